@@ -1,0 +1,71 @@
+# `make train` and `make test` set up everything they need; `make train ARGS="--domain cartpole --minutes 5"`.
+
+PYTHON ?= python3 python3.11 python3.12 python3.13
+ARGS ?=
+BIN := .venv/bin
+STAMP := .venv/.installed
+
+.PHONY: setup train test check doctor soak clean
+
+setup: $(STAMP)
+
+train: $(STAMP)
+	@$(BIN)/python scripts/train.py --domain walker $(ARGS)
+
+test: $(STAMP)
+	$(BIN)/python -m pytest
+
+check: test
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+
+doctor: $(STAMP)
+	@$(BIN)/python -m latentplan doctor
+
+soak: $(STAMP)
+	$(BIN)/python -m pytest -m soak
+
+clean:
+	rm -rf .venv build dist *.egg-info .mypy_cache .ruff_cache .pytest_cache
+
+$(STAMP): pyproject.toml constraints.txt
+	@$(find_python); $(make_venv)
+	$(BIN)/python -m pip install --constraint constraints.txt --editable '.[dev]'
+	$(BIN)/python -m pip install --constraint constraints.txt --no-deps dm-control
+	@$(install_gl)
+	@touch $@
+
+# The first interpreter the project runs on.
+define find_python
+for candidate in $(PYTHON); do \
+	if $$candidate -c 'import sys; sys.exit(not (3, 11) <= sys.version_info[:2] < (3, 14))' 2>/dev/null; \
+	then python=$$candidate; break; fi; \
+done; \
+if [ -z "$$python" ]; then echo "no Python 3.11 to 3.13 found; name one with PYTHON=/path/to/python" >&2; exit 1; fi
+endef
+
+# Debian and Ubuntu keep the module that makes environments in a package of its own.
+define make_venv
+if ! $$python -c 'import ensurepip, venv' 2>/dev/null; then \
+	package=$$($$python -c 'import sys; print("python%d.%d-venv" % sys.version_info[:2])'); \
+	if [ "$$(id -u)" = 0 ] && command -v apt-get >/dev/null; then apt-get update && apt-get install -y $$package; \
+	else echo "Python lacks venv; run: sudo apt-get install -y $$package" >&2; exit 1; fi; \
+fi; \
+$$python -m venv .venv
+endef
+
+# Software rendering for machines without a display; a machine with a hardware EGL works without it.
+define install_gl
+missing=; \
+for pair in libOSMesa.so:libosmesa6 libEGL.so:libegl1 libGL.so:libgl1; do \
+	/sbin/ldconfig -p 2>/dev/null | grep -q "$${pair%%:*}" || missing="$$missing $${pair##*:}"; \
+done; \
+if [ -z "$$missing" ]; then :; \
+elif [ "$$(id -u)" = 0 ] && command -v apt-get >/dev/null; then \
+	apt-get update || true; \
+	for package in $$missing; do \
+		apt-get install -y --no-install-recommends $$package || echo "could not install $$package" >&2; \
+	done; \
+else echo "headless rendering needs GL libraries; run: sudo apt-get install -y$$missing" >&2; fi
+endef

@@ -1,0 +1,10 @@
+"""`python -m latentplan`: train, eval, doctor and --version."""
+
+from __future__ import annotations
+
+import sys
+
+from latentplan.cli import main
+
+if __name__ == "__main__":
+    sys.exit(main())

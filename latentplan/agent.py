@@ -1,0 +1,187 @@
+"""Agents: a world model, and a way to choose actions with it."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from latentplan.config import Config, PlannerConfig
+from latentplan.models import State, WorldModel
+from latentplan.models.heads import sample_action
+from latentplan.planning import CEMPlanner, ModelPredictiveController
+
+
+class ModelAgent:
+    """What planning and acting agents share: a belief that follows the frames.
+
+    One frame (64, 64, 3) in gives one action (action,) out; several, (batch, 64, 64, 3), give (batch, action).
+    The belief is the posterior's mean.
+
+    Args:
+        model: The world model; put into evaluation mode and never changed.
+        config: Settings it was trained with.
+        noise_std: Standard deviation of Gaussian noise added to each action, for exploration.
+        seed: Of the agent's own random stream.
+    """
+
+    def __init__(self, model: WorldModel, config: Config, *, noise_std: float = 0.0, seed: int = 0) -> None:
+        self.model, self.config, self.noise_std = model.eval(), config, noise_std
+        self.num_actions = model.action_dim
+        self.generator = torch.Generator(model.device)
+        self.state: State | None = None
+        self._action: Tensor | None = None
+        self._forget: Tensor | None = None
+        self.seed(seed)
+
+    def seed(self, seed: int) -> None:
+        """Restart the agent's random stream."""
+        self.generator.manual_seed(seed)
+
+    def reset(self, mask: np.ndarray | None = None) -> None:
+        """Forget the past, everywhere or in the environments where mask (batch,) is true."""
+        if mask is None or self.state is None:
+            self.state = self._action = self._forget = None
+        else:
+            self._forget = torch.as_tensor(mask, device=self.model.device)
+
+    @torch.no_grad()
+    def act(self, frame: np.ndarray) -> np.ndarray:
+        """The action in [-1, 1], float32 (action,) or (batch, action), for uint8 frame(s).
+
+        Raises:
+            ValueError: The frame has another shape or dtype, or the batch changed without a reset.
+        """
+        single = frame.ndim == 3
+        frames = self._check(frame[None] if single else frame)
+        state = self._believe(frames)
+        action = self._choose(state)
+        if self.noise_std > 0.0:
+            noise = torch.randn(action.shape, generator=self.generator, device=action.device)
+            action = (action + self.noise_std * noise).clamp(-1.0, 1.0)
+        self.state, self._action = state, action
+        result = action.float().cpu().numpy()
+        return result[0] if single else result
+
+    @torch.no_grad()
+    def encode(self, frame: np.ndarray) -> np.ndarray:
+        """The latent of one frame seen without a past, float32 (32,), or (batch, 32) for several."""
+        single = frame.ndim == 3
+        frames = self._check(frame[None] if single else frame)
+        latent = self.model.see(self.model.dynamics.initial(len(frames)).deter, frames).stoch.cpu().numpy()
+        return latent[0] if single else latent
+
+    def imagine(self) -> np.ndarray | None:
+        """The picture an agent looks forward to, uint8 (64, 64, 3); None without a plan."""
+        return None
+
+    def _choose(self, state: State) -> Tensor:
+        raise AssertionError("an agent defines how it chooses")
+
+    def _believe(self, frames: Tensor) -> State:
+        if self.state is None or self._action is None:
+            return self.model.see(self.model.dynamics.initial(len(frames)).deter, frames)
+        if len(self.state.deter) != len(frames):
+            raise ValueError(f"got {len(frames)} frames after {len(self.state.deter)}: call reset() between batches")
+        deter = self.model.dynamics.advance(self.state, self._action)
+        if self._forget is not None:
+            deter = torch.where(self._forget[:, None], 0.0, deter)
+            self._forget = None
+        return self.model.see(deter, frames)
+
+    def _check(self, frames: np.ndarray) -> Tensor:
+        if frames.dtype != np.uint8 or frames.shape[1:] != (64, 64, 3):
+            raise ValueError(f"frames must be uint8 (64, 64, 3), got {frames.dtype} {frames.shape[1:]}")
+        return torch.as_tensor(frames, device=self.model.device)
+
+
+class PlanningAgent(ModelAgent):
+    """Decides by CEM-MPC in the latent, and executes only the first action of each plan.
+
+    Args:
+        model: The world model.
+        config: Settings it was trained with.
+        discount: Per decision, as learned.
+        planner: Settings of the search; None takes those of `config`.
+        noise_std: Of exploration noise.
+        seed: Of the agent's own random stream.
+    """
+
+    def __init__(
+        self,
+        model: WorldModel,
+        config: Config,
+        discount: float,
+        *,
+        planner: PlannerConfig | None = None,
+        noise_std: float = 0.0,
+        seed: int = 0,
+    ) -> None:
+        super().__init__(model, config, noise_std=noise_std, seed=seed)
+        search = CEMPlanner.from_config(planner or config.planner, action_dim=model.action_dim, discount=discount)
+        self.controller = ModelPredictiveController(search, model, generator=self.generator)
+
+    def reset(self, mask: np.ndarray | None = None) -> None:
+        """Forget the past and the last plan, everywhere or where mask (batch,) is true."""
+        super().reset(mask)
+        self.controller.reset(None if self.state is None else self._forget)
+
+    @torch.no_grad()
+    def imagine(self) -> np.ndarray | None:
+        """The decoded last state of the present plan, uint8 (64, 64, 3), of the first environment."""
+        if self.controller.plan is None or self.state is None:
+            return None
+        first = State(*(part[:1] for part in self.state))
+        _, last = self.model.rollout(first, self.controller.plan.mean[:1].to(first.deter.dtype))
+        return self.model.decoder.picture(last.features.float())[0].cpu().numpy()
+
+    def _choose(self, state: State) -> Tensor:
+        return self.controller.act(state)
+
+
+class ActorAgent(ModelAgent):
+    """Decides by the actor alone: its mode, or samples when it explores.
+
+    Args:
+        model: The world model.
+        config: Settings it was trained with.
+        explore: Whether actions are sampled.
+        seed: Of the agent's own random stream.
+    """
+
+    def __init__(self, model: WorldModel, config: Config, *, explore: bool = False, seed: int = 0) -> None:
+        super().__init__(model, config, seed=seed)
+        self.explore = explore
+
+    def _choose(self, state: State) -> Tensor:
+        mean, std = self.model.actor(state.features)
+        if not self.explore:
+            return mean
+        noise = torch.randn(mean.shape, generator=self.generator, device=mean.device)
+        return sample_action(mean, std, noise)
+
+
+class RandomAgent:
+    """Uniform actions in [-1, 1]."""
+
+    def __init__(self, num_actions: int, seed: int = 0) -> None:
+        self.num_actions = num_actions
+        self.seed(seed)
+
+    def seed(self, seed: int) -> None:
+        """Restart the agent's random stream."""
+        self._rng = np.random.default_rng(seed)
+
+    def reset(self, mask: np.ndarray | None = None) -> None:
+        """Nothing to forget."""
+
+    def imagine(self) -> None:
+        """There is no plan to picture."""
+
+    def act(self, frame: np.ndarray) -> np.ndarray:
+        """A random action, float32 (action,), or (batch, action) for several frames."""
+        shape = (self.num_actions,) if frame.ndim == 3 else (len(frame), self.num_actions)
+        return self._rng.uniform(-1.0, 1.0, shape).astype(np.float32)
+
+
+Agent = PlanningAgent | ActorAgent | RandomAgent

@@ -1,0 +1,143 @@
+"""Which OpenGL renders: chosen before MuJoCo is imported, named once a context exists.
+
+MuJoCo and dm_control read `MUJOCO_GL` when they are imported, and without it they pick a windowed
+backend that dies at the first frame on a headless machine. So this module imports neither at the top.
+"""
+
+from __future__ import annotations
+
+import ctypes.util
+import functools
+import glob
+import os
+import subprocess
+import sys
+from contextlib import contextmanager
+from typing import TYPE_CHECKING
+
+from latentplan.config import UserError
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+REMEDY = "install software rendering (apt-get install -y libosmesa6 libegl1 libgl1) or set MUJOCO_GL=egl|osmesa|glfw"
+_SOFTWARE_RENDERERS = ("llvmpipe", "softpipe", "swrast", "software")
+_PROBE_TIMEOUT_S = 30.0
+_PROBE = (
+    "import mujoco; from OpenGL import GL; context = mujoco.GLContext(64, 64); context.make_current(); "
+    "print(GL.glGetString(GL.GL_RENDERER).decode())"
+)
+
+
+def choose_backend() -> str | None:
+    """Set `MUJOCO_GL` for this process and its children, unless the user did; also how Mesa and dm_control thread.
+
+    Hardware EGL comes first, then OSMesa, then EGL in software. Nothing is probed when `MUJOCO_GL` is
+    set, so child processes inherit the choice for free.
+
+    Returns:
+        The backend that MuJoCo will use, or None where no OpenGL library was found.
+    """
+    # dm_control's rendering thread prints errors at exit; one environment needs no thread of its own.
+    os.environ.setdefault("DISABLE_RENDER_THREAD_OFFLOADING", "1")
+    # Small frames gain nothing from Mesa's worker threads, and learning needs the cores.
+    os.environ.setdefault("LP_NUM_THREADS", "0")
+    backend = os.environ.get("MUJOCO_GL") or _find_backend()
+    if backend:
+        os.environ["MUJOCO_GL"] = backend
+    return backend or None
+
+
+def require_backend() -> str:
+    """The chosen backend.
+
+    Raises:
+        UserError: No OpenGL library was found.
+    """
+    backend = choose_backend()
+    if backend is None:
+        raise UserError(f"no OpenGL library found to render with; {REMEDY}")
+    return backend
+
+
+@contextmanager
+def explain_gl_errors() -> Iterator[None]:
+    """Turn what OpenGL libraries raise when a context cannot be made into one line with the remedy.
+
+    Raises:
+        UserError: The body raised while importing a backend or making a context.
+    """
+    try:
+        yield
+    except UserError:
+        raise
+    except Exception as error:  # each backend raises types of its own
+        backend = os.environ.get("MUJOCO_GL")
+        reason = str(error).strip().splitlines()[0] if str(error).strip() else type(error).__name__
+        raise UserError(f"cannot render with MUJOCO_GL={backend}: {reason}; {REMEDY}") from error
+
+
+@functools.cache
+def render_info() -> dict[str, str | bool]:
+    """What renders the frames.
+
+    Returns:
+        `backend` (MUJOCO_GL), `renderer` (OpenGL's own name for itself), `hardware` (whether that is a
+        graphics processor) and `mujoco` (its version: pictures differ between versions).
+
+    Raises:
+        UserError: No OpenGL context can be made.
+    """
+    backend = require_backend()
+    with explain_gl_errors():
+        import mujoco
+        from dm_control import _render
+        from OpenGL import GL
+
+        context = _render.Renderer(64, 64)
+        with context.make_current() as gl:
+            renderer = gl.call(GL.glGetString, GL.GL_RENDERER).decode()
+        context.free()
+    return {
+        "backend": backend,
+        "renderer": renderer,
+        "hardware": is_hardware(renderer),
+        "mujoco": mujoco.__version__,
+    }
+
+
+def is_hardware(renderer: str) -> bool:
+    """Whether an OpenGL renderer's name is that of a graphics processor."""
+    return bool(renderer) and not any(name in renderer.lower() for name in _SOFTWARE_RENDERERS)
+
+
+def _find_backend() -> str | None:
+    if sys.platform == "darwin":
+        return "glfw"
+    has_egl = ctypes.util.find_library("EGL") is not None
+    if has_egl and _has_graphics_device() and is_hardware(_probe_egl()):
+        return "egl"
+    if ctypes.util.find_library("OSMesa") is not None:
+        return "osmesa"
+    return "egl" if has_egl else None
+
+
+def _has_graphics_device() -> bool:
+    return bool(glob.glob("/dev/nvidia[0-9]*") or glob.glob("/dev/dri/renderD*"))
+
+
+def _probe_egl() -> str:
+    """EGL's renderer as a child process sees it, empty where it fails: a bad driver may crash the prober."""
+    environment = {**os.environ, "MUJOCO_GL": "egl", "PYOPENGL_PLATFORM": "egl"}
+    try:
+        probe = subprocess.run(
+            [sys.executable, "-c", _PROBE],
+            env=environment,
+            capture_output=True,
+            text=True,
+            timeout=_PROBE_TIMEOUT_S,
+            check=False,
+        )
+    except (OSError, subprocess.TimeoutExpired):
+        return ""
+    return probe.stdout.strip() if probe.returncode == 0 else ""

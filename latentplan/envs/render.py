@@ -1,0 +1,108 @@
+"""Square frames of a simulated body, from one scene and one OpenGL context that are made once."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from latentplan.envs.gl import explain_gl_errors, require_backend
+
+if TYPE_CHECKING:
+    from dm_control.mujoco import Physics
+
+# What each quality changes in the model's `visual/quality`. Software renderers pay per triangle and sample.
+_QUALITY_SETTINGS: dict[str, dict[str, int]] = {
+    "exact": {},
+    "fast": {"shadowsize": 256},
+    "fastest": {"shadowsize": 256, "offsamples": 0},
+}
+
+
+class FrameRenderer:
+    """Renders the present state of a body, as `Physics.render` would but without its set-up per frame.
+
+    Shadow map, anti-aliasing and buffer size are fixed when the context is made. The buffer is as small
+    as the frame: that leaves the picture as it is and saves clearing the rest.
+    """
+
+    def __init__(self, physics: Physics, size: int, camera: int, quality: str) -> None:
+        """Make the OpenGL context and the scene.
+
+        Args:
+            physics: The body to look at.
+            size: Height and width of the frames, in pixels.
+            camera: Camera id of the MuJoCo model; -1 is the free camera.
+            quality: `exact`, `fast` or `fastest`.
+
+        Raises:
+            UserError: No OpenGL context can be made.
+        """
+        require_backend()
+        with explain_gl_errors():
+            import mujoco
+            from dm_control import _render
+            from dm_control.mujoco import wrapper
+
+            self._physics = physics
+            self._gl = _render.Renderer(size, size)
+            self._context = _make_context(physics, self._gl, size, quality)
+        self._rectangle = mujoco.MjrRect(0, 0, size, size)
+        self._pixels = np.empty((size, size, 3), dtype=np.uint8)
+        self._options = mujoco.MjvOption()
+        self._camera = mujoco.MjvCamera()
+        self._camera.fixedcamid = camera
+        self._camera.type = mujoco.mjtCamera.mjCAMERA_FIXED
+        if camera == -1:
+            self._camera.type = mujoco.mjtCamera.mjCAMERA_FREE
+            mujoco.mjv_defaultFreeCamera(physics.model.ptr, self._camera)
+        self._scene = wrapper.MjvScene(physics.model)
+        if quality == "fastest":
+            self._scene.flags[mujoco.mjtRndFlag.mjRND_SHADOW] = False
+            self._scene.flags[mujoco.mjtRndFlag.mjRND_REFLECTION] = False
+
+    def render(self) -> np.ndarray:
+        """The present state, a fresh uint8 array (size, size, 3)."""
+        import mujoco
+
+        model, data = self._physics.model.ptr, self._physics.data.ptr
+        everything = mujoco.mjtCatBit.mjCAT_ALL
+        mujoco.mjv_updateScene(model, data, self._options, None, self._camera, everything, self._scene)
+        with self._gl.make_current() as gl:
+            gl.call(self._draw)
+        return self._pixels[::-1].copy()  # OpenGL's rows run upwards
+
+    def refresh_terrain(self) -> None:
+        """Draw the ground as it is now; for tasks that change it between episodes."""
+        import mujoco
+
+        with self._gl.make_current() as gl:
+            for heightfield in range(self._physics.model.nhfield):
+                gl.call(mujoco.mjr_uploadHField, self._physics.model.ptr, self._context.ptr, heightfield)
+
+    def close(self) -> None:
+        """Free the context; call it before `Physics.free`."""
+        self._context.free()
+
+    def _draw(self) -> None:
+        import mujoco
+
+        mujoco.mjr_render(self._rectangle, self._scene, self._context.ptr)
+        mujoco.mjr_readPixels(self._pixels, None, self._rectangle, self._context.ptr)
+
+
+def _make_context(physics: Physics, gl: object, size: int, quality: str) -> Any:
+    """MuJoCo's drawing context; it reads its settings from the model, which is left as it was."""
+    from dm_control.mujoco import wrapper
+
+    visual = physics.model.vis
+    buffer_size, before = (visual.global_.offwidth, visual.global_.offheight), {}
+    visual.global_.offwidth = visual.global_.offheight = size
+    for name, value in _QUALITY_SETTINGS[quality].items():
+        before[name] = getattr(visual.quality, name)
+        setattr(visual.quality, name, value)
+    context = wrapper.MjrContext(physics.model, gl)
+    visual.global_.offwidth, visual.global_.offheight = buffer_size
+    for name, value in before.items():
+        setattr(visual.quality, name, value)
+    return context

@@ -1,0 +1,228 @@
+"""Any task of `dm_control.suite` as a gymnasium environment seen through a camera."""
+
+from __future__ import annotations
+
+import difflib
+import logging
+import math
+from contextlib import contextmanager
+from typing import TYPE_CHECKING, Any
+
+import gymnasium
+import numpy as np
+from gymnasium.error import ResetNeeded
+
+from latentplan.config import EnvConfig, UserError
+from latentplan.envs.gl import explain_gl_errors, require_backend
+from latentplan.envs.render import FrameRenderer
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Iterator
+
+    from dm_control.mujoco import Physics
+
+FRAME_SIZE = 64
+_UNLIMITED_EPISODE_STEPS = 1000
+_DEFAULT_TASKS = {
+    "acrobot": "swingup",
+    "ball_in_cup": "catch",
+    "cartpole": "swingup",
+    "cheetah": "run",
+    "dog": "walk",
+    "finger": "spin",
+    "fish": "swim",
+    "hopper": "hop",
+    "humanoid": "walk",
+    "humanoid_CMU": "run",
+    "lqr": "lqr_2_1",
+    "manipulator": "bring_ball",
+    "pendulum": "swingup",
+    "point_mass": "easy",
+    "quadruped": "walk",
+    "reacher": "easy",
+    "stacker": "stack_2",
+    "swimmer": "swimmer6",
+    "walker": "walk",
+}
+
+
+def default_task(domain: str) -> str:
+    """The task a domain is usually benchmarked with.
+
+    Raises:
+        UserError: The domain is unknown.
+    """
+    if domain not in _DEFAULT_TASKS:
+        raise UserError(_unknown("domain", domain, _DEFAULT_TASKS))
+    return _DEFAULT_TASKS[domain]
+
+
+class SuiteEnv(gymnasium.Env[np.ndarray, np.ndarray]):
+    """A `dm_control.suite` task: frames in, bounded actions out, action repeat within.
+
+    An observation is a uint8 frame (64, 64, 3), always a fresh array. An action is float32 (action,) in
+    [-1, 1], scaled to the actuators' range. `reset(seed=s)` depends on s alone; `reset()` continues the
+    random stream. The time limit truncates; only the task itself terminates. `info["env_frames"]` counts
+    the control steps that a step took, which is fewer than the action repeat where an episode ends early.
+
+    Attributes:
+        action_repeat: Control steps per decision; rewards are summed over them.
+        decisions_per_episode: Decisions until the time limit.
+    """
+
+    metadata = {"render_modes": ["rgb_array"]}
+    render_mode = "rgb_array"
+
+    def __init__(self, config: EnvConfig, seed: int | None = None) -> None:
+        """Load the task; the OpenGL context is made by the first frame.
+
+        Args:
+            config: What to load and how to look at it.
+            seed: Start of the random stream; None draws one from the system.
+
+        Raises:
+            UserError: Domain, task or camera do not exist, or nothing can render.
+        """
+        task = default_task(config.domain) if config.task is None else config.task
+        self._task_env = _load(config.domain, task)
+        self._camera = _checked_camera(self.physics, config)
+        self._quality = config.render_quality
+        self._renderers: dict[int, FrameRenderer] = {}
+        self._needs_reset = True
+        self._steps_left = 0
+        # An episode lasts for the first whole number of steps that reaches dm_control's limit.
+        limit = self._task_env._step_limit
+        self._steps_per_episode = _UNLIMITED_EPISODE_STEPS if math.isinf(limit) else math.ceil(limit)
+        self.action_repeat = config.action_repeat
+        self.decisions_per_episode = math.ceil(self._steps_per_episode / config.action_repeat)
+        spec = self._task_env.action_spec()
+        bounded = np.isfinite(spec.minimum) & np.isfinite(spec.maximum)
+        self._action_low = np.where(bounded, spec.minimum, -1.0)
+        self._action_high = np.where(bounded, spec.maximum, 1.0)
+        self.observation_space = gymnasium.spaces.Box(0, 255, (FRAME_SIZE, FRAME_SIZE, 3), np.uint8)
+        self.action_space = gymnasium.spaces.Box(-1.0, 1.0, spec.shape, np.float32)
+        self._seed_task(seed)
+
+    @property
+    def physics(self) -> Physics:
+        """The simulated body, for reading the true state."""
+        return self._task_env.physics
+
+    def true_state(self) -> np.ndarray:
+        """Positions, velocities and activations of the body, float64 (state,)."""
+        return self.physics.get_state()
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[np.ndarray, dict[str, Any]]:
+        """Begin an episode.
+
+        Args:
+            seed: Where to restart the random stream; None continues it.
+            options: Not used.
+
+        Returns:
+            The first frame (64, 64, 3), and an info with no `env_frames` taken.
+        """
+        super().reset(seed=seed)
+        if seed is not None:
+            self._seed_task(seed)
+        self._task_env.reset()
+        for renderer in self._renderers.values():
+            renderer.refresh_terrain()
+        self._steps_left = self._steps_per_episode
+        self._needs_reset = False
+        return self.render(), {"env_frames": 0}
+
+    def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
+        """Hold an action for `action_repeat` control steps.
+
+        Args:
+            action: (action,), clipped to [-1, 1].
+
+        Returns:
+            Frame (64, 64, 3), summed reward, terminated, truncated, info.
+
+        Raises:
+            ResetNeeded: The episode is over.
+            ValueError: The action has another shape or is not finite.
+        """
+        if self._needs_reset:
+            raise ResetNeeded("the episode is over; call reset() first")
+        control = self._scaled(action)
+        reward, env_frames, terminated = 0.0, 0, False
+        while env_frames < self.action_repeat and not self._needs_reset:
+            outcome = self._task_env.step(control)
+            reward += float(outcome.reward)
+            env_frames += 1
+            self._steps_left -= 1
+            # The suite marks an end of its own with discount 0, and the time limit with discount 1.
+            terminated = outcome.last() and outcome.discount == 0.0
+            self._needs_reset = outcome.last() or self._steps_left <= 0
+        return self.render(), reward, terminated, self._needs_reset and not terminated, {"env_frames": env_frames}
+
+    def render(self) -> np.ndarray:  # type: ignore[override]
+        """The present state as the agent sees it, a fresh uint8 array (64, 64, 3)."""
+        return self.render_large(FRAME_SIZE)
+
+    def render_large(self, size: int) -> np.ndarray:
+        """The present state through the same camera at another resolution, a fresh uint8 array (size, size, 3)."""
+        if size not in self._renderers:
+            self._renderers[size] = FrameRenderer(self.physics, size, self._camera, self._quality)
+        return self._renderers[size].render()
+
+    def close(self) -> None:
+        """Free OpenGL contexts and simulator; the environment cannot be used afterwards."""
+        for renderer in self._renderers.values():
+            renderer.close()
+        self._renderers.clear()
+        self.physics.free()
+        self._needs_reset = True
+
+    def _seed_task(self, seed: int | None) -> None:
+        self._task_env.task.random.seed(seed)
+
+    def _scaled(self, action: np.ndarray) -> np.ndarray:
+        action = np.asarray(action, dtype=np.float64)
+        if action.shape != self.action_space.shape:
+            raise ValueError(f"action has shape {action.shape}, the environment takes {self.action_space.shape}")
+        if not np.isfinite(action).all():
+            raise ValueError(f"action must be finite, got {action}")
+        return self._action_low + (np.clip(action, -1.0, 1.0) + 1.0) * 0.5 * (self._action_high - self._action_low)
+
+
+def _load(domain: str, task: str) -> Any:
+    require_backend()
+    with explain_gl_errors():
+        from dm_control import suite
+    if domain not in suite.TASKS_BY_DOMAIN:
+        raise UserError(_unknown("domain", domain, suite.TASKS_BY_DOMAIN))
+    if task not in suite.TASKS_BY_DOMAIN[domain]:
+        raise UserError(_unknown(f"task of {domain}", task, suite.TASKS_BY_DOMAIN[domain]))
+    with _quiet_model_compiler():
+        # A few tasks draw their model when they are built: a fixed seed makes that the same body every time.
+        return suite.load(domain, task, task_kwargs={"random": 0})
+
+
+@contextmanager
+def _quiet_model_compiler() -> Iterator[None]:
+    """Drop warnings about the suite's model files, which users cannot act on."""
+    logger = logging.getLogger("absl")
+    before = logger.level
+    logger.setLevel(logging.ERROR)
+    try:
+        yield
+    finally:
+        logger.setLevel(before)
+
+
+def _checked_camera(physics: Physics, config: EnvConfig) -> int:
+    if config.camera >= physics.model.ncam:
+        raise UserError(f"camera {config.camera} does not exist; {config.domain} has {physics.model.ncam} cameras")
+    return config.camera
+
+
+def _unknown(what: str, name: str, available: Iterable[str]) -> str:
+    choices = sorted(available)
+    nearest = difflib.get_close_matches(name, choices, n=1, cutoff=0.0)[0]
+    return f"unknown {what} {name!r}; available: {', '.join(choices)}. Did you mean {nearest!r}?"

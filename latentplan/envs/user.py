@@ -1,0 +1,152 @@
+"""A user's own environment, brought to the frames and actions that the agent works with."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, Any
+
+import cv2
+import gymnasium
+import numpy as np
+from gymnasium.error import ResetNeeded
+
+from latentplan.config import EnvConfig, UserError
+from latentplan.envs.suite import FRAME_SIZE
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+
+def make_from(
+    factory: Callable[[], gymnasium.Env[Any, Any]],
+) -> Callable[[EnvConfig, int | None], PixelEnv]:
+    """A builder with the signature of `make_env` around a user's factory.
+
+    Args:
+        factory: Returns a new environment with image observations and a bounded Box of actions.
+    """
+
+    def build(config: EnvConfig, seed: int | None = None) -> PixelEnv:
+        env = factory()
+        if not isinstance(env, gymnasium.Env):
+            raise UserError(f"make_env must return a gymnasium.Env, got {type(env).__name__}")
+        return wrap_user_env(env, config.action_repeat, seed)
+
+    return build
+
+
+def wrap_user_env(env: gymnasium.Env[Any, Any], action_repeat: int = 1, seed: int | None = None) -> PixelEnv:
+    """A user's environment as the agent sees it.
+
+    Args:
+        env: Observations are uint8 images (height, width, 3); actions a bounded Box (action,).
+        action_repeat: Steps of `env` per decision.
+        seed: Seed of the first reset that is given none.
+
+    Raises:
+        UserError: A space does not fit; the message names what is wrong with it.
+    """
+    return PixelEnv(env, action_repeat, seed)
+
+
+class PixelEnv(gymnasium.Env[np.ndarray, np.ndarray]):
+    """Frames of 64 x 64, actions in [-1, 1] and action repeat around any image environment.
+
+    Attributes:
+        action_repeat: Steps of the inner environment per decision; rewards are summed over them.
+        decisions_per_episode: Decisions until the time limit that the environment's spec states, or None.
+    """
+
+    metadata = {"render_modes": ["rgb_array"]}
+    render_mode = "rgb_array"
+
+    def __init__(self, env: gymnasium.Env[Any, Any], action_repeat: int, seed: int | None = None) -> None:
+        """Check the spaces; see `wrap_user_env`."""
+        _check_observations(env.observation_space)
+        self._inner_actions = _checked_actions(env.action_space)
+        self._env = env
+        self._first_seed = seed
+        self._picture = np.zeros((FRAME_SIZE, FRAME_SIZE, 3), dtype=np.uint8)
+        self._needs_reset = True
+        self.action_repeat = action_repeat
+        limit = env.spec.max_episode_steps if env.spec is not None else None
+        self.decisions_per_episode = None if limit is None else math.ceil(limit / action_repeat)
+        self.observation_space = gymnasium.spaces.Box(0, 255, (FRAME_SIZE, FRAME_SIZE, 3), np.uint8)
+        self.action_space = gymnasium.spaces.Box(-1.0, 1.0, self._inner_actions.shape, np.float32)
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[np.ndarray, dict[str, Any]]:
+        """Begin an episode: the first frame (64, 64, 3) and the inner environment's info."""
+        seed, self._first_seed = self._first_seed if seed is None else seed, None
+        super().reset(seed=seed)
+        picture, info = self._env.reset(seed=seed, options=options)
+        self._needs_reset = False
+        return self._frame(picture), {**info, "env_frames": 0}
+
+    def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
+        """Hold an action (action,) in [-1, 1] for `action_repeat` steps: frame, summed reward, ends, info.
+
+        Raises:
+            ResetNeeded: The episode is over.
+        """
+        if self._needs_reset:
+            raise ResetNeeded("the episode is over; call reset() first")
+        low, high = self._inner_actions.low, self._inner_actions.high
+        scaled = low + (np.clip(action, -1.0, 1.0) + 1.0) * 0.5 * (high - low)
+        scaled = scaled.astype(self._inner_actions.dtype)
+        total, env_frames, terminated, truncated = 0.0, 0, False, False
+        while env_frames < self.action_repeat and not (terminated or truncated):
+            picture, reward, terminated, truncated, info = self._env.step(scaled)
+            total += float(reward)
+            env_frames += 1
+        self._needs_reset = bool(terminated or truncated)
+        return self._frame(picture), total, bool(terminated), bool(truncated), {**info, "env_frames": env_frames}
+
+    def render(self) -> np.ndarray:  # type: ignore[override]
+        """The last frame, a fresh uint8 array (64, 64, 3)."""
+        return _resized(self._picture, FRAME_SIZE)
+
+    def render_large(self, size: int) -> np.ndarray:
+        """The inner environment's own rendering if it has one, else its last observation, (size, size, 3)."""
+        rendered = self._env.render() if self._env.render_mode == "rgb_array" else None
+        return _resized(self._picture if rendered is None else np.asarray(rendered), size)
+
+    def close(self) -> None:
+        """Close the inner environment."""
+        self._env.close()
+
+    def _frame(self, picture: np.ndarray) -> np.ndarray:
+        self._picture = np.array(picture, dtype=np.uint8)
+        return _resized(self._picture, FRAME_SIZE)
+
+
+def _check_observations(space: gymnasium.Space[Any]) -> None:
+    wanted = "observations must be a Box of uint8 images (height, width, 3)"
+    if not isinstance(space, gymnasium.spaces.Box):
+        raise UserError(f"{wanted}, got {type(space).__name__}")
+    if space.dtype != np.uint8:
+        raise UserError(f"{wanted}, got dtype {space.dtype}")
+    if len(space.shape) != 3 or space.shape[2] != 3:
+        raise UserError(f"{wanted}, got shape {space.shape}")
+
+
+def _checked_actions(space: gymnasium.Space[Any]) -> gymnasium.spaces.Box:
+    wanted = "actions must be a bounded Box of floats with shape (action,)"
+    if not isinstance(space, gymnasium.spaces.Box):
+        raise UserError(f"{wanted}, got {type(space).__name__}")
+    if not np.issubdtype(space.dtype, np.floating):
+        raise UserError(f"{wanted}, got dtype {space.dtype}")
+    if len(space.shape) != 1 or space.shape[0] == 0:
+        raise UserError(f"{wanted}, got shape {space.shape}")
+    if not space.is_bounded("both"):
+        raise UserError(f"{wanted}, got bounds {space.low} to {space.high}")
+    return space
+
+
+def _resized(picture: np.ndarray, size: int) -> np.ndarray:
+    """A fresh uint8 array (size, size, 3)."""
+    if picture.shape[:2] == (size, size):
+        return picture.copy()
+    shrinks = picture.shape[0] >= size and picture.shape[1] >= size
+    return cv2.resize(picture, (size, size), interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR)

@@ -1,0 +1,99 @@
+"""One environment or several at once, all from the same settings."""
+
+from __future__ import annotations
+
+import os
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv, VectorEnv
+
+from latentplan.config import EnvConfig
+from latentplan.envs.suite import SuiteEnv
+from latentplan.envs.user import make_from
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator
+
+    import gymnasium
+
+_THREAD_SETTINGS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
+
+
+def make_env(config: EnvConfig, seed: int | None = None) -> SuiteEnv:
+    """The environment that the settings name.
+
+    Args:
+        config: Domain, task, action repeat, camera and render quality.
+        seed: Start of its random stream; None draws one from the system.
+
+    Raises:
+        UserError: Domain, task or camera do not exist, or nothing can render.
+    """
+    return SuiteEnv(config, seed)
+
+
+def make_vector_env(
+    config: EnvConfig,
+    num_envs: int,
+    seed: int | None,
+    make_env: Callable[[], gymnasium.Env[Any, Any]] | None = None,
+) -> VectorEnv[np.ndarray, np.ndarray, Any]:
+    """Several environments behind one `step`, each in a process of its own if there is more than one.
+
+    Episodes are not restarted by themselves, so `step` always returns what its own action led to. Restart
+    those that ended with `vector_env.reset(options={"reset_mask": ended})`, where `ended` is a bool array
+    (env,); the others' observations come back as they were. Processes are spawned, because a forked child
+    hangs once an OpenGL context exists.
+
+    Args:
+        config: What to build.
+        num_envs: How many.
+        seed: Each environment's random stream derives from this and its index; None draws from the system.
+        make_env: A user's factory, called in each process in place of the suite; it must be picklable.
+
+    Returns:
+        Observations uint8 (env, 64, 64, 3), rewards (env,), terminated and truncated (env,).
+
+    Raises:
+        UserError: The environment cannot be built.
+    """
+    builders = [_Builder(config, _derived_seed(seed, index), make_env) for index in range(num_envs)]
+    if num_envs == 1:
+        return SyncVectorEnv(builders, autoreset_mode=AutoresetMode.DISABLED)
+    with _single_threaded_children():
+        return AsyncVectorEnv(builders, shared_memory=True, context="spawn", autoreset_mode=AutoresetMode.DISABLED)
+
+
+@dataclass(frozen=True)
+class _Builder:
+    """Builds one environment wherever it is called; picklable where the user's factory is."""
+
+    config: EnvConfig
+    seed: int | None
+    factory: Callable[[], gymnasium.Env[Any, Any]] | None
+
+    def __call__(self) -> gymnasium.Env[np.ndarray, np.ndarray]:
+        build = make_env if self.factory is None else make_from(self.factory)
+        return build(self.config, self.seed)
+
+
+def _derived_seed(seed: int | None, index: int) -> int | None:
+    return None if seed is None else int(np.random.SeedSequence([seed, index]).generate_state(1)[0])
+
+
+@contextmanager
+def _single_threaded_children() -> Iterator[None]:
+    """Thread limits in the environment while processes start: their libraries read them at import."""
+    before = {name: os.environ.get(name) for name in _THREAD_SETTINGS}
+    os.environ.update(dict.fromkeys(_THREAD_SETTINGS, "1"))
+    try:
+        yield
+    finally:
+        for name, value in before.items():
+            if value is None:
+                del os.environ[name]
+            else:
+                os.environ[name] = value

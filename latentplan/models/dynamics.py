@@ -1,0 +1,105 @@
+"""RSSM: a deterministic GRU state beside a Gaussian latent (Hafner et al. 2019, section 3)."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+from latentplan.models.heads import NormedLinear
+
+MIN_STD = 0.1
+
+
+class State(NamedTuple):
+    """Where the model believes the world is: `deter` (rows, deter) and `stoch` (rows, latent)."""
+
+    deter: Tensor
+    stoch: Tensor
+
+    @property
+    def features(self) -> Tensor:
+        """Both parts side by side, (..., deter + latent): what every head reads."""
+        return torch.cat(self, -1)
+
+
+class Gaussian(NamedTuple):
+    """A diagonal Gaussian: `mean` and `std`, (..., latent) each, float32."""
+
+    mean: Tensor
+    std: Tensor
+
+
+class Rssm(nn.Module):
+    """Latent dynamics: one step, the prior without a frame, the posterior with one, and whole sequences."""
+
+    def __init__(self, latent_dim: int, deter_dim: int, hidden_dim: int, action_dim: int, embedding_dim: int) -> None:
+        super().__init__()
+        self.latent_dim, self.deter_dim = latent_dim, deter_dim
+        self.input = NormedLinear(latent_dim + action_dim, hidden_dim)
+        self.gates = nn.Linear(hidden_dim + deter_dim, 3 * deter_dim, bias=False)
+        self.gates_norm = nn.LayerNorm(3 * deter_dim)
+        self.prior_hidden = NormedLinear(deter_dim, hidden_dim)
+        self.prior_output = nn.Linear(hidden_dim, 2 * latent_dim)
+        self.posterior_deter = nn.Linear(deter_dim, embedding_dim, bias=False)
+        self.posterior_norm = nn.LayerNorm(embedding_dim)
+        self.posterior_output = nn.Linear(embedding_dim, 2 * latent_dim)
+
+    def initial(self, rows: int) -> State:
+        """The state before anything was seen or done: zeros."""
+        weight = self.prior_output.weight
+        return State(weight.new_zeros(rows, self.deter_dim), weight.new_zeros(rows, self.latent_dim))
+
+    def advance(self, state: State, action: Tensor) -> Tensor:
+        """The next deterministic state (rows, deter) after action (rows, action)."""
+        hidden = self.input(torch.cat([state.stoch, action], -1))
+        gates = self.gates_norm(self.gates(torch.cat([hidden, state.deter.to(hidden.dtype)], -1)))
+        reset, candidate, update = gates.chunk(3, -1)
+        candidate = torch.tanh(torch.sigmoid(reset) * candidate)
+        return torch.lerp(state.deter, candidate.to(state.deter.dtype), torch.sigmoid(update - 1.0).to(state.deter.dtype))
+
+    def prior(self, deter: Tensor) -> Gaussian:
+        """What the latent will be, judged from the past alone, for deter (..., deter)."""
+        return _gaussian(self.prior_output(self.prior_hidden(deter)))
+
+    def posterior(self, deter: Tensor, embedding: Tensor) -> Gaussian:
+        """What the latent is, given deter (..., deter) and the frame's embedding (..., embedding)."""
+        hidden = functional.silu(self.posterior_norm(self.posterior_deter(deter) + embedding))
+        return _gaussian(self.posterior_output(hidden))
+
+    def observe(self, embeddings: Tensor, actions: Tensor, deter: Tensor, noise: Tensor) -> tuple[State, Gaussian]:
+        """Follow a sequence of frames.
+
+        Args:
+            embeddings: Of the frames, (batch, time + 1, embedding).
+            actions: Taken between them, in [-1, 1], (batch, time, action).
+            deter: Deterministic state at the first frame, (batch, deter).
+            noise: Standard normal draws for the latents, (batch, time + 1, latent).
+
+        Returns:
+            The states and their posteriors, (batch, time + 1, ...) each.
+        """
+        deters, stochs, posteriors = [], [], []
+        for time in range(embeddings.shape[1]):
+            if time > 0:
+                deter = self.advance(State(deter, stochs[-1]), actions[:, time - 1])
+            posterior = self.posterior(deter, embeddings[:, time])
+            deters.append(deter)
+            stochs.append(posterior.mean + posterior.std * noise[:, time])
+            posteriors.append(posterior)
+        means, stds = (torch.stack(part, 1) for part in zip(*posteriors, strict=True))
+        return State(torch.stack(deters, 1), torch.stack(stochs, 1)), Gaussian(means, stds)
+
+
+def kl_divergence(left: Gaussian, right: Gaussian) -> Tensor:
+    """KL(left || right) in nats, summed over the latent: (...)."""
+    ratio = (left.std / right.std).square()
+    distance = ((left.mean - right.mean) / right.std).square()
+    return 0.5 * (ratio + distance - 1.0 - ratio.log()).sum(-1)
+
+
+def _gaussian(raw: Tensor) -> Gaussian:
+    mean, raw_std = raw.float().chunk(2, -1)
+    return Gaussian(mean, 2.0 * torch.sigmoid(raw_std / 2.0) + MIN_STD)

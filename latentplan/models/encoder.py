@@ -1,0 +1,42 @@
+"""Frames to embeddings."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import torch
+from einops import rearrange
+from torch import Tensor, nn
+from torch.nn import functional
+
+FRAME_SIZE = 64
+PATCH = 4
+
+
+class Encoder(nn.Module):
+    """Patches of 4 x 4 pixels through one matrix product, strided convolutions, and one linear layer.
+
+    The patches are a stride-4 convolution written as a product, which is what the CPU is fast at; the whole
+    64 x 64 picture is read.
+    """
+
+    def __init__(self, channels: tuple[int, ...], embedding_dim: int) -> None:
+        super().__init__()
+        self.patches = nn.Linear(3 * PATCH * PATCH, channels[0])
+        self.convolutions = nn.ModuleList(
+            nn.Conv2d(before, after, kernel_size=4, stride=2, padding=1) for before, after in pairwise(channels)
+        ).to(memory_format=torch.channels_last)
+        side = FRAME_SIZE // PATCH // 2 ** (len(channels) - 1)
+        self.linear = nn.Linear(channels[-1] * side * side, embedding_dim)
+
+    def forward(self, frames: Tensor) -> Tensor:
+        """Embed uint8 frames (rows, 64, 64, 3) as float32 (rows, embedding)."""
+        patches = rearrange(
+            frames, "rows (height y) (width x) channel -> rows height width (y x channel)", y=PATCH, x=PATCH
+        )
+        patches = patches.to(self.patches.weight.dtype).mul_(1.0 / 255.0).sub_(0.5)
+        tokens = functional.silu(self.patches(patches))
+        features = rearrange(tokens, "rows height width channel -> rows channel height width")
+        for convolution in self.convolutions:
+            features = functional.silu(convolution(features))
+        return self.linear(rearrange(features, "rows channel height width -> rows (height width channel)")).float()

@@ -1,0 +1,98 @@
+"""The world model: encoder, latent dynamics and heads, and the planner's view of them."""
+
+from __future__ import annotations
+
+from contextlib import AbstractContextManager
+
+import torch
+from torch import Tensor, nn
+
+from latentplan.config import ModelConfig
+from latentplan.models.decoder import Decoder
+from latentplan.models.dynamics import Rssm, State
+from latentplan.models.encoder import Encoder
+from latentplan.models.heads import Actor, Mlp, ScalarHead, sample_action
+
+
+class WorldModel(nn.Module):
+    """Everything an agent needs to see, imagine, judge and act.
+
+    Args:
+        config: Sizes.
+        action_dim: Size of the action, taken from the environment.
+
+    The methods `step`, `rollout`, `value`, `policy` and `continues` are the planner's protocol. They follow the
+    mean of the prior, so that a plan's return is a function of its actions alone.
+    """
+
+    def __init__(self, config: ModelConfig, action_dim: int) -> None:
+        super().__init__()
+        self.config, self.action_dim = config, action_dim
+        embedding_dim, features = config.hidden_dim, config.deter_dim + config.latent_dim
+        self.encoder = Encoder(config.encoder_channels, embedding_dim)
+        self.dynamics = Rssm(config.latent_dim, config.deter_dim, config.hidden_dim, action_dim, embedding_dim)
+        self.decoder = Decoder(features, config.decoder_channels)
+        self.reward_head = ScalarHead(features, config.hidden_dim, config.num_bins)
+        self.continue_head = Mlp(features, config.hidden_dim, 1)
+        self.value_head = ScalarHead(features, config.hidden_dim, config.num_bins)
+        self.actor = Actor(features, config.hidden_dim, action_dim)
+
+    def trunk_precision(self) -> AbstractContextManager[None]:
+        """Autocast to bfloat16 for the products in the trunk; heads leave it by themselves."""
+        return torch.autocast(self.device.type, dtype=torch.bfloat16)
+
+    @property
+    def device(self) -> torch.device:
+        """Where the parameters live."""
+        return self.dynamics.prior_output.weight.device
+
+    def infer(self, state: State, action: Tensor, frames: Tensor) -> State:
+        """The belief after acting and seeing: posterior mean after `action` (rows, action) led to `frames`.
+
+        Args:
+            state: Belief before the action.
+            action: In [-1, 1], (rows, action).
+            frames: uint8 (rows, 64, 64, 3).
+        """
+        return self.see(self.dynamics.advance(state, action), frames)
+
+    def see(self, deter: Tensor, frames: Tensor) -> State:
+        """The belief with posterior mean for deter (rows, deter) and uint8 frames (rows, 64, 64, 3)."""
+        return State(deter, self.dynamics.posterior(deter, self.encoder(frames)).mean)
+
+    def step(self, state: State, action: Tensor) -> tuple[State, Tensor]:
+        """Imagine one decision: the next state, and the reward (rows,) that arrives with it."""
+        with self.trunk_precision():
+            following = self._advance_mean(state, action)
+            return following, self.reward_head.mean(self.reward_head(following.features))
+
+    def rollout(self, state: State, actions: Tensor) -> tuple[Tensor, State]:
+        """Imagine action sequences (rows, horizon, action): rewards (rows, horizon) and the last state."""
+        features = []
+        with self.trunk_precision():
+            for action in actions.unbind(1):
+                state = self._advance_mean(state, action)
+                features.append(state.features)
+            return self.reward_head.mean(self.reward_head(torch.stack(features, 1))), state
+
+    def value(self, state: State) -> Tensor:
+        """Expected discounted return from a state on, (rows,)."""
+        with self.trunk_precision():
+            return self.value_head.mean(self.value_head(state.features))
+
+    def policy(self, state: State, generator: torch.Generator | None = None) -> Tensor:
+        """The actor's action (rows, action): a sample when a generator is given, else its mode."""
+        with self.trunk_precision():
+            mean, std = self.actor(state.features)
+        if generator is None:
+            return mean
+        return sample_action(mean, std, torch.randn(mean.shape, generator=generator, device=mean.device))
+
+    def continues(self, state: State) -> Tensor:
+        """Probability (rows,) that the episode goes on at a state."""
+        with self.trunk_precision():
+            return torch.sigmoid(self.continue_head(state.features)).squeeze(-1)
+
+    def _advance_mean(self, state: State, action: Tensor) -> State:
+        deter = self.dynamics.advance(state, action)
+        return State(deter, self.dynamics.prior(deter).mean)

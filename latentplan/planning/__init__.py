@@ -1,0 +1,48 @@
+"""Planning in any model: cross-entropy search, objectives, constraints and receding-horizon control.
+
+Imports torch, einops and numpy, and of this project only the settings.
+"""
+
+from latentplan.planning.adapters import CEMTrajectoryOptimizer
+from latentplan.planning.cem import CEMPlanner
+from latentplan.planning.check import check_model
+from latentplan.planning.controller import ModelPredictiveController
+from latentplan.planning.elites import refit
+from latentplan.planning.family import icem_planner, mppi_planner
+from latentplan.planning.model import FunctionModel, Model
+from latentplan.planning.objectives import (
+    Objective,
+    Rollout,
+    action_penalty,
+    at_every_state,
+    goal_term,
+    learned_return,
+    risk,
+    smoothness_penalty,
+    terminal_value,
+    uncertainty_penalty,
+)
+from latentplan.planning.plan import Plan
+
+__all__ = [
+    "CEMPlanner",
+    "CEMTrajectoryOptimizer",
+    "FunctionModel",
+    "Model",
+    "ModelPredictiveController",
+    "Objective",
+    "Plan",
+    "Rollout",
+    "action_penalty",
+    "at_every_state",
+    "check_model",
+    "goal_term",
+    "icem_planner",
+    "learned_return",
+    "mppi_planner",
+    "refit",
+    "risk",
+    "smoothness_penalty",
+    "terminal_value",
+    "uncertainty_penalty",
+]

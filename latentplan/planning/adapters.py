@@ -1,0 +1,145 @@
+"""The search for models that are one NumPy function of a state and an action sequence.
+
+Same equations, same planner; only the arrays and the names of the arguments differ.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from latentplan.planning.cem import CEMPlanner
+from latentplan.planning.elites import refit
+from latentplan.planning.plan import Plan
+
+RolloutFunction = Callable[[np.ndarray, np.ndarray], float]
+
+
+class CEMTrajectoryOptimizer:
+    """Cross-entropy search with a function `rollout_fn(state, sequence) -> return`, one sequence at a time.
+
+    Args:
+        horizon: Steps of a sequence.
+        action_dim: Numbers in an action.
+        num_candidates: Sequences per iteration, the present mean among them.
+        num_elites: Best sequences that refit the distribution.
+        num_iterations: Refits.
+        smoothing: Weight of the new statistics, in (0, 1].
+        action_low: Lowest action.
+        action_high: Highest action.
+        seed: Of the sampling noise; the optimizer keeps its own stream.
+    """
+
+    def __init__(
+        self,
+        horizon: int,
+        action_dim: int,
+        num_candidates: int = 100,
+        num_elites: int = 10,
+        num_iterations: int = 5,
+        smoothing: float = 0.8,
+        action_low: float = -1.0,
+        action_high: float = 1.0,
+        seed: int = 0,
+    ) -> None:
+        self.horizon = horizon
+        self.action_dim = action_dim
+        self.num_candidates = num_candidates
+        self.num_elites = num_elites
+        self.num_iterations = num_iterations
+        self.smoothing = smoothing
+        self.action_low = action_low
+        self.action_high = action_high
+        self._planner = CEMPlanner(
+            action_dim=action_dim,
+            horizon=horizon,
+            num_samples=num_candidates,
+            num_elites=num_elites,
+            num_iterations=num_iterations,
+            smoothing=smoothing,
+            action_low=action_low,
+            action_high=action_high,
+            init_std=1.0,
+        )
+        self._generator = torch.Generator().manual_seed(seed)
+
+    def plan(
+        self, initial_state: np.ndarray, rollout_fn: RolloutFunction, warm_start_mean: np.ndarray | None = None
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Mean and variance of the searched sequence, float64 (horizon, action) each.
+
+        Args:
+            initial_state: Handed to `rollout_fn` as it is.
+            rollout_fn: `rollout_fn(initial_state, sequence (horizon, action)) -> return`, maximised.
+            warm_start_mean: Where to start, (horizon, action); None starts at zeros.
+        """
+        model = _RolloutModel(initial_state, rollout_fn)
+        previous = None if warm_start_mean is None else _plan_around(warm_start_mean)
+        nothing = torch.zeros(1, 0, dtype=torch.float64)  # the rollout function holds the state
+        plan = self._planner.plan(model, nothing, previous, generator=self._generator)
+        return plan.mean[0].numpy(), plan.var[0].numpy()
+
+    def step_numerical_example(
+        self,
+        candidates: np.ndarray,
+        returns: np.ndarray,
+        prior_mean: np.ndarray,
+        prior_var: np.ndarray,
+        num_elites: int = 2,
+        smoothing: float = 0.8,
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """One refit by hand: the new mean and variance (horizon, action), and the first action (action,)."""
+        arrays = (torch.as_tensor(array) for array in (candidates, returns, prior_mean, prior_var))
+        mean, var = refit(*arrays, num_elites=num_elites, smoothing=smoothing)
+        return mean.numpy(), var.numpy(), mean[0].numpy()
+
+
+class RolloutController:
+    """Receding-horizon control with a `CEMTrajectoryOptimizer`; what `ModelPredictiveController` becomes for one.
+
+    Args:
+        optimizer: What searches.
+        rollout_fn: `rollout_fn(state, sequence) -> return`.
+    """
+
+    def __init__(self, optimizer: CEMTrajectoryOptimizer, rollout_fn: RolloutFunction) -> None:
+        self.optimizer = optimizer
+        self.rollout_fn = rollout_fn
+        self.warm_start: np.ndarray | None = None
+
+    def act(self, current_state: np.ndarray) -> np.ndarray:
+        """The first action (action,) of a new plan; the rest, padded with zeros, starts the next search."""
+        mean, _ = self.optimizer.plan(current_state, self.rollout_fn, self.warm_start)
+        self.warm_start = np.zeros_like(mean)
+        self.warm_start[:-1] = mean[1:]
+        return mean[0]
+
+    def reset(self) -> None:
+        """Forgets the last plan."""
+        self.warm_start = None
+
+
+class _RolloutModel:
+    """A fused rollout made of calls to a function; the whole return counts as the first reward."""
+
+    def __init__(self, state: np.ndarray, rollout_fn: RolloutFunction) -> None:
+        self._state, self._rollout_fn = state, rollout_fn
+
+    def step(self, state: Tensor, action: Tensor) -> tuple[Tensor, Tensor]:
+        raise NotImplementedError("a rollout function imagines whole sequences only")
+
+    def rollout(self, state: Tensor, actions: Tensor) -> tuple[Tensor, Tensor]:
+        rewards = torch.zeros(actions.shape[:2], dtype=torch.float64)
+        for row, sequence in enumerate(actions.numpy()):
+            rewards[row, 0] = float(self._rollout_fn(self._state, sequence))
+        return rewards, state
+
+
+def _plan_around(mean: np.ndarray) -> Plan:
+    """A plan to start from, none of which has been executed."""
+    sequence = torch.as_tensor(mean, dtype=torch.float64)[None]
+    zero = torch.zeros(1, dtype=torch.long)
+    return Plan(sequence, sequence, torch.ones_like(sequence), torch.zeros(1), {}, None, zero == 0, zero)

@@ -1,0 +1,191 @@
+"""The cross-entropy method over action sequences, as a planner."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from latentplan.config import PlannerConfig
+from latentplan.planning.model import Model, State, per_dimension
+from latentplan.planning.objectives import Constraint, Term
+from latentplan.planning.plan import Plan
+from latentplan.planning.sampling import Generators
+from latentplan.planning.search import Search
+
+Bound = float | Sequence[float] | Tensor
+_CHOICES = {
+    "start": ("shifted", "policy", "both"),
+    "final": ("mean", "best"),
+    "tail": ("zero", "hold", "policy"),
+    "warm_start_variance": ("reset", "keep", "inflate"),
+}
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class CEMPlanner:
+    """Searches action sequences by refitting a Gaussian to its best samples, inside a model.
+
+    A search keeps nothing: the last plan is passed in, and every option is fixed at construction.
+
+    Attributes:
+        action_dim: Numbers in an action.
+        horizon: Model steps that a plan looks ahead.
+        num_samples: Candidates per iteration, proposals included; those kept from earlier iterations come on top.
+        num_elites: Best candidates that refit the search distribution.
+        num_iterations: Refits of a cold start.
+        warm_start_iterations: Refits when the last plan is handed on; None takes `num_iterations`.
+        smoothing: Weight of the new statistics in the Polyak update of mean and variance, in (0, 1].
+        action_low: Lowest action, one number or one per dimension.
+        action_high: Highest action, one number or one per dimension.
+        init_std: Standard deviation at the start of a search, in action units; None takes half the range.
+        min_std: Floor of the sampling standard deviation, in action units.
+        discount: Discount per model step, in (0, 1].
+        num_policy_samples: Candidates proposed by the model's policy, its mode first; 0 leaves the policy out.
+        warm_start: Whether a search starts from the shifted last plan.
+        terminal_value: Whether the model's value completes the return; None does so when the model has one.
+        use_continues: Whether the model's probability of going on discounts what follows.
+        start: Centre of the search: `shifted` (the last plan), `policy` (its mode sequence) or `both` (half the
+            candidates of the first iteration around each). Without policy samples it is `shifted`.
+        tail: What fills the end of the shifted plan: `zero`, `hold` or `policy`.
+        warm_start_variance: Variance of a warm start: `reset`, `keep`, or `inflate` (halfway between these).
+        final: What is executed: the `mean` of the distribution or the `best` candidate.
+        noise_beta: Exponent of coloured sampling noise, 0 for white; larger is smoother over the horizon.
+        keep_elite_fraction: Share of the elites that stay candidates in the next iteration and, shifted, the next plan.
+        stop_std: Stop early where the search distribution is narrower than this everywhere, in action units; 0 never.
+        temperature: None weighs elites alike; a number weighs them by exp(return / temperature) as MPPI does.
+        adapt_std: Whether the variance is refitted too.
+        gradient_steps: Steps of gradient ascent on the chosen sequence; the model must be differentiable.
+        gradient_step_size: Largest change of an action in the first of these steps, in action units.
+        constraint_penalty: None ranks feasible candidates first; a number subtracts that much per unit of violation.
+    """
+
+    action_dim: int
+    horizon: int
+    num_samples: int = 256
+    num_elites: int = 32
+    num_iterations: int = 4
+    warm_start_iterations: int | None = None
+    smoothing: float = 0.9
+    action_low: Bound = -1.0
+    action_high: Bound = 1.0
+    init_std: Bound | None = None
+    min_std: float = 0.0
+    discount: float = 1.0
+    num_policy_samples: int = 0
+    warm_start: bool = True
+    terminal_value: bool | None = None
+    use_continues: bool = False
+    start: str = "shifted"
+    tail: str = "zero"
+    warm_start_variance: str = "reset"
+    final: str = "mean"
+    noise_beta: float = 0.0
+    keep_elite_fraction: float = 0.0
+    stop_std: float = 0.0
+    temperature: float | None = None
+    adapt_std: bool = True
+    gradient_steps: int = 0
+    gradient_step_size: float = 0.1
+    constraint_penalty: float | None = None
+
+    def __post_init__(self) -> None:
+        _validate(self)
+
+    @property
+    def num_kept(self) -> int:
+        """Elites that stay candidates; at least one when any share is kept."""
+        return 0 if self.keep_elite_fraction == 0 else max(1, round(self.keep_elite_fraction * self.num_elites))
+
+    @classmethod
+    def from_config(
+        cls,
+        config: PlannerConfig,
+        action_dim: int,
+        discount: float,
+        *,
+        action_low: Bound = -1.0,
+        action_high: Bound = 1.0,
+    ) -> CEMPlanner:
+        """The planner that a configuration describes, for actions of `action_dim` numbers."""
+        options: dict[str, Any] = {f.name: getattr(config, f.name) for f in dataclasses.fields(config)}
+        return cls(action_dim=action_dim, discount=discount, action_low=action_low, action_high=action_high, **options)
+
+    def plan(
+        self,
+        model: Model,
+        state: State,
+        previous: Plan | None = None,
+        *,
+        objective: Term | None = None,
+        constraints: Sequence[Constraint] = (),
+        generator: Generators = None,
+    ) -> Plan:
+        """Searches the best action sequence from each state.
+
+        Args:
+            model: What imagines; see `latentplan.planning.model`.
+            state: Where plans start, rows (batch,).
+            previous: The last plan, for a warm start.
+            objective: What is maximised, `objective(rollout) -> (rows,)`; None is the discounted reward, with the
+                terminal value as set.
+            constraints: What candidates must keep: each gives a violation `(rows,)`, 0 where it is kept.
+            generator: One for all environments (each then sees the same noise), or a list of one per environment;
+                None takes torch's default. A plan does not depend on which environments share the call.
+
+        Returns:
+            The plan. Its `info`: `elite_return` and `std` (batch, iteration), `iterations`, `num_nonfinite` and
+            `is_fallback` (batch,) (nothing finite was found, so the last plan's tail or zeros stand in), and
+            `violation` (batch,) of the chosen sequence when there are constraints.
+
+        Raises:
+            ValueError: The model lacks what a setting asks for, or something returned a wrong shape.
+        """
+        # Leaving inference mode keeps the plan usable as a training target, and lets gradient steps work.
+        with torch.inference_mode(False), torch.no_grad():
+            return Search(self, model, state, objective, constraints, generator).run(previous)
+
+
+def _validate(planner: CEMPlanner) -> None:
+    for name in ("action_dim", "horizon", "num_samples", "num_elites", "num_iterations"):
+        if getattr(planner, name) < 1:
+            raise ValueError(f"{name} must be at least 1, got {getattr(planner, name)}")
+    if planner.warm_start_iterations is not None and planner.warm_start_iterations < 1:
+        raise ValueError(f"warm_start_iterations must be at least 1, got {planner.warm_start_iterations}")
+    if planner.num_elites > planner.num_samples:
+        raise ValueError(f"num_elites ({planner.num_elites}) must not exceed num_samples ({planner.num_samples})")
+    if not 0 <= planner.num_policy_samples < planner.num_samples:
+        raise ValueError(
+            f"num_policy_samples ({planner.num_policy_samples}) must lie in 0 to below "
+            f"num_samples ({planner.num_samples})"
+        )
+    for name, allowed in _CHOICES.items():
+        if getattr(planner, name) not in allowed:
+            raise ValueError(f"{name} must be one of {', '.join(allowed)}, got {getattr(planner, name)!r}")
+    for name in ("smoothing", "discount"):
+        if not 0.0 < getattr(planner, name) <= 1.0:
+            raise ValueError(f"{name} must lie in (0, 1], got {getattr(planner, name)}")
+    for name in ("min_std", "noise_beta", "stop_std", "constraint_penalty", "gradient_steps"):
+        if (getattr(planner, name) or 0.0) < 0.0:
+            raise ValueError(f"{name} must be at least 0, got {getattr(planner, name)}")
+    if not 0.0 <= planner.keep_elite_fraction <= 1.0:
+        raise ValueError(f"keep_elite_fraction must lie in [0, 1], got {planner.keep_elite_fraction}")
+    for name in ("temperature", "gradient_step_size"):
+        if getattr(planner, name) is not None and getattr(planner, name) <= 0.0:
+            raise ValueError(f"{name} must be above 0, got {getattr(planner, name)}")
+    _validate_bounds(planner)
+
+
+def _validate_bounds(planner: CEMPlanner) -> None:
+    low = per_dimension(planner.action_low, planner.action_dim, "action_low")
+    high = per_dimension(planner.action_high, planner.action_dim, "action_high")
+    if not bool((low < high).all()):
+        raise ValueError(f"action_low {low.tolist()} must lie below action_high {high.tolist()}")
+    if planner.init_std is not None:
+        init_std = per_dimension(planner.init_std, planner.action_dim, "init_std")
+        if not bool((init_std >= 0).all()):
+            raise ValueError(f"init_std must be at least 0, got {init_std.tolist()}")

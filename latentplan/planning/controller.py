@@ -1,0 +1,127 @@
+"""Receding-horizon control: plan, execute the first actions, shift, plan again."""
+
+from __future__ import annotations
+
+import time
+from collections import deque
+from collections.abc import Sequence
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from latentplan.planning.adapters import CEMTrajectoryOptimizer, RolloutController
+from latentplan.planning.cem import CEMPlanner
+from latentplan.planning.model import Model, State, count_rows, state_device
+from latentplan.planning.objectives import Constraint, Term
+from latentplan.planning.plan import Plan
+from latentplan.planning.sampling import Generators
+
+
+class ModelPredictiveController:
+    """Acts by planning anew at every step, or every few, and hands each plan on to the next search.
+
+    With a `CEMTrajectoryOptimizer` and a rollout function in place of planner and model, it is a `RolloutController`.
+
+    Args:
+        planner: What searches.
+        model: What it searches in.
+        objective: What is maximised; see `CEMPlanner.plan`.
+        constraints: What plans must keep.
+        generator: Random stream, or one per environment.
+        replan_every: Actions executed from each plan; at most the planner's horizon.
+
+    Raises:
+        ValueError: `replan_every` does not lie in 1 to the horizon.
+    """
+
+    def __new__(cls, *args: Any, **kwargs: Any) -> Any:
+        """A controller for what it is given: a planner and a model, or an optimizer and a rollout function."""
+        if "optimizer" in kwargs or (args and isinstance(args[0], CEMTrajectoryOptimizer)):
+            return RolloutController(*args, **kwargs)
+        return super().__new__(cls)
+
+    def __init__(
+        self,
+        planner: CEMPlanner,
+        model: Model,
+        *,
+        objective: Term | None = None,
+        constraints: Sequence[Constraint] = (),
+        generator: Generators = None,
+        replan_every: int = 1,
+    ) -> None:
+        if not 1 <= replan_every <= planner.horizon:
+            raise ValueError(f"replan_every ({replan_every}) must lie in 1 to the horizon ({planner.horizon})")
+        self.planner = planner
+        self.model = model
+        self.objective = objective
+        self.constraints = constraints
+        self.generator = generator
+        self.replan_every = replan_every
+        self.plan: Plan | None = None
+        self._is_stale = False
+        self._latencies_ms: deque[float] = deque(maxlen=10_000)
+
+    def act(self, state: State) -> Tensor:
+        """The next action from each state, (batch, action).
+
+        Args:
+            state: Where each environment is now, rows (batch,).
+        """
+        started = time.perf_counter()
+        if self.plan is None or self.plan.mean.shape[0] != count_rows(state):
+            self.plan = self._search(state, None)
+            is_due = torch.ones(count_rows(state), dtype=torch.bool)
+        else:
+            is_due = ~self.plan.is_warm | (self.plan.elapsed >= self.replan_every) | self._is_stale
+            if bool(is_due.all()):
+                self.plan = self._search(state, self.plan)
+            elif bool(is_due.any()):
+                self.plan = self.plan.updated(is_due, self._search(state, self.plan))
+        self._is_stale = False
+        action = self.plan.actions[torch.arange(len(is_due)), self.plan.elapsed]
+        self.plan = self.plan.executed(self.plan.elapsed + 1)
+        if state_device(state).type == "cuda":
+            torch.cuda.synchronize(state_device(state))
+        self._latencies_ms.append(1000 * (time.perf_counter() - started))
+        return action
+
+    def reset(self, mask: Tensor | None = None) -> None:
+        """Forgets the plan, so that the next search starts cold.
+
+        Args:
+            mask: Environments that start anew, (batch,) bool; None is all of them.
+        """
+        if mask is None:
+            self.plan = None
+        elif self.plan is not None:
+            self.plan = self.plan.forget(mask)
+
+    def set_objective(self, objective: Term | None) -> None:
+        """Changes what is maximised, from the next action on; the last plan stays where the search starts."""
+        self.objective = objective
+        self._is_stale = True  # what was planned for the old objective is not executed further
+
+    @property
+    def latency(self) -> dict[str, float]:
+        """Milliseconds from state to action over the last 10,000 decisions: `mean_ms`, `p50_ms`, `p95_ms`, `p99_ms`.
+
+        Empty before the first action.
+        """
+        if not self._latencies_ms:
+            return {}
+        times = torch.tensor(list(self._latencies_ms), dtype=torch.float64)
+        p50, p95, p99 = torch.quantile(times, torch.tensor([0.5, 0.95, 0.99], dtype=torch.float64)).tolist()
+        return {"mean_ms": float(times.mean()), "p50_ms": p50, "p95_ms": p95, "p99_ms": p99}
+
+    def _search(self, state: State, previous: Plan | None) -> Plan:
+        plan = self.planner.plan(
+            self.model,
+            state,
+            previous,
+            objective=self.objective,
+            constraints=self.constraints,
+            generator=self.generator,
+        )
+        return plan.executed(torch.zeros_like(plan.elapsed))

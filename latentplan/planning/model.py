@@ -1,0 +1,153 @@
+"""What a planner asks of a model, and how bare functions become one.
+
+A model needs one method, `step`. What else it has is detected by name:
+
+    step(state, action) -> (next_state, reward)      state: tensor or pytree, dim 0 = rows; action (rows, action)
+    value(state) -> (rows,)                          worth of a state beyond the horizon
+    policy(state, generator) -> (rows, action)       with a generator it samples, with None it gives the mode
+    continues(state) -> (rows,)                      probability that the episode goes on from this state
+    uncertainty(state, action) -> (rows,)            doubt of the model about that step
+    rollout(state, actions (rows, horizon, action)) -> (rewards (rows, horizon), last_state)     fused fast path
+    particles(state, num) -> state                   several versions of each row, batch-major: (batch num) rows
+
+Every output must depend on its own row only.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any, Protocol
+
+import torch
+from einops import rearrange, repeat
+from torch import Tensor
+from torch.utils._pytree import tree_leaves, tree_map
+
+State = Any  # a tensor, or a pytree (tuple, NamedTuple, dict, list) of tensors, dim 0 = rows
+
+
+class Model(Protocol):
+    """The one method that every model has; the optional ones are listed at the top of this module."""
+
+    def step(self, state: State, action: Tensor) -> tuple[State, Tensor]:
+        """The next state, and the reward (rows,) of taking action (rows, action) in state."""
+        ...
+
+
+class FunctionModel:
+    """A model made of bare functions.
+
+    Args:
+        dynamics: `dynamics(state, action) -> next_state`.
+        reward: `reward(state, action) -> (rows,)`, of the state before the step.
+        value: `value(state) -> (rows,)`, the worth of the state a plan ends in.
+        policy: `policy(state, generator) -> (rows, action)`; the mode when the generator is None.
+        continues: `continues(state) -> (rows,)`, the probability that the episode goes on.
+        uncertainty: `uncertainty(state, action) -> (rows,)`.
+        rollout: `rollout(state, actions) -> (rewards (rows, horizon), last_state)`.
+    """
+
+    def __init__(
+        self,
+        dynamics: Callable[[State, Tensor], State],
+        reward: Callable[[State, Tensor], Tensor],
+        value: Callable[[State], Tensor] | None = None,
+        policy: Callable[[State, torch.Generator | None], Tensor] | None = None,
+        continues: Callable[[State], Tensor] | None = None,
+        uncertainty: Callable[[State, Tensor], Tensor] | None = None,
+        rollout: Callable[[State, Tensor], tuple[Tensor, State]] | None = None,
+    ) -> None:
+        self.dynamics = dynamics
+        self.reward = reward
+        optional = {
+            "value": value,
+            "policy": policy,
+            "continues": continues,
+            "uncertainty": uncertainty,
+            "rollout": rollout,
+        }
+        for name, function in optional.items():
+            if function is not None:  # an absent attribute is how a planner sees that the model cannot do it
+                setattr(self, name, function)
+
+    def step(self, state: State, action: Tensor) -> tuple[State, Tensor]:
+        """The next state, and the reward (rows,) of the step."""
+        return self.dynamics(state, action), self.reward(state, action)
+
+
+def supports(model: object, method: str) -> bool:
+    """Whether the model has this optional method."""
+    return callable(getattr(model, method, None))
+
+
+def require(model: object, method: str, reason: str) -> None:
+    """Refuses a model without a method that a setting needs.
+
+    Raises:
+        ValueError: The model lacks the method.
+    """
+    if not supports(model, method):
+        raise ValueError(f"{reason} needs a model with {method}(), which {type(model).__name__} does not have")
+
+
+def count_rows(state: State) -> int:
+    """Size of dim 0, the same in every tensor of the state.
+
+    Raises:
+        TypeError: Something in the state is not a tensor.
+        ValueError: The state holds no tensor, or tensors whose rows differ.
+    """
+    leaves = tree_leaves(state)
+    for leaf in leaves:
+        if not isinstance(leaf, Tensor):
+            raise TypeError(f"a state is a tensor or a pytree of tensors, but holds a {type(leaf).__name__}")
+    shapes = [tuple(leaf.shape) for leaf in leaves]
+    if not shapes or any(len(shape) == 0 or shape[0] != shapes[0][0] for shape in shapes):
+        raise ValueError(f"every tensor of a state needs the same rows in dim 0, got shapes {shapes}")
+    return shapes[0][0]
+
+
+def repeat_rows(state: State, num: int) -> State:
+    """Each row `num` times, batch-major: row r becomes rows r * num to r * num + num - 1."""
+    return tree_map(lambda leaf: repeat(leaf, "row ... -> (row num) ...", num=num), state)
+
+
+def split_rows(state: State, batch: int) -> State:
+    """Rows (batch sample) seen as (batch, sample, ...), in every tensor of the state."""
+    return tree_map(lambda leaf: rearrange(leaf, "(batch sample) ... -> batch sample ...", batch=batch), state)
+
+
+def action_dtype(state: State) -> torch.dtype:
+    """The precision of actions and returns: float64 for a state in float64, otherwise float32."""
+    is_double = any(leaf.dtype == torch.float64 for leaf in tree_leaves(state))
+    return torch.float64 if is_double else torch.float32
+
+
+def state_device(state: State) -> torch.device:
+    """Where the state's tensors live."""
+    device: torch.device = tree_leaves(state)[0].device
+    return device
+
+
+def per_dimension(value: float | Sequence[float] | Tensor, action_dim: int, name: str) -> Tensor:
+    """The value for each action dimension, (action,), float64.
+
+    Raises:
+        ValueError: Neither one number nor one per dimension, or not finite.
+    """
+    numbers = torch.as_tensor(value, dtype=torch.float64)
+    if numbers.ndim > 1 or numbers.numel() not in (1, action_dim):
+        raise ValueError(f"{name} must be one number or {action_dim} numbers, got shape {tuple(numbers.shape)}")
+    if not bool(torch.isfinite(numbers).all()):
+        raise ValueError(f"{name} must be finite, got {numbers.tolist()}")
+    return numbers.expand(action_dim) if numbers.ndim == 0 or numbers.numel() == 1 else numbers
+
+
+def check_shape(name: str, tensor: Tensor, shape: Sequence[int]) -> None:
+    """Refuses what foreign code returned in another shape.
+
+    Raises:
+        ValueError: The shapes differ; names both.
+    """
+    if tensor.shape != torch.Size(shape):
+        raise ValueError(f"{name} must have shape {tuple(shape)}, got {tuple(tensor.shape)}")

@@ -1,0 +1,258 @@
+"""What a search maximises, and what it must keep.
+
+Terms are added and multiplied, with each other and with numbers:
+
+    learned_return() + terminal_value() + 0.1 * action_penalty() + 5 * goal_term(goal)
+
+Every term is maximised, so penalties are negative. A bare function `function(rollout) -> (rows,)` is a term as well.
+"""
+
+from __future__ import annotations
+
+import operator
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from einops import rearrange, reduce, repeat
+from torch import Tensor
+from torch.nn import functional
+
+from latentplan.planning.model import Model, State, check_shape, require, supports
+
+Term = Callable[["Rollout"], Tensor]
+Constraint = Callable[["Rollout"], Tensor]
+
+
+@dataclass(frozen=True)
+class Rollout:
+    """Imagined trajectories, one per row; rows are (batch sample particle), the batch slowest.
+
+    Attributes:
+        model: What imagined them.
+        batch: Environments that share the rows.
+        num_particles: Rollouts of each candidate.
+        actions: What was done, (rows, horizon, action).
+        rewards: Predicted reward of each step, (rows, horizon), float32 or float64.
+        weights: Discount of each step and, last, of the state after them: (horizon + 1,), or (rows, horizon + 1)
+            when the probability of going on is part of it.
+        start: State before the first step.
+        last_state: State after the last step.
+        states: State after each step, when a term needs them; otherwise empty.
+    """
+
+    model: Any
+    batch: int
+    num_particles: int
+    actions: Tensor
+    rewards: Tensor
+    weights: Tensor
+    start: State
+    last_state: State
+    states: tuple[State, ...]
+
+
+@dataclass(frozen=True)
+class Objective:
+    """A term, or several composed: `objective(rollout) -> (rows,)`, to be maximised.
+
+    Attributes:
+        function: What computes it.
+        needs_states: Whether it looks at the states on the way, which a fused rollout does not give.
+        num_particles: Rollouts of each candidate that it asks for.
+        needs: Methods that the model must have.
+    """
+
+    function: Term
+    needs_states: bool = False
+    num_particles: int = 1
+    needs: tuple[str, ...] = ()
+
+    def __call__(self, rollout: Rollout) -> Tensor:
+        """The term's value for each row, (rows,)."""
+        return self.function(rollout)
+
+    def check(self, model: Model) -> None:
+        """Refuses a model that cannot give what this objective needs.
+
+        Raises:
+            ValueError: The model lacks a method.
+        """
+        for method in self.needs:
+            require(model, method, "this objective")
+
+    def __add__(self, other: Term | float) -> Objective:
+        return _compose(operator.add, self, other)
+
+    def __sub__(self, other: Term | float) -> Objective:
+        return _compose(operator.sub, self, other)
+
+    def __mul__(self, other: Term | float) -> Objective:
+        return _compose(operator.mul, self, other)
+
+    def __neg__(self) -> Objective:
+        return _compose(operator.mul, self, -1.0)
+
+    def __radd__(self, other: Term | float) -> Objective:
+        return self + other
+
+    def __rmul__(self, other: Term | float) -> Objective:
+        return self * other
+
+
+def as_objective(term: Term) -> Objective:
+    """The term as an objective; a bare function is taken to need the states on the way."""
+    return term if isinstance(term, Objective) else Objective(term, needs_states=True)
+
+
+def learned_return() -> Objective:
+    """The predicted reward of every step, discounted and summed."""
+    return Objective(lambda rollout: (rollout.rewards * rollout.weights[..., :-1]).sum(dim=1))
+
+
+def terminal_value() -> Objective:
+    """The model's value of where a rollout ends, discounted."""
+
+    def evaluate(rollout: Rollout) -> Tensor:
+        value = rollout.model.value(rollout.last_state)
+        check_shape("value()", value, rollout.actions.shape[:1])
+        return rollout.weights[..., -1] * value.to(rollout.rewards.dtype)
+
+    return Objective(evaluate, needs=("value",))
+
+
+def goal_term(
+    goal: Tensor,
+    *,
+    metric: str = "mse",
+    over: str = "last",
+    select: Callable[[State], Tensor] | None = None,
+) -> Objective:
+    """Closeness of the imagined states to a goal: minus the distance, so 0 at the goal.
+
+    Args:
+        goal: Features of the goal, (feature,) for all environments or (batch, feature) for one each.
+        metric: `mse` (mean squared error over features) or `cosine` (1 - cosine similarity).
+        over: Distance of the `last` state, their `sum` over the steps, or `min`, that of the closest.
+        select: `select(state) -> (rows, feature)`, what is compared; None for states that are tensors.
+
+    Raises:
+        ValueError: `metric` or `over` is not one of these, or the goal has another rank.
+    """
+    if metric not in ("mse", "cosine") or over not in ("last", "sum", "min"):
+        raise ValueError(f"metric must be mse or cosine and over last, sum or min, got {metric!r} and {over!r}")
+    if goal.ndim not in (1, 2):
+        raise ValueError(f"a goal has shape (feature,) or (batch, feature), got {tuple(goal.shape)}")
+
+    def distance(rollout: Rollout, state: State) -> Tensor:
+        features = state if select is None else select(state)
+        target = goal.to(features)
+        if goal.ndim == 2:
+            check_shape("the goal", goal, (rollout.batch, features.shape[-1]))
+            target = repeat(target, "batch feature -> (batch num) feature", num=len(features) // rollout.batch)
+        if metric == "mse":
+            return (features - target).square().mean(dim=-1)
+        return 1 - functional.cosine_similarity(features, target.expand_as(features), dim=-1)
+
+    def evaluate(rollout: Rollout) -> Tensor:
+        if over == "last":
+            return -distance(rollout, rollout.last_state)
+        distances = torch.stack([distance(rollout, state) for state in rollout.states])
+        return -(distances.sum(dim=0) if over == "sum" else distances.amin(dim=0))
+
+    return Objective(evaluate, needs_states=over != "last")
+
+
+def action_penalty() -> Objective:
+    """Minus the squared size of the actions, summed over steps and dimensions."""
+    return Objective(lambda rollout: -rollout.actions.square().sum(dim=(1, 2)))
+
+
+def smoothness_penalty() -> Objective:
+    """Minus the squared change from each action to the next, summed over steps and dimensions."""
+    return Objective(lambda rollout: -rollout.actions.diff(dim=1).square().sum(dim=(1, 2)))
+
+
+def uncertainty_penalty() -> Objective:
+    """Minus the model's doubt about every step, discounted and summed."""
+
+    def evaluate(rollout: Rollout) -> Tensor:
+        befores = (rollout.start, *rollout.states[:-1])
+        pairs = zip(befores, rollout.actions.unbind(dim=1), strict=True)
+        doubts = torch.stack([rollout.model.uncertainty(state, action) for state, action in pairs], dim=1)
+        check_shape("uncertainty()", doubts, rollout.rewards.shape)
+        return -(rollout.weights[..., :-1] * doubts).sum(dim=1)
+
+    return Objective(evaluate, needs_states=True, needs=("uncertainty",))
+
+
+def risk(objective: Term, *, measure: str = "cvar", num_particles: int = 8, worst_share: float = 0.25) -> Objective:
+    """An objective over several rollouts of each candidate, judged by more than their mean.
+
+    The rollouts differ where the model makes them differ: by `particles(state, num)`, which gives several versions of
+    each state (members of an ensemble, samples of a belief), or by a step that samples.
+
+    Args:
+        objective: What each rollout is judged by.
+        measure: `mean`, `worst`, or `cvar`: the mean of the worst share.
+        num_particles: Rollouts per candidate.
+        worst_share: Share of the rollouts that `cvar` looks at, in (0, 1].
+
+    Raises:
+        ValueError: An argument is not one of these.
+    """
+    if measure not in ("mean", "worst", "cvar"):
+        raise ValueError(f"measure must be mean, worst or cvar, got {measure!r}")
+    if num_particles < 1 or not 0.0 < worst_share <= 1.0:
+        raise ValueError(f"risk needs particles and a share in (0, 1], got {num_particles} and {worst_share}")
+    inner = as_objective(objective)
+    num_worst = {"mean": num_particles, "worst": 1, "cvar": max(1, round(worst_share * num_particles))}[measure]
+
+    def evaluate(rollout: Rollout) -> Tensor:
+        values = rearrange(inner(rollout), "(row particle) -> row particle", particle=rollout.num_particles)
+        worst = torch.topk(values, num_worst, dim=1, largest=False).values.mean(dim=1)
+        # NaN sorts as the largest number: without this it would hide among the particles that do not count.
+        worst = worst.masked_fill(values.isnan().any(dim=1), float("nan"))
+        return repeat(worst, "row -> (row particle)", particle=rollout.num_particles)
+
+    return Objective(evaluate, inner.needs_states, num_particles, inner.needs)
+
+
+def at_every_state(function: Callable[[State], Tensor]) -> Objective:
+    """The constraint that `function(state) -> (rows,)` is at most 0 in every imagined state.
+
+    Its violation is what exceeds 0, summed over the steps.
+    """
+
+    def violation(rollout: Rollout) -> Tensor:
+        excess = torch.stack([function(state) for state in rollout.states])
+        return reduce(excess.clamp_min(0.0), "step rows -> rows", "sum")
+
+    return Objective(violation, needs_states=True)
+
+
+def predicted_return(model: Model, use_value: bool | None) -> Objective:
+    """The default objective: reward, and the terminal value if asked for (None: if the model has one)."""
+    if use_value is None:
+        use_value = supports(model, "value")
+    if use_value:
+        require(model, "value", "terminal_value=True")
+    return learned_return() + terminal_value() if use_value else learned_return()
+
+
+def _compose(operation: Callable[[Any, Any], Any], left: Objective, right: Term | float) -> Objective:
+    if isinstance(right, int | float):
+        return Objective(
+            lambda rollout: operation(left(rollout), right), left.needs_states, left.num_particles, left.needs
+        )
+    other = as_objective(right)
+    particles = {left.num_particles, other.num_particles} - {1}
+    if len(particles) > 1:
+        raise ValueError(f"terms of one objective must agree on num_particles, got {sorted(particles)}")
+    return Objective(
+        lambda rollout: operation(left(rollout), other(rollout)),
+        left.needs_states or other.needs_states,
+        max(left.num_particles, other.num_particles),
+        (*left.needs, *other.needs),
+    )

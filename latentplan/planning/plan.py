@@ -1,0 +1,130 @@
+"""The result of a search, as a value: planners keep nothing between calls, callers pass the last plan on."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any
+
+import torch
+from einops import rearrange
+from torch import Tensor
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What a search found, for every environment in the call.
+
+    Attributes:
+        actions: The chosen sequence within the bounds, (batch, horizon, action).
+        mean: Mean of the search distribution, (batch, horizon, action).
+        var: Variance of the search distribution, (batch, horizon, action).
+        expected_return: Predicted return of what the choice rests on, (batch,): of the last elites on average, or of
+            the best candidate when that is executed. NaN where nothing finite was found.
+        info: Diagnostics, each (batch,) or (batch, iteration); see `CEMPlanner.plan`.
+        elites: Kept elites, (batch, kept, horizon, action), when the planner keeps some.
+        is_warm: Whether the next search may start here, (batch,) bool on the CPU.
+        elapsed: Actions executed since this plan was made, (batch,) on the CPU; the next search shifts by as many.
+    """
+
+    actions: Tensor
+    mean: Tensor
+    var: Tensor
+    expected_return: Tensor
+    info: dict[str, Tensor]
+    elites: Tensor | None
+    is_warm: Tensor
+    elapsed: Tensor
+
+    @property
+    def action(self) -> Tensor:
+        """The first action of the chosen sequence, (batch, action)."""
+        return self.actions[:, 0]
+
+    def forget(self, mask: Tensor) -> Plan:
+        """The same plan, except that environments in mask (batch,) bool start their next search cold."""
+        return replace(self, is_warm=self.is_warm & ~mask.to("cpu", torch.bool))
+
+    def executed(self, elapsed: Tensor) -> Plan:
+        """The same plan, `elapsed` (batch,) of whose actions have been executed."""
+        return replace(self, elapsed=elapsed)
+
+    def updated(self, mask: Tensor, new: Plan) -> Plan:
+        """This plan, with the environments in mask (batch,) bool taken from a newer one."""
+
+        def choose(old: Any, fresh: Any) -> Any:
+            if not isinstance(old, Tensor) or not isinstance(fresh, Tensor) or old.shape != fresh.shape:
+                return fresh  # diagnostics of another length describe the newer search only
+            chosen = rearrange(mask.to(old.device), f"batch -> batch {' '.join(['1'] * (old.ndim - 1))}")
+            return torch.where(chosen, fresh, old)
+
+        info = {name: choose(self.info.get(name), value) for name, value in new.info.items()}
+        fields = ("actions", "mean", "var", "expected_return", "elites", "is_warm", "elapsed")
+        return Plan(info=info, **{name: choose(getattr(self, name), getattr(new, name)) for name in fields})
+
+
+@dataclass(frozen=True)
+class WarmStart:
+    """The last plan, moved to the present.
+
+    Attributes:
+        mean: Shifted plan with its tail filled, zeros where cold, within the bounds, (batch, horizon, action).
+        var: Variance to search with, (batch, horizon, action).
+        elites: Shifted elites, (batch, kept, horizon, action), if any were kept.
+        is_warm: (batch,) bool on the CPU.
+    """
+
+    mean: Tensor
+    var: Tensor
+    elites: Tensor | None
+    is_warm: Tensor
+
+
+def shift_plan(
+    previous: Plan,
+    *,
+    tail: str,
+    variance: str,
+    initial_var: Tensor,
+    bounds: tuple[Tensor, Tensor],
+    policy_tail: Callable[[Tensor, Tensor], Tensor],
+) -> WarmStart:
+    """Moves a plan forward by the actions executed since, and fills what that leaves open at its end.
+
+    Args:
+        previous: The last plan.
+        tail: `zero`, `hold` (the last action again) or `policy`.
+        variance: `reset` to the initial variance, `keep`, or `inflate` halfway between the two.
+        initial_var: Variance of a cold start, (action,).
+        bounds: Lowest and highest action, each (action,).
+        policy_tail: `policy_tail(sequence, is_tail) -> sequence` fills by the model's policy.
+    """
+    batch, horizon, _ = previous.mean.shape
+    device, low, high = previous.mean.device, *bounds
+    position = torch.arange(horizon)[None] + previous.elapsed[:, None]
+    is_tail = (position >= horizon).to(device)[..., None]  # (batch, horizon, 1)
+    index = position.clamp_max(horizon - 1).to(device)[..., None]
+
+    def move(sequence: Tensor) -> Tensor:
+        return torch.take_along_dim(sequence, index, dim=1)  # past its end this repeats the last action: `hold`
+
+    is_warm = previous.is_warm.to(device)[:, None, None]
+    zeros = torch.zeros_like(low).clamp(low, high)
+    mean = move(previous.actions)
+    if tail == "zero":
+        mean = torch.where(is_tail, zeros, mean)
+    elif tail == "policy":
+        mean = policy_tail(mean, is_tail)
+    mean = torch.where(is_warm, mean.clamp(low, high), zeros)
+
+    var = initial_var.expand_as(mean)
+    if variance != "reset":
+        kept = torch.where(is_tail, var, move(previous.var))
+        kept = kept if variance == "keep" else (kept + var) / 2
+        var = torch.where(is_warm, kept, var)
+
+    elites = previous.elites
+    if elites is not None:
+        elites = torch.take_along_dim(elites, index[:, None], dim=2)
+        elites = torch.where(is_tail[:, None], mean[:, None], elites).clamp(low, high)
+    return WarmStart(mean, var, elites, previous.is_warm)

@@ -1,0 +1,270 @@
+"""One search, from the candidates to the plan: the loop that every planner of the family runs."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import torch
+from torch import Tensor
+from torch.utils._pytree import tree_map
+
+from latentplan.planning.elites import Elites, Scores, mean_return, move_towards, select_elites
+from latentplan.planning.gradient import ascend
+from latentplan.planning.imagination import Scorer
+from latentplan.planning.model import Model, State, action_dtype, count_rows, per_dimension, state_device
+from latentplan.planning.objectives import Constraint, Term
+from latentplan.planning.plan import Plan, WarmStart, shift_plan
+from latentplan.planning.sampling import Generators, Streams
+
+if TYPE_CHECKING:
+    from latentplan.planning.cem import CEMPlanner
+
+Candidates = tuple[Tensor, Scores]  # sequences (batch, sample, horizon, action) and how good they are
+
+
+class _Progress(NamedTuple):
+    """Where a search stands; dim 0 of everything is the environment, so that those that are done can be frozen."""
+
+    mean: Tensor
+    var: Tensor
+    elites: Elites | None
+    expected_return: Tensor
+    num_nonfinite: Tensor
+    iterations: Tensor
+    is_found: Tensor
+
+
+class Search:
+    """The search problem of one call, and the settings it is solved with.
+
+    Args:
+        options: The planner whose settings hold.
+        model: What imagines.
+        state: Where plans start, rows (batch,).
+        objective: What is maximised; None for the predicted return.
+        constraints: What candidates must keep.
+        generator: See `CEMPlanner.plan`.
+
+    Raises:
+        ValueError: The model lacks what a setting asks for.
+    """
+
+    def __init__(
+        self,
+        options: CEMPlanner,
+        model: Model,
+        state: State,
+        objective: Term | None,
+        constraints: Sequence[Constraint],
+        generator: Generators,
+    ) -> None:
+        self.options, self.state = options, state
+        self.batch, self.device, self.dtype = count_rows(state), state_device(state), action_dtype(state)
+        self.low = self._constant(options.action_low, "action_low")
+        self.high = self._constant(options.action_high, "action_high")
+        half_range = (self.high - self.low) / 2
+        self.init_std = half_range if options.init_std is None else self._constant(options.init_std, "init_std")
+        self.streams = Streams(generator, self.batch, self.device)
+        discounts = options.discount ** torch.arange(options.horizon + 1, dtype=self.dtype, device=self.device)
+        self.scorer = Scorer.build(
+            model,
+            objective,
+            constraints,
+            discounts,
+            terminal_value=options.terminal_value,
+            use_continues=options.use_continues,
+            penalty=options.constraint_penalty,
+        )
+
+    def run(self, previous: Plan | None) -> Plan:
+        """The plan, warm-started from the last one in the environments where it may be."""
+        options = self.options
+        last = self._cold_start() if previous is None else self._shift(previous)
+        start = last if options.warm_start else self._cold_start()
+        proposals: list[Candidates] = []
+        if options.num_policy_samples:
+            generators, bounds = self.streams.policy_generators(), (self.low, self.high)
+            proposals = [self.scorer.propose(self.state, options.num_policy_samples, generators, bounds)]
+        progress, history = self._iterate(start, proposals)
+        # Where nothing finite was found: the last plan's tail, or zeros clamped into the bounds.
+        mean = torch.where(progress.is_found[:, None, None], progress.mean, last.mean).clamp(self.low, self.high)
+        actions, expected, violation = self._choose(progress, mean)
+        if options.gradient_steps:
+            actions, expected, violation = ascend(
+                self.scorer,
+                self.state,
+                actions,
+                num_steps=options.gradient_steps,
+                step_size=options.gradient_step_size,
+                bounds=(self.low, self.high),
+            )
+        info = {
+            "elite_return": torch.stack([elite_return for elite_return, _ in history], dim=1),
+            "std": torch.stack([std for _, std in history], dim=1),
+            "iterations": progress.iterations,
+            "num_nonfinite": progress.num_nonfinite,
+            "is_fallback": ~progress.is_found,
+        }
+        if violation is not None:
+            info["violation"] = violation
+        kept = None
+        if progress.elites is not None and options.num_kept:
+            kept = progress.elites.actions[:, : options.num_kept]
+        ones = torch.ones(self.batch, dtype=torch.long)
+        return Plan(actions, mean, progress.var, expected, info, kept, ones.bool(), ones)
+
+    def _iterate(self, start: WarmStart, proposals: list[Candidates]) -> tuple[_Progress, list[tuple[Tensor, Tensor]]]:
+        """The refits; and after each, the elites' mean return and the mean sampling std, both (batch,)."""
+        options, num_fresh = self.options, self.options.num_samples - self.options.num_policy_samples
+        rows = self.scorer.start_rows(self.state, num_fresh)
+        progress, centre, spread = self._begin(start, proposals, num_fresh)
+        warm_iterations = options.warm_start_iterations or options.num_iterations
+        budget = torch.where(start.is_warm, warm_iterations, options.num_iterations)
+        num_common = int(budget.min())
+        is_active = torch.ones(self.batch, dtype=torch.bool, device=self.device)
+        known, history = proposals, []
+        for iteration in range(int(budget.max())):
+            fresh = self._sample(centre, spread, num_fresh)
+            fresh[:, 0] = progress.mean if iteration else start.mean
+            if iteration == 0:
+                self._place_elites(fresh, start)
+            scores = self.scorer.score(rows, fresh)
+            updated = self._refit(progress, [(fresh, scores), *known, *self._kept(progress)], scores.returns)
+            if iteration == 0:  # the shifted last plan stays among the candidates
+                known = [*proposals, (fresh[:, :1], scores.first(1))]
+            elif iteration >= num_common or options.stop_std > 0:
+                updated = _choose_rows(is_active & (budget > iteration).to(self.device), updated, progress)
+            progress = updated
+            spread = self._sampling_std(progress.var)[:, None]
+            centre = progress.mean[:, None]
+            history.append((progress.expected_return, spread.mean(dim=(1, 2, 3))))
+            if options.stop_std > 0:
+                is_active = is_active & (progress.var.amax(dim=(1, 2)).sqrt() >= options.stop_std)
+                if not bool(is_active.any()):
+                    break
+        return progress, history
+
+    def _begin(self, start: WarmStart, proposals: list[Candidates], num_fresh: int) -> tuple[_Progress, Tensor, Tensor]:
+        """The first distribution, and the centre and std of its samples, (batch, 1 or sample, horizon, action)."""
+        mean, var = start.mean, start.var
+        centre, spread = mean[:, None], self._sampling_std(var)[:, None]
+        if proposals and self.options.start != "shifted":
+            mode = proposals[0][0][:, 0]
+            mode = torch.where(torch.isfinite(mode), mode, mean)  # a policy that fails leaves the last plan
+            mode_std = self.init_std.clamp_min(self.options.min_std).expand_as(mode)
+            if self.options.start == "policy":
+                mean, var = mode, self.init_std.square().expand_as(mode)
+                centre, spread = mode[:, None], mode_std[:, None]
+            else:
+                is_policy = (torch.arange(num_fresh, device=self.device) % 2 == 1)[:, None, None]
+                centre = torch.where(is_policy, mode[:, None], centre)
+                spread = torch.where(is_policy, mode_std[:, None], spread)
+                mean = (mean + mode) / 2
+        nothing = torch.zeros(self.batch, dtype=torch.long, device=self.device)
+        unknown = torch.full((self.batch,), float("nan"), dtype=self.dtype, device=self.device)
+        return _Progress(mean, var, None, unknown, nothing, nothing, nothing.bool()), centre, spread
+
+    def _sample(self, centre: Tensor, spread: Tensor, num: int) -> Tensor:
+        options = self.options
+        noise = self.streams.noise(num, options.horizon, options.action_dim, options.noise_beta, self.dtype)
+        samples = torch.addcmul(centre, spread, noise)
+        return torch.minimum(torch.maximum(samples, self.low, out=samples), self.high, out=samples)
+
+    def _place_elites(self, fresh: Tensor, start: WarmStart) -> None:
+        """Puts the shifted elites of the last plan among the candidates of the warm environments."""
+        if start.elites is not None:
+            end = min(1 + start.elites.shape[1], fresh.shape[1])
+            is_warm = start.is_warm.to(self.device)[:, None, None, None]
+            fresh[:, 1:end] = torch.where(is_warm, start.elites[:, : end - 1], fresh[:, 1:end])
+
+    def _kept(self, progress: _Progress) -> list[Candidates]:
+        needs_best = self.options.final == "best" or bool(self.scorer.constraints)
+        num = max(self.options.num_kept, int(needs_best))
+        if progress.elites is None or num == 0:
+            return []
+        return [(progress.elites.actions[:, :num], progress.elites.scores.first(num))]
+
+    def _refit(self, progress: _Progress, candidates: list[Candidates], fresh_returns: Tensor) -> _Progress:
+        options = self.options
+        elites = select_elites(
+            torch.cat([actions for actions, _ in candidates], dim=1),
+            Scores.join([scores for _, scores in candidates]),
+            num_elites=options.num_elites,
+            temperature=options.temperature,
+        )
+        mean, var = move_towards(
+            elites, progress.mean, progress.var, smoothing=options.smoothing, adapt_std=options.adapt_std
+        )
+        is_found = elites.weights.sum(dim=1) > 0
+        return _Progress(
+            mean,
+            var,
+            elites,
+            torch.where(is_found, mean_return(elites), progress.expected_return),
+            progress.num_nonfinite + (~torch.isfinite(fresh_returns)).sum(dim=1),
+            progress.iterations + 1,
+            progress.is_found | is_found,
+        )
+
+    def _choose(self, progress: _Progress, mean: Tensor) -> tuple[Tensor, Tensor, Tensor | None]:
+        """What is executed, its expected return and its violation (when there are constraints)."""
+        assert progress.elites is not None
+        best, scores = progress.elites.actions[:, 0], progress.elites.scores
+        best_return = scores.returns[:, 0]
+        if scores.violations is None:
+            if self.options.final == "mean":
+                return mean, progress.expected_return, None
+            is_best = torch.isfinite(best_return)
+            actions = torch.where(is_best[:, None, None], best, mean)
+            return actions, torch.where(is_best, best_return, progress.expected_return), None
+        own = self.scorer.score(
+            self.scorer.start_rows(self.state, 1), mean[:, None]
+        )  # the mean of feasible sequences may itself be infeasible
+        assert own.violations is not None
+        violation, best_violation = own.violations[:, 0], scores.violations[:, 0]
+        is_best = torch.isfinite(best_return)
+        if self.options.final == "mean":
+            is_safer = best_violation < violation.nan_to_num(float("inf"))
+            is_best = is_best & is_safer if scores.is_ranked else torch.zeros_like(is_best)
+        return (
+            torch.where(is_best[:, None, None], best, mean),
+            torch.where(is_best, best_return, progress.expected_return),
+            torch.where(is_best, best_violation, violation),
+        )
+
+    def _cold_start(self) -> WarmStart:
+        shape = (self.batch, self.options.horizon, self.options.action_dim)
+        mean = torch.zeros_like(self.low).clamp(self.low, self.high).expand(shape)
+        return WarmStart(mean, self.init_std.square().expand(shape), None, torch.zeros(self.batch, dtype=torch.bool))
+
+    def _shift(self, previous: Plan) -> WarmStart:
+        shape, bounds = (self.batch, self.options.horizon, self.options.action_dim), (self.low, self.high)
+        if previous.mean.shape != shape:
+            raise ValueError(f"the last plan has shape {tuple(previous.mean.shape)}, this search {shape}")
+        return shift_plan(
+            previous,
+            tail=self.options.tail,
+            variance=self.options.warm_start_variance,
+            initial_var=self.init_std.square(),
+            bounds=bounds,
+            policy_tail=lambda actions, is_tail: self.scorer.continue_by_policy(self.state, actions, is_tail, bounds),
+        )
+
+    def _sampling_std(self, var: Tensor) -> Tensor:
+        return var.sqrt().clamp_min(self.options.min_std)
+
+    def _constant(self, value: float | Sequence[float] | Tensor, name: str) -> Tensor:
+        return per_dimension(value, self.options.action_dim, name).to(dtype=self.dtype, device=self.device)
+
+
+def _choose_rows(mask: Tensor, new: _Progress, old: _Progress) -> _Progress:
+    """Environments in mask (batch,) from `new`, the others from `old`."""
+
+    def choose(fresh: Any, past: Any) -> Any:
+        if not isinstance(fresh, Tensor):
+            return fresh
+        return torch.where(mask.reshape(-1, *[1] * (fresh.ndim - 1)), fresh, past)
+
+    chosen: _Progress = tree_map(choose, new, old)
+    return chosen

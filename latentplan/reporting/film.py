@@ -1,0 +1,89 @@
+"""The film of an episode, as a callback for rollouts."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+from collections.abc import Callable, Iterator
+from typing import TYPE_CHECKING, Any, Protocol
+
+from latentplan.reporting.video import PANEL_SIZE, Frame, VideoWriter, compose_frame
+
+if TYPE_CHECKING:
+    import gymnasium
+
+DEFAULT_FPS = 20.0
+
+
+class Moment(Protocol):
+    """What a film needs to know of one moment of an episode; rollouts hand it to their callback."""
+
+    @property
+    def episode(self) -> int:
+        """Index of the episode."""
+
+    @property
+    def decision(self) -> int:
+        """Decisions executed before this moment."""
+
+    @property
+    def total_return(self) -> float:
+        """Reward earned before this moment."""
+
+    @property
+    def frame(self) -> Frame:
+        """What the agent sees, uint8 (height, width, 3)."""
+
+    @property
+    def action(self) -> Any:
+        """What it chose, or None where the episode is over."""
+
+
+class Imagining(Protocol):
+    """An agent that can show where its present plan ends."""
+
+    def imagine(self) -> Frame | None:
+        """The decoded last state of the plan, uint8 (height, width, 3); None without a plan."""
+        ...
+
+
+@contextlib.contextmanager
+def filming(
+    path: str | os.PathLike[str], env: gymnasium.Env[Any, Any], planner: Imagining | None, horizon: int | None = None
+) -> Iterator[Callable[[Moment], None]]:
+    """Films the first episode that is played inside the block, in real time where the environment tells its rate.
+
+    Args:
+        path: Where the film goes, `.mp4` or `.webm`; it appears when the block ends well.
+        env: The environment that is played; `render_large` gives the picture where it has that.
+        planner: The agent, where it plans; None leaves the plan's side empty.
+        horizon: Model steps that its plans look ahead.
+
+    Yields:
+        The callback to hand to the rollouts.
+    """
+    with contextlib.ExitStack() as stack:
+        films: list[VideoWriter] = []
+
+        def film(moment: Moment) -> None:
+            if moment.episode > 0:
+                return
+            picture = _compose(moment, env, planner, horizon)
+            if not films:
+                fps = float(env.unwrapped.metadata.get("render_fps") or DEFAULT_FPS)
+                films.append(stack.enter_context(VideoWriter(path, fps, (picture.shape[1], picture.shape[0]))))
+            films[0].write(picture)
+
+        yield film
+
+
+def _compose(moment: Moment, env: gymnasium.Env[Any, Any], planner: Imagining | None, horizon: int | None) -> Frame:
+    over = moment.action is None
+    render = getattr(env.unwrapped, "render_large", None)
+    return compose_frame(
+        moment.frame if render is None else render(PANEL_SIZE),
+        None if planner is None or over else planner.imagine(),
+        [f"return {moment.total_return:.1f}    step {moment.decision}"],
+        horizon=horizon,
+        absence="episode over" if over else "no plan",
+    )

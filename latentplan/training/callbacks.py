@@ -1,0 +1,188 @@
+"""When things happen in a run: collecting, evaluating, recording, saving, stopping."""
+
+from __future__ import annotations
+
+import csv
+import signal
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import lightning
+import numpy as np
+
+from latentplan.checkpoint import save_checkpoint
+from latentplan.config import Config
+from latentplan.replay import Replay
+from latentplan.training.collector import Collected
+from latentplan.training.state import RunState, save_state
+from latentplan.training.worker import Worker
+
+if TYPE_CHECKING:
+    from latentplan.training.module import Learner
+    from latentplan.training.progress import Progress
+
+COLUMNS = (
+    *("env_frames", "decisions", "updates", "minutes", "episode_return"),
+    *("planner_return", "actor_return", "planner_minus_actor"),
+    *("reconstruction", "reward", "continue", "dynamics", "representation", "actor", "value"),
+    *("imagined_return", "entropy", "model_grad_norm", "behaviour_grad_norm"),
+)
+
+
+class Experience(lightning.Callback):
+    """Collects one round per epoch, and evaluates when it is due.
+
+    A round is asked for when an epoch starts and taken when the next one does, so a worker in another process acts,
+    with the weights of its start, while the learner learns.
+    """
+
+    def __init__(self, config: Config, replay: Replay, state: RunState, worker: Worker) -> None:
+        self.config, self.replay, self.state, self.worker = config, replay, state, worker
+        self.episode_returns: list[float] = []
+        self._asked_evaluation: dict[str, Any] | None = None
+        self._asked_round = False
+
+    def on_train_epoch_start(self, trainer: lightning.Trainer, learner: Learner) -> None:  # type: ignore[override]
+        """Take what was asked for an epoch ago, and ask for what comes next."""
+        settings, state = self.config.collection, self.state
+        while state.decisions < settings.prefill_decisions:
+            self.worker.submit("collect", None, "random", settings.prefill_decisions - state.decisions, state.rounds)
+            self._take_round()
+        self.take()
+        weights = {name: value.detach().cpu().numpy().copy() for name, value in learner.model.state_dict().items()}
+        both = ("planner", "actor")[state.rounds % 2]
+        behaviour = both if settings.behaviour == "both" else settings.behaviour
+        self.worker.submit("collect", weights, behaviour, settings.round_decisions, state.rounds)
+        self._asked_round = True
+        if state.env_frames >= state.next_evaluation:
+            self._ask_evaluation(learner.updates)
+
+    def take(self) -> None:
+        """Wait for what was asked for, if anything was."""
+        if self._asked_round:
+            self._take_round()
+            self._asked_round = False
+        if self._asked_evaluation is not None:
+            returns = self.worker.result()
+            entry = self._asked_evaluation | {mode: float(np.mean(values)) for mode, values in returns.items()}
+            self.state.evaluations.append(entry)
+            self._asked_evaluation = None
+
+    def _ask_evaluation(self, updates: int) -> None:
+        state, settings = self.state, self.config.evaluation
+        self._asked_evaluation = {"env_frames": state.env_frames, "updates": updates, "minutes": state.minutes}
+        self.worker.submit("evaluate", settings.episodes)
+        state.next_evaluation = (state.env_frames // settings.every_frames + 1) * settings.every_frames
+
+    def _take_round(self) -> None:
+        collected: Collected = self.worker.result()
+        for lane, rows in enumerate(collected.rows):
+            self.replay.add(lane, rows)
+        self.state.env_frames += collected.env_frames
+        self.state.decisions += collected.decisions
+        self.state.rounds += 1
+        self.episode_returns.extend(collected.episode_returns)
+
+
+class Record(lightning.Callback):
+    """Writes metrics.csv and TensorBoard once per epoch, and shows progress."""
+
+    def __init__(self, path: Path, state: RunState, experience: Experience, progress: Progress) -> None:
+        self.path, self.state, self.experience, self.progress = path, state, experience, progress
+        self._shown_evaluations = len(state.evaluations)
+
+    def on_train_batch_end(self, trainer: lightning.Trainer, learner: Learner, *_: Any) -> None:  # type: ignore[override]
+        """Move the progress display on."""
+        self.progress.update(self.state, learner.updates)
+
+    def on_train_epoch_end(self, trainer: lightning.Trainer, learner: Learner) -> None:  # type: ignore[override]
+        """Append one row."""
+        state = self.state
+        row: dict[str, float] = {name: float(value) for name, value in learner.metrics.items()}
+        clocks = {"env_frames": state.env_frames, "decisions": state.decisions, "updates": learner.updates}
+        row |= clocks | {"minutes": round(state.minutes, 3)}
+        if self.experience.episode_returns:
+            row["episode_return"] = float(np.mean(self.experience.episode_returns))
+            self.progress.episode_return = row["episode_return"]
+            self.experience.episode_returns.clear()
+        for entry in state.evaluations[self._shown_evaluations :]:
+            row |= {"planner_return": entry["planner"], "actor_return": entry["actor"]}
+            row["planner_minus_actor"] = entry["planner"] - entry["actor"]
+            self.progress.show_evaluation(entry)
+        self._shown_evaluations = len(state.evaluations)
+        self._append(row)
+        if trainer.logger is not None:
+            trainer.logger.log_metrics(row, step=state.env_frames)
+
+    def _append(self, row: dict[str, float]) -> None:
+        is_new = not self.path.exists()
+        with self.path.open("a", newline="") as file:
+            writer = csv.DictWriter(file, COLUMNS)
+            if is_new:
+                writer.writeheader()
+            writer.writerow(row)
+
+
+class Save(lightning.Callback):
+    """Keeps the last agent, the best one, and what it takes to resume."""
+
+    def __init__(self, folder: Path, config: Config, state: RunState, replay: Replay, facts: dict[str, Any]) -> None:
+        self.folder, self.config, self.state, self.replay, self.facts = folder, config, state, replay, facts
+        self._kept_evaluations = len(state.evaluations)
+
+    def on_train_epoch_end(self, trainer: lightning.Trainer, learner: Learner) -> None:  # type: ignore[override]
+        """Save after every evaluation."""
+        if len(self.state.evaluations) == self._kept_evaluations:
+            return
+        self._kept_evaluations = len(self.state.evaluations)
+        if self.state.evaluations[-1]["planner"] > self.state.best_return:
+            self.state.best_return = self.state.evaluations[-1]["planner"]
+            self.save_agent("best", learner)
+        self.save(trainer, learner)
+
+    def save(self, trainer: lightning.Trainer, learner: Learner) -> None:
+        """Save the last agent and the state of the run."""
+        self.save_agent("last", learner)
+        optimizers = [optimizer.state_dict() for optimizer in trainer.optimizers]
+        saved = {"weights": learner.state_dict(), "updates": learner.updates}
+        save_state(self.folder / "resume", self.state, saved, optimizers, self.replay)
+
+    def save_agent(self, name: str, learner: Learner) -> None:
+        """Save the present agent under a name."""
+        clocks = {"env_frames": self.state.env_frames, "updates": learner.updates, "minutes": self.state.minutes}
+        info = self.facts | clocks | {"metrics": self.state.evaluations}
+        save_checkpoint(self.folder / "checkpoints" / name, learner.model, self.config, info)
+
+
+class Stop(lightning.Callback):
+    """Ends the run at its budget, or when the user interrupts; a second Ctrl-C ends it at once."""
+
+    def __init__(self, config: Config, state: RunState) -> None:
+        self.run, self.state = config.run, state
+        self._previous: dict[int, Any] = {}
+
+    def on_train_start(self, trainer: lightning.Trainer, learner: lightning.LightningModule) -> None:
+        """Take over the signals."""
+        for number in (signal.SIGINT, signal.SIGTERM):
+            self._previous[number] = signal.signal(number, self._interrupt)
+
+    def on_train_batch_end(self, trainer: lightning.Trainer, *_: Any) -> None:  # type: ignore[override]
+        """Stop between two updates."""
+        if self.state.interrupted or self.is_spent():
+            trainer.should_stop = True
+
+    def on_train_end(self, trainer: lightning.Trainer, learner: lightning.LightningModule) -> None:
+        """Give the signals back."""
+        for number, handler in self._previous.items():
+            signal.signal(number, handler)
+
+    def is_spent(self) -> bool:
+        """Whether the budget of frames or minutes is used up."""
+        frames, minutes = self.run.frames, self.run.minutes
+        out_of_frames = frames is not None and self.state.env_frames >= frames
+        return out_of_frames or (minutes is not None and self.state.minutes >= minutes)
+
+    def _interrupt(self, number: int, frame: Any) -> None:
+        if self.state.interrupted:
+            raise KeyboardInterrupt
+        self.state.interrupted = True

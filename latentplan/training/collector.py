@@ -1,0 +1,219 @@
+"""Gathering experience: agents act in environments and hand over the rows for replay."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import gymnasium
+import numpy as np
+import torch
+
+from latentplan.agent import ActorAgent, ModelAgent, PlanningAgent, RandomAgent
+from latentplan.config import Config, derive_seed
+from latentplan.envs import make_env, make_from, make_vector_env, render_info
+from latentplan.models import WorldModel
+from latentplan.replay import Rows
+from latentplan.rollout import episode_seed, run_episodes
+
+TIMED_FRAMES = 5
+
+EnvFactory = Callable[[], gymnasium.Env[Any, Any]]
+
+
+@dataclass(frozen=True)
+class Collected:
+    """One round of experience.
+
+    Attributes:
+        rows: What each environment saw, in order, one entry per lane.
+        env_frames: Simulator control steps taken.
+        decisions: Actions chosen.
+        episode_returns: Of the episodes that ended in this round.
+    """
+
+    rows: list[Rows]
+    env_frames: int
+    decisions: int
+    episode_returns: list[float]
+
+
+@dataclass(frozen=True)
+class Description:
+    """What the learner has to know of the environment.
+
+    Attributes:
+        action_dim: Size of the action.
+        discount: Per decision.
+        render_ms: Milliseconds per rendered frame.
+        renderer: What draws it.
+    """
+
+    action_dim: int
+    discount: float
+    render_ms: float
+    renderer: dict[str, str]
+
+
+class Collector:
+    """Acts in `config.env.num_envs` environments, and evaluates in one of its own.
+
+    Args:
+        config: Settings of the run.
+        make_user_env: The user's factory, or None for the suite.
+        device: Where the acting model lives.
+    """
+
+    def __init__(self, config: Config, make_user_env: EnvFactory | None, device: str) -> None:
+        self.config = config
+        self._make_user_env = make_user_env
+        self.envs = make_vector_env(config.env, config.env.num_envs, config.run.seed, make_user_env)
+        build = make_env if make_user_env is None else make_from(make_user_env)
+        self._eval_env = build(config.env, 0)
+        action_dim = self.envs.single_action_space.shape[0]
+        decisions = self._eval_env.unwrapped.decisions_per_episode
+        self.discount = discount = config.learning.discount or _discount_for(decisions)
+        self.model = WorldModel(config.model, action_dim).to(device)
+        noise = config.collection.noise_std
+        self._agents: dict[str, ModelAgent] = {
+            "planner": PlanningAgent(self.model, config, discount, noise_std=noise),
+            "actor": ActorAgent(self.model, config, explore=True),
+        }
+        self._judged: dict[str, ModelAgent] = {
+            "planner": PlanningAgent(self.model, config, discount),
+            "actor": ActorAgent(self.model, config),
+        }
+        self._random = RandomAgent(action_dim)
+        self._frames: np.ndarray | None = None
+        self._ended = np.ones(config.env.num_envs, dtype=bool)
+        self._returns = np.zeros(config.env.num_envs)
+        self._acting: object = None
+
+    def describe(self) -> Description:
+        """What the learner has to know of the environment."""
+        self._eval_env.reset(seed=0)
+        started = time.perf_counter()
+        for _ in range(TIMED_FRAMES):
+            self._eval_env.render()
+        render_ms = 1000.0 * (time.perf_counter() - started) / TIMED_FRAMES
+        facts = render_info() if self._make_user_env is None else {"renderer": "the user's environment"}
+        return Description(self.model.action_dim, self.discount, render_ms, {k: str(v) for k, v in facts.items()})
+
+    def collect(self, weights: dict[str, np.ndarray] | None, behaviour: str, decisions: int, counter: int) -> Collected:
+        """Take `decisions` decisions in all, with new weights; continues the episodes of the last round.
+
+        Args:
+            weights: State of the world model; None acts at random.
+            behaviour: `planner` or `actor`.
+            decisions: Rounded up to a multiple of the number of environments.
+            counter: Number of the round, from which its random stream derives.
+        """
+        agent = self._random if weights is None else self._agents[behaviour]
+        if weights is not None:
+            self._load(weights)
+        if agent is not self._acting:
+            agent.reset()
+            self._acting = agent
+        agent.seed(derive_seed(self.config.run.seed, "collect", counter))
+        steps = -(-decisions // len(self._ended))
+        log = _Log(len(self._ended), self.envs.single_action_space.shape[0], self.config.model.deter_dim)
+        for _ in range(steps):
+            self._restart_ended(agent, counter)
+            self._step(agent, log)
+        return Collected(log.rows(), log.env_frames, steps * len(self._ended), log.returns)
+
+    def evaluate(self, episodes: int, weights: dict[str, np.ndarray] | None = None) -> dict[str, list[float]]:
+        """Returns of planner and actor on the same starts, without exploration.
+
+        Args:
+            episodes: Episodes of each.
+            weights: State of the world model; None keeps that of the last round.
+        """
+        if weights is not None:
+            self._load(weights)
+        stream = derive_seed(self.config.run.seed, "evaluation")
+        seeds = [episode_seed(stream, index) for index in range(episodes)]
+        return {
+            mode: [episode.total_return for episode in run_episodes(self._eval_env, agent, seeds)]
+            for mode, agent in self._judged.items()
+        }
+
+    def close(self) -> None:
+        """Free simulators and processes."""
+        self.envs.close()
+        self._eval_env.close()
+
+    def _load(self, weights: dict[str, np.ndarray]) -> None:
+        self.model.load_state_dict({name: torch.from_numpy(value) for name, value in weights.items()})
+
+    def _restart_ended(self, agent: ModelAgent | RandomAgent, counter: int) -> None:
+        if not self._ended.any():
+            return
+        if self._frames is None:
+            self._frames, _ = self.envs.reset(seed=derive_seed(self.config.run.seed, "episodes", counter))
+        else:
+            self._frames, _ = self.envs.reset(options={"reset_mask": self._ended})
+            agent.reset(self._ended)
+        self._returns[self._ended] = 0.0
+
+    def _step(self, agent: ModelAgent | RandomAgent, log: _Log) -> None:
+        assert self._frames is not None
+        frames, first = self._frames.copy(), self._ended.copy()
+        actions = agent.act(frames)
+        state = agent.state if isinstance(agent, ModelAgent) else None
+        deter = None if state is None else state.deter.float().cpu().numpy()
+        self._frames, rewards, terminated, truncated, info = self.envs.step(actions)
+        self._ended = terminated | truncated
+        self._returns += rewards
+        log.append(frames, deter, actions, rewards, ~terminated, first, np.asarray(info["env_frames"]))
+        for lane in np.flatnonzero(self._ended):
+            log.finish(lane, self._frames[lane].copy(), float(self._returns[lane]))
+
+
+def _discount_for(decisions: int | None) -> float:
+    """A horizon of a fifth of an episode: 0.96 at 125 decisions, 0.99 at 500."""
+    return 1.0 - 5.0 / min(max(decisions or 500, 50), 1000)
+
+
+class _Log:
+    """Rows of every lane while a round lasts."""
+
+    def __init__(self, lanes: int, action_dim: int, deter_dim: int) -> None:
+        self._lanes: list[list[tuple[Any, ...]]] = [[] for _ in range(lanes)]
+        self._no_deter = np.zeros((lanes, deter_dim), np.float32)
+        self._no_action = np.zeros(action_dim, np.float32)
+        self.returns: list[float] = []
+        self.env_frames = 0
+
+    def append(
+        self,
+        frames: np.ndarray,
+        deter: np.ndarray | None,
+        actions: np.ndarray,
+        rewards: np.ndarray,
+        continues: np.ndarray,
+        first: np.ndarray,
+        env_frames: np.ndarray,
+    ) -> None:
+        beliefs = self._no_deter if deter is None else deter
+        for lane, entries in enumerate(self._lanes):
+            entries.append(
+                (frames[lane], beliefs[lane], actions[lane], rewards[lane], float(continues[lane]), first[lane])
+            )
+        self.env_frames += int(env_frames.sum())
+
+    def finish(self, lane: int, frame: np.ndarray, total_return: float) -> None:
+        self._lanes[lane].append((frame, self._no_deter[lane], self._no_action, 0.0, 1.0, False))
+        self.returns.append(total_return)
+
+    def rows(self) -> list[Rows]:
+        return [
+            Rows(
+                *(np.stack(column) for column in columns[:3]),
+                *(np.asarray(column, np.float32) for column in columns[3:5]),
+                np.asarray(columns[5], bool),
+            )
+            for columns in (list(zip(*entries, strict=True)) for entries in self._lanes)
+        ]

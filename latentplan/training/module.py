@@ -1,0 +1,124 @@
+"""The learner: what one update does, as a LightningModule."""
+
+from __future__ import annotations
+
+import copy
+
+import lightning
+import torch
+from torch import Tensor
+
+from latentplan.config import LearningConfig, derive_seed
+from latentplan.models import State, WorldModel
+from latentplan.replay import Batch, Replay
+from latentplan.training.losses import imagine, lambda_return, value_loss, world_model_loss
+
+RETURN_RANGE_RATE = 0.01
+
+
+class Learner(lightning.LightningModule):
+    """Learns a world model from replay, and an actor and a value in its imagination.
+
+    Args:
+        model: What is learned.
+        config: Losses and optimizers.
+        discount: Per decision.
+        replay: Where refreshed beliefs go after each update.
+        seed: Of the noise of posterior, prior and actor samples.
+    """
+
+    return_range: Tensor
+
+    def __init__(self, model: WorldModel, config: LearningConfig, discount: float, replay: Replay, seed: int) -> None:
+        super().__init__()
+        self.automatic_optimization = False
+        self.model, self.config, self.discount, self.replay, self.seed = model, config, discount, replay, seed
+        self.target_value = copy.deepcopy(model.value_head).requires_grad_(False)
+        self.register_buffer("return_range", torch.zeros(()))
+        self.updates = 0
+        self.metrics: dict[str, Tensor] = {}
+
+    def configure_optimizers(self) -> list[torch.optim.Optimizer]:
+        """One Adam for the world model, one for actor and value."""
+        behaviour = [*self.model.actor.parameters(), *self.model.value_head.parameters()]
+        chosen = {id(parameter) for parameter in behaviour}
+        world = [parameter for parameter in self.model.parameters() if id(parameter) not in chosen]
+        return [
+            torch.optim.Adam(world, lr=self.config.model_learning_rate, eps=1e-6, fused=True),
+            torch.optim.Adam(behaviour, lr=self.config.behaviour_learning_rate, eps=1e-6, fused=True),
+        ]
+
+    def training_step(self, batch: Batch, batch_index: int) -> None:
+        """One update of everything from one batch of sequences."""
+        world_optimizer, behaviour_optimizer = self.optimizers(use_pl_optimizer=False)
+        generator = torch.Generator(self.device).manual_seed(derive_seed(self.seed, "update", self.updates))
+        loss, states, parts = world_model_loss(self.model, batch, self.config, generator)
+        parts["model_grad_norm"] = self._descend(world_optimizer, loss)
+        self.replay.refresh(batch.rows, states.deter)
+        loss, behaviour_parts = self._behaviour_loss(states, batch, generator)
+        parts |= behaviour_parts
+        parts["behaviour_grad_norm"] = self._descend(behaviour_optimizer, loss)
+        with torch.no_grad():
+            pairs = zip(self.target_value.parameters(), self.model.value_head.parameters(), strict=True)
+            for slow, fast in pairs:
+                slow.lerp_(fast, self.config.target_rate)
+        self.updates += 1
+        self.metrics = parts
+
+    def _behaviour_loss(
+        self, states: State, batch: Batch, generator: torch.Generator
+    ) -> tuple[Tensor, dict[str, Tensor]]:
+        config = self.config
+        flat = State(states.deter.flatten(0, 1), states.stoch.flatten(0, 1))
+        chosen = torch.randperm(len(flat.deter), generator=generator, device=self.device)[: config.imagination_starts]
+        world = [self.model.dynamics, self.model.reward_head, self.model.continue_head]
+        for part in world:
+            part.requires_grad_(False)
+        with self.model.trunk_precision():
+            dream = imagine(
+                self.model, State(flat.deter[chosen], flat.stoch[chosen]), config.imagination_horizon, generator
+            )
+            values = self.target_value.mean(self.target_value(dream.features[1:]))
+        for part in world:
+            part.requires_grad_(True)
+        discounts = self.discount * dream.continues
+        returns = lambda_return(dream.rewards, discounts, values, config.lambda_)
+        reach = torch.cat([torch.ones_like(discounts[:1]), discounts[:-1]]).cumprod(0).detach()
+        scale = self._return_scale(returns.detach())
+        actor = -(reach * (returns / scale + config.entropy_scale * dream.entropies)).mean()
+        with self.model.trunk_precision():
+            imagined = value_loss(self.model.value_head, dream.features[:-1], returns, reach)
+            replayed = self._replayed_value_loss(states, batch)
+        parts = {
+            "actor": actor.detach(),
+            "value": imagined.detach(),
+            "imagined_return": returns[0].detach().mean(),
+            "entropy": dream.entropies.detach().mean(),
+        }
+        return actor + imagined + config.replay_value_scale * replayed, parts
+
+    def _replayed_value_loss(self, states: State, batch: Batch) -> Tensor:
+        features = states.features.transpose(0, 1)
+        with torch.no_grad():
+            values = self.target_value.mean(self.target_value(features[1:]))
+            discounts = self.discount * batch.continues.T
+            returns = lambda_return(batch.rewards.T, discounts, values, self.config.lambda_)
+        return value_loss(self.model.value_head, features[:-1], returns, torch.ones_like(returns))
+
+    def _return_scale(self, returns: Tensor) -> Tensor:
+        """Spread of returns between their 5th and 95th percentile, smoothed, at least 1 (Hafner et al. 2023, eq. 7)."""
+        flat = returns.flatten()
+        spread = torch.quantile(flat, 0.95) - torch.quantile(flat, 0.05)
+        rate = 1.0 if self.updates == 0 else RETURN_RANGE_RATE
+        self.return_range.lerp_(spread, rate)
+        return self.return_range.clamp_min(1.0)
+
+    def _descend(self, optimizer: torch.optim.Optimizer, loss: Tensor) -> Tensor:
+        optimizer.zero_grad(set_to_none=True)
+        loss.backward()
+        parameters = [parameter for group in optimizer.param_groups for parameter in group["params"]]
+        norm = torch.nn.utils.clip_grad_norm_(parameters, self.config.max_grad_norm)
+        if not torch.isfinite(norm):
+            raise FloatingPointError(f"the gradient is not finite at update {self.updates} (loss {loss.item()})")
+        optimizer.step()
+        return norm

@@ -1,0 +1,74 @@
+"""What a run shows while it lasts."""
+
+from __future__ import annotations
+
+import time
+from typing import Any
+
+from rich.console import Console
+
+from latentplan.config import RunConfig
+from latentplan.training.state import RunState
+
+SECONDS_ON_A_TERMINAL = 0.5
+SECONDS_IN_A_LOG = 30.0
+
+
+class Progress:
+    """One live line on a terminal, one line every half minute in a log, and one line per evaluation."""
+
+    def __init__(self, run: RunConfig) -> None:
+        self.run, self.console = run, Console(highlight=False)
+        self.episode_return: float | None = None
+        self._evaluation = ""
+        self._last_time, self._last_updates = time.monotonic(), 0
+        self._rate = 0.0
+        self._live = self.console.status("starting") if self.console.is_terminal else None
+
+    def start(self, updates: int) -> None:
+        """Begin to show; `updates` were done before."""
+        self._last_time, self._last_updates = time.monotonic(), updates
+        if self._live is not None:
+            self._live.start()
+
+    def stop(self) -> None:
+        """Leave the terminal as it was."""
+        if self._live is not None:
+            self._live.stop()
+
+    def update(self, state: RunState, updates: int) -> None:
+        """Show where the run stands, if it is time to."""
+        now = time.monotonic()
+        pause = SECONDS_IN_A_LOG if self._live is None else SECONDS_ON_A_TERMINAL
+        if now - self._last_time < pause:
+            return
+        self._rate = (updates - self._last_updates) / (now - self._last_time)
+        self._last_time, self._last_updates = now, updates
+        line = self._line(state)
+        if self._live is None:
+            self.console.print(line)
+        else:
+            self._live.update(line)
+
+    def show_evaluation(self, entry: dict[str, Any]) -> None:
+        """One lasting line for an evaluation."""
+        planner, actor = entry["planner"], entry["actor"]
+        self._evaluation = f"planner {planner:.0f}, actor {actor:.0f}"
+        self.console.print(
+            f"{entry['env_frames']:>9,} frames  {entry['minutes']:6.1f} min  "
+            f"planner {planner:6.1f}  actor {actor:6.1f}  difference {planner - actor:+6.1f}"
+        )
+
+    def _line(self, state: RunState) -> str:
+        left = [self.run.minutes - state.minutes] if self.run.minutes else []
+        if self.run.frames and state.env_frames:
+            left.append(state.minutes * (self.run.frames / state.env_frames - 1.0))
+        parts = [
+            f"{state.env_frames:,} frames",
+            f"{state.minutes:.1f} min",
+            f"{self._rate:.1f} updates/s",
+            f"episode {self.episode_return:.0f}" if self.episode_return is not None else "",
+            self._evaluation,
+            f"{max(min(left), 0.0):.0f} min left" if left else "",
+        ]
+        return " | ".join(part for part in parts if part)

@@ -1,0 +1,254 @@
+"""A training run from its settings to its final evaluation."""
+
+from __future__ import annotations
+
+import logging
+import warnings
+from dataclasses import dataclass, replace
+from datetime import datetime
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import lightning
+import numpy as np
+import torch
+import yaml
+from lightning.pytorch.loggers import TensorBoardLogger
+
+from latentplan.config import Config, RunConfig, UserError, derive_seed, from_dict, to_dict
+from latentplan.models import WorldModel
+from latentplan.replay import Replay
+from latentplan.training.callbacks import Experience, Record, Save, Stop
+from latentplan.training.collector import Description, EnvFactory
+from latentplan.training.data import ReplayBatches, ReplayData
+from latentplan.training.module import Learner
+from latentplan.training.progress import Progress
+from latentplan.training.state import RunState, load_state
+from latentplan.training.worker import LocalWorker, RemoteWorker, Worker
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+UNKNOWN_LENGTH_CAPACITY = 500_000
+INTERRUPTED = 130
+
+
+@dataclass(frozen=True)
+class Result:
+    """How a run ended.
+
+    Attributes:
+        run_dir: Its folder.
+        exit_code: 0, or 130 when the user interrupted it.
+        summary: Mean returns of the final evaluation by mode; empty when interrupted.
+    """
+
+    run_dir: Path
+    exit_code: int
+    summary: Mapping[str, float]
+
+
+def train(config: Config, make_env: EnvFactory | None = None) -> Result:
+    """Learn to control a body from pixels.
+
+    Args:
+        config: Settings of the run.
+        make_env: Makes the user's own `gymnasium.Env` with image observations and a bounded Box of actions;
+            None takes the suite's task that `config.env` names.
+
+    Returns:
+        Where the run lies and how it ended.
+
+    Raises:
+        UserError: Settings, environment or machine cannot carry the run.
+    """
+    if config.run.frames is None and config.run.minutes is None:
+        raise UserError("a run needs an end: give --frames or --minutes")
+    if config.run.run_dir is None:
+        stamp = datetime.now().strftime("%Y%m%d-%H%M%S")
+        name = f"{config.env.domain}-{config.env.task or 'default'}-seed{config.run.seed}-{stamp}"
+        config = replace(config, run=replace(config.run, run_dir=str(Path("runs") / name)))
+    folder = Path(str(config.run.run_dir))
+    if (folder / "config.yaml").exists():
+        raise UserError(f"{folder} already holds a run: continue it with --resume {folder}, or choose another --run-dir")
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / "config.yaml").write_text(yaml.safe_dump(to_dict(config), sort_keys=False))
+    return _Run(config, folder, make_env, resume=False).execute()
+
+
+def resume(
+    run_dir: Path | str,
+    *,
+    frames: int | None = None,
+    minutes: float | None = None,
+    device: str | None = None,
+    make_env: EnvFactory | None = None,
+) -> Result:
+    """Continue a run where it was last saved: weights, optimizers, replay, clocks and random streams.
+
+    Args:
+        run_dir: Folder of the run.
+        frames: New budget of frames in all; None keeps the old one.
+        minutes: New budget of minutes in all; None keeps the old one.
+        device: New device; None keeps the old one.
+        make_env: As given to `train`.
+
+    Raises:
+        UserError: The folder holds no run that can be resumed.
+    """
+    folder = Path(run_dir)
+    if not (folder / "config.yaml").exists():
+        raise UserError(f"nothing to resume in {folder}: config.yaml is missing")
+    config = from_dict(yaml.safe_load((folder / "config.yaml").read_text()))
+    changes = {"frames": frames, "minutes": minutes, "device": device}
+    run = replace(config.run, **{name: value for name, value in changes.items() if value is not None})
+    return _Run(replace(config, run=run), folder, make_env, resume=True).execute()
+
+
+class _Run:
+    """Everything a run is made of, put together once."""
+
+    def __init__(self, config: Config, folder: Path, make_env: EnvFactory | None, *, resume: bool) -> None:
+        self.config, self.folder = config, folder
+        self.device = _choose_device(config.run)
+        if config.run.threads is not None:
+            torch.set_num_threads(config.run.threads)
+        self.console = Progress(config.run)
+        overlap = config.collection.overlap and self.device.type == "cpu"
+        self.worker: Worker = RemoteWorker(config, make_env) if overlap else LocalWorker(config, make_env, str(self.device))
+        try:
+            self.worker.submit("describe")
+            self.description: Description = self.worker.result()
+            self._build(resume=resume)
+        except BaseException:
+            self.worker.close()
+            raise
+
+    def _build(self, *, resume: bool) -> None:
+        config, seed = self.config, self.config.run.seed
+        with torch.random.fork_rng(devices=[]):
+            torch.manual_seed(derive_seed(seed, "weights"))
+            model = WorldModel(config.model, self.description.action_dim).to(self.device)
+        on = self.device if config.replay.on_device else torch.device("cpu")
+        capacity = _capacity(config)
+        self.replay = Replay(capacity, model.action_dim, config.model.deter_dim, config.env.num_envs, on)
+        discount = self.description.discount
+        self.learner = Learner(model, config.learning, discount, self.replay, derive_seed(seed, "learner"))
+        self.state = RunState()
+        self._saved_optimizers: list[Any] = []
+        if resume:
+            self.state, saved, self._saved_optimizers = load_state(self.folder / "resume", self.device)
+            self.replay.load(self.folder / "resume" / "replay")
+            self.learner.load_state_dict(saved["weights"])
+            self.learner.updates = saved["updates"]
+
+    def execute(self) -> Result:
+        """Learn until the budget is spent, then evaluate."""
+        try:
+            return self._execute()
+        finally:
+            self.worker.close()
+
+    def _execute(self) -> Result:
+        config = self.config
+        self._announce()
+        experience = Experience(config, self.replay, self.state, self.worker)
+        save = Save(self.folder, config, self.state, self.replay, self._facts())
+        stop = Stop(config, self.state)
+        trainer = self._trainer([experience, Record(self.folder / "metrics.csv", self.state, experience, self.console), save, stop])
+        length = max(1, round(config.collection.round_decisions * config.collection.updates_per_decision))
+        batches = ReplayBatches(self.replay, config.learning, self.state, config.run.seed, length)
+        if not stop.is_spent():
+            self.console.start(self.learner.updates)
+            try:
+                trainer.fit(self.learner, datamodule=ReplayData(batches))
+            finally:
+                self.console.stop()
+            save.save(trainer, self.learner)
+        if self.state.interrupted:
+            self.console.console.print(f"stopped; to go on: python scripts/train.py --resume {self.folder}")
+            return Result(self.folder, INTERRUPTED, {})
+        experience.take()
+        return Result(self.folder, 0, self._finish(save))
+
+    def _trainer(self, callbacks: list[lightning.Callback]) -> lightning.Trainer:
+        logging.getLogger("lightning.pytorch").setLevel(logging.ERROR)
+        warnings.filterwarnings("ignore", module="lightning")
+        optimizers = self._saved_optimizers
+
+        class Restore(lightning.Callback):
+            def on_fit_start(self, trainer: lightning.Trainer, learner: lightning.LightningModule) -> None:
+                for optimizer, saved in zip(trainer.optimizers, optimizers, strict=False):
+                    optimizer.load_state_dict(saved)
+
+        return lightning.Trainer(
+            accelerator="gpu" if self.device.type == "cuda" else "cpu",
+            devices=1,
+            max_epochs=-1,
+            callbacks=[Restore(), *callbacks],
+            logger=TensorBoardLogger(self.folder, name="tensorboard", version=""),
+            enable_checkpointing=False,
+            enable_progress_bar=False,
+            enable_model_summary=False,
+            log_every_n_steps=10**9,
+        )
+
+    def _finish(self, save: Save) -> dict[str, float]:
+        weights = {name: value.detach().cpu().numpy() for name, value in self.learner.model.state_dict().items()}
+        episodes = self.config.evaluation.final_episodes
+        self.console.console.print(f"final evaluation: {episodes} episodes each of planner and actor")
+        self.worker.submit("evaluate", episodes, weights)
+        returns = self.worker.result()
+        summary = {mode: float(np.mean(values)) for mode, values in returns.items()}
+        self.console.console.print(
+            f"trained {self.state.env_frames:,} frames in {self.state.minutes:.1f} min: "
+            f"planner {summary['planner']:.1f}, actor {summary['actor']:.1f} ({episodes} episodes)\nrun folder: {self.folder}"
+        )
+        return summary
+
+    def _announce(self) -> None:
+        run, description = self.config.run, self.description
+        parameters = sum(parameter.numel() for parameter in self.learner.model.parameters())
+        budget = " or ".join(
+            part for part in (f"{run.frames:,} frames" if run.frames else "", f"{run.minutes:g} min" if run.minutes else "") if part
+        )
+        renderer = ", ".join(f"{name} {value}" for name, value in description.renderer.items())
+        self.console.console.print(
+            f"task        {self.config.env.domain} {self.config.env.task or '(usual task)'}, action repeat {self.config.env.action_repeat}\n"
+            f"device      {self.device}, {torch.get_num_threads()} threads\n"
+            f"renderer    {renderer}, {description.render_ms:.1f} ms per frame, quality {self.config.env.render_quality}\n"
+            f"parameters  {parameters:,}, discount {description.discount:g}\n"
+            f"replay      {self.replay.num_bytes / 2**20:,.0f} MiB for {self.replay.lane_size * self.replay.num_lanes:,} frames\n"
+            f"budget      {budget}\n"
+            f"run folder  {self.folder}"
+        )
+
+    def _facts(self) -> dict[str, Any]:
+        from latentplan import __version__
+
+        return {
+            "format": 1,
+            "version": __version__,
+            "domain": self.config.env.domain,
+            "task": self.config.env.task,
+            "discount": self.description.discount,
+            "renderer": self.description.renderer,
+        }
+
+
+def _choose_device(run: RunConfig) -> torch.device:
+    if run.device == "cuda" and not torch.cuda.is_available():
+        raise UserError("device cuda was asked for, but torch finds no CUDA device: use --device cpu")
+    if run.device == "auto":
+        return torch.device("cuda" if torch.cuda.is_available() else "cpu")
+    return torch.device(run.device)
+
+
+def _capacity(config: Config) -> int:
+    if config.replay.capacity is not None:
+        return config.replay.capacity
+    if config.run.frames is None:
+        return UNKNOWN_LENGTH_CAPACITY
+    # Two rounds may run past the budget, and every episode ends with one frame without an action.
+    decisions = config.run.frames / config.env.action_repeat
+    return int(1.05 * decisions) + 2 * config.collection.round_decisions + config.collection.prefill_decisions

@@ -1,0 +1,71 @@
+"""Where a run stands, and how it is written down and picked up again."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from latentplan.config import UserError
+from latentplan.replay import Replay
+
+STATE_FILE = "state.pt"
+
+
+@dataclass
+class RunState:
+    """The clocks of a run and what its evaluations found.
+
+    Attributes:
+        env_frames: Simulator control steps so far.
+        decisions: Decisions so far.
+        rounds: Collections so far.
+        earlier_minutes: Wall clock spent before this process took over.
+        next_evaluation: Value of `env_frames` at which the next evaluation is due.
+        best_return: Best mean return of the planner so far.
+        evaluations: One entry per evaluation: env_frames, updates, minutes, planner, actor.
+        interrupted: Whether the user asked to stop.
+    """
+
+    env_frames: int = 0
+    decisions: int = 0
+    rounds: int = 0
+    earlier_minutes: float = 0.0
+    next_evaluation: int = 0
+    best_return: float = float("-inf")
+    evaluations: list[dict[str, Any]] = field(default_factory=list)
+    interrupted: bool = False
+    started: float = field(default_factory=time.monotonic)
+
+    @property
+    def minutes(self) -> float:
+        """Wall clock of the run, over all its processes."""
+        return self.earlier_minutes + (time.monotonic() - self.started) / 60.0
+
+    def to_dict(self) -> dict[str, Any]:
+        """What is saved: everything but this process's own clock and interruption."""
+        values = asdict(self) | {"earlier_minutes": self.minutes}
+        return {name: value for name, value in values.items() if name not in ("interrupted", "started")}
+
+
+def save_state(folder: Path, state: RunState, learner: dict[str, Any], optimizers: list[Any], replay: Replay) -> None:
+    """Write everything that `load_state` needs to go on; the state file is replaced whole, after the replay."""
+    replay.save(folder / "replay")
+    part = folder / f"{STATE_FILE}.part"
+    torch.save({"run": state.to_dict(), "learner": learner, "optimizers": optimizers}, part)
+    part.replace(folder / STATE_FILE)
+
+
+def load_state(folder: Path, device: torch.device) -> tuple[RunState, dict[str, Any], list[Any]]:
+    """The clocks, the learner's state and the optimizers' states that `save_state` wrote.
+
+    Raises:
+        UserError: The folder holds no saved run.
+    """
+    if not (folder / STATE_FILE).exists():
+        raise UserError(f"nothing to resume in {folder.parent}: {folder / STATE_FILE} is missing")
+    saved = torch.load(folder / STATE_FILE, map_location=device, weights_only=True)
+    return RunState(**saved["run"]), saved["learner"], saved["optimizers"]

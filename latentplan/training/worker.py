@@ -1,0 +1,129 @@
+"""Where collection runs: in this process, or in another beside the learner."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import traceback
+from collections import deque
+from collections.abc import Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import contextmanager
+from multiprocessing.connection import Connection
+from typing import Any
+
+import torch
+from gymnasium.vector.utils import CloudpickleWrapper
+
+from latentplan.config import Config, UserError
+from latentplan.training.collector import Collector, EnvFactory
+
+THREAD_SETTINGS = ("OMP_NUM_THREADS", "LP_NUM_THREADS")
+
+
+class LocalWorker:
+    """Calls methods of a `Collector` at once, in this process."""
+
+    def __init__(self, config: Config, make_user_env: EnvFactory | None, device: str) -> None:
+        self._collector = Collector(config, make_user_env, device)
+        self._results: list[Any] = []
+
+    def submit(self, method: str, *arguments: Any) -> None:
+        """Run a method; its result waits for `result`."""
+        self._results.append(getattr(self._collector, method)(*arguments))
+
+    def result(self) -> Any:
+        """The oldest result not yet taken."""
+        return self._results.pop(0)
+
+    def close(self) -> None:
+        """Free simulators."""
+        self._collector.close()
+
+
+class RemoteWorker:
+    """Calls methods of a `Collector` in a spawned process, on one core, while the caller goes on."""
+
+    def __init__(self, config: Config, make_user_env: EnvFactory | None) -> None:
+        context = multiprocessing.get_context("spawn")
+        self._connection, theirs = context.Pipe()
+        arguments = (theirs, CloudpickleWrapper(make_user_env), config)
+        self._process = context.Process(target=_serve, args=arguments, daemon=config.env.num_envs == 1)
+        with _single_threaded():
+            self._process.start()
+        theirs.close()
+        # A thread waits on the pipe, so that neither side ever blocks on the other's full buffer.
+        self._caller = ThreadPoolExecutor(max_workers=1)
+        self._futures: deque[Future[tuple[str, Any]]] = deque()
+
+    def submit(self, method: str, *arguments: Any) -> None:
+        """Ask for a method; its result arrives through `result`, in order."""
+        self._futures.append(self._caller.submit(self._call, method, arguments))
+
+    def result(self) -> Any:
+        """The oldest result not yet taken; waits for it.
+
+        Raises:
+            UserError: What the method raised for the user.
+            RuntimeError: The method failed, or its process ended.
+        """
+        try:
+            kind, value = self._futures.popleft().result()
+        except (EOFError, OSError):
+            raise RuntimeError("the process that collects has ended unexpectedly") from None
+        if kind == "user_error":
+            raise UserError(value)
+        if kind == "error":
+            raise RuntimeError(f"collection failed:\n{value}")
+        return value
+
+    def close(self) -> None:
+        """End the process, whatever it is doing."""
+        if self._process.is_alive():
+            self._process.terminate()
+        self._process.join()
+        self._caller.shutdown(cancel_futures=True)
+        self._connection.close()
+
+    def _call(self, method: str, arguments: tuple[Any, ...]) -> tuple[str, Any]:
+        self._connection.send((method, arguments))
+        answer: tuple[str, Any] = self._connection.recv()
+        return answer
+
+
+Worker = LocalWorker | RemoteWorker
+
+
+def _serve(connection: Connection, factory: CloudpickleWrapper, config: Config) -> None:
+    import signal
+
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches the whole group; the learner decides what follows
+    torch.set_num_threads(1)
+    collector: Collector | None = None
+    while True:
+        try:
+            method, arguments = connection.recv()
+        except EOFError:
+            return
+        try:
+            if collector is None:
+                collector = Collector(config, factory.fn, "cpu")
+            connection.send(("ok", getattr(collector, method)(*arguments)))
+        except UserError as error:
+            connection.send(("user_error", str(error)))
+        except Exception:
+            connection.send(("error", traceback.format_exc()))
+
+
+@contextmanager
+def _single_threaded() -> Iterator[None]:
+    before = {name: os.environ.get(name) for name in THREAD_SETTINGS}
+    os.environ.update(dict.fromkeys(THREAD_SETTINGS, "1"))
+    try:
+        yield
+    finally:
+        for name, value in before.items():
+            if value is None:
+                del os.environ[name]
+            else:
+                os.environ[name] = value

@@ -1,0 +1,13 @@
+"""Run a trained agent in closed loop: `python scripts/eval.py --checkpoint DIR`; --help lists every flag."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
+
+from latentplan.evaluate import main  # noqa: E402
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,186 @@
+"""A suite task keeps the promises of an environment of frames."""
+
+import numpy as np
+import pytest
+from gymnasium.error import ResetNeeded
+from gymnasium.utils.env_checker import check_env
+
+from latentplan.config import EnvConfig, UserError
+from latentplan.envs import default_task, make_env
+
+
+def config(**changes):
+    return EnvConfig(**{"domain": "cartpole", "render_quality": "fastest", "action_repeat": 8, **changes})
+
+
+@pytest.fixture(scope="module")
+def env():
+    env = make_env(config(), seed=0)
+    yield env
+    env.close()
+
+
+def play(env, seed, num_decisions=5):
+    """Frames, rewards and true states of a few random decisions from a seeded start."""
+    actions = np.random.default_rng(0).uniform(-1.0, 1.0, (num_decisions, *env.action_space.shape))
+    frame, _ = env.reset(seed=seed)
+    frames, rewards, states = [frame], [], [env.true_state()]
+    for action in actions:
+        frame, reward, *_ = env.step(action)
+        frames.append(frame)
+        rewards.append(reward)
+        states.append(env.true_state())
+    return np.stack(frames), np.array(rewards), np.stack(states)
+
+
+def test_an_episode_depends_on_its_seed_alone(env):
+    first, other, again = play(env, 5), play(env, 6), play(env, 5)
+    assert all(np.array_equal(a, b) for a, b in zip(first, again, strict=True))
+    assert not np.array_equal(first[2], other[2])
+
+
+def test_resets_without_a_seed_go_on_with_the_stream(env):
+    env.reset(seed=3)
+    states = []
+    for _ in range(2):
+        env.reset()
+        states.append(env.true_state())
+    env.reset(seed=3)
+    env.reset()
+    assert not np.array_equal(states[0], states[1])
+    assert np.array_equal(states[0], env.true_state())
+
+
+def test_the_seed_given_at_the_start_is_that_of_the_first_reset(env):
+    other = make_env(config(), seed=11)
+    other.reset()
+    env.reset(seed=11)
+    assert np.array_equal(other.true_state(), env.true_state())
+    other.close()
+
+
+def test_two_environments_do_not_disturb_each_others_frames(env):
+    alone, _, _ = play(env, 5)
+    other = make_env(config(domain="pendulum"), seed=0)
+    other.reset()
+    frames = [env.reset(seed=5)[0]]
+    for action in np.random.default_rng(0).uniform(-1.0, 1.0, (5, 1)):
+        other.step(action)
+        frames.append(env.step(action)[0])
+    other.close()
+    assert np.array_equal(alone, np.stack(frames))
+
+
+def test_frames_are_never_changed_later(env):
+    frame, _ = env.reset(seed=0)
+    copy = frame.copy()
+    for _ in range(5):
+        env.step(np.ones(1))
+    assert np.array_equal(frame, copy)
+
+
+def test_spaces_are_bytes_in_and_bounded_floats_out(env):
+    assert env.observation_space.shape == (64, 64, 3)
+    assert env.observation_space.dtype == np.uint8
+    assert env.action_space.dtype == np.float32
+    assert (env.action_space.low == -1.0).all() and (env.action_space.high == 1.0).all()
+
+
+@pytest.mark.filterwarnings("ignore::UserWarning")
+def test_gymnasiums_own_checker_agrees(env):
+    check_env(env, skip_render_check=True)
+
+
+def test_action_repeat_sums_the_rewards_of_single_steps(env):
+    single = make_env(config(action_repeat=1), seed=0)
+    env.reset(seed=2)
+    single.reset(seed=2)
+    action = np.array([0.7])
+    frame, reward, *_ = env.step(action)
+    steps = [single.step(action) for _ in range(8)]
+    assert reward == pytest.approx(sum(step[1] for step in steps), abs=1e-12)
+    assert np.array_equal(frame, steps[-1][0])
+    assert np.array_equal(env.true_state(), single.true_state())
+    single.close()
+
+
+@pytest.mark.parametrize(("action_repeat", "decisions", "last"), [(8, 125, 8), (300, 4, 100)])
+def test_the_time_limit_truncates_after_a_thousand_control_steps(action_repeat, decisions, last):
+    env = make_env(config(action_repeat=action_repeat), seed=0)
+    env.reset()
+    taken, total, ended = [], 0.0, False
+    while not ended:
+        _, reward, terminated, ended, info = env.step(np.zeros(1))
+        assert not terminated
+        taken.append(info["env_frames"])
+        total += reward
+    assert len(taken) == decisions == env.unwrapped.decisions_per_episode
+    assert (sum(taken), taken[-1]) == (1000, last)
+    with pytest.raises(ResetNeeded):
+        env.step(np.zeros(1))
+    env.close()
+
+
+def test_a_task_that_ends_itself_terminates():
+    env = make_env(config(domain="lqr", action_repeat=1), seed=0)
+    env.reset()
+    with env.physics.reset_context():
+        env.physics.data.qpos[:] = 0.0  # the goal of the regulator
+    _, _, terminated, truncated, _ = env.step(np.zeros(env.action_space.shape))
+    env.close()
+    assert terminated and not truncated
+
+
+def test_actions_beyond_the_bounds_act_like_the_bounds(env):
+    states = []
+    for value in (1.0, 7.0):
+        env.reset(seed=4)
+        env.step(np.array([value]))
+        states.append(env.true_state())
+    assert np.array_equal(*states)
+
+
+@pytest.mark.parametrize("action", [np.zeros(2), np.array([np.nan])])
+def test_an_action_that_cannot_be_is_refused(env, action):
+    env.reset(seed=0)
+    with pytest.raises(ValueError, match="action"):
+        env.step(action)
+
+
+def test_the_exact_picture_is_dm_controls_own():
+    env = make_env(config(render_quality="exact"), seed=0)
+    frame, _ = env.reset()
+    expected = env.physics.render(64, 64, camera_id=0)
+    env.close()
+    assert np.array_equal(frame, expected)
+
+
+def test_large_pictures_show_the_same_view(env):
+    frame, _ = env.reset(seed=0)
+    large = env.unwrapped.render_large(256)
+    assert large.shape == (256, 256, 3)
+    means = large.reshape(64, 4, 64, 4, 3).mean(axis=(1, 3))
+    assert np.abs(means - frame).mean() < 4.0  # edges fall differently on 16 pixels than on one
+    assert np.array_equal(env.render(), frame)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"domain": "cartpol"}, r"unknown domain 'cartpol'; available: acrobot, .* Did you mean 'cartpole'\?"),
+        ({"task": "swing"}, r"unknown task of cartpole 'swing'; available: balance, .* Did you mean 'swingup'\?"),
+        ({"camera": 9}, r"camera 9 does not exist; cartpole has 2 cameras"),
+    ],
+)
+def test_unknown_names_are_refused_with_the_nearest_choice(changes, message):
+    with pytest.raises(UserError, match=message):
+        make_env(config(**changes))
+
+
+def test_every_domain_has_a_default_task_that_exists():
+    from dm_control import suite
+
+    for domain, tasks in suite.TASKS_BY_DOMAIN.items():
+        assert default_task(domain) in tasks
+    with pytest.raises(UserError, match="Did you mean 'walker'"):
+        default_task("walkr")

@@ -1,0 +1,118 @@
+"""A user's environment becomes frames of 64 x 64 and actions in [-1, 1], or is refused by name."""
+
+import gymnasium
+import numpy as np
+import pytest
+from gymnasium.spaces import Box, Dict, Discrete
+from gymnasium.wrappers import TimeLimit
+
+from latentplan.config import EnvConfig, UserError
+from latentplan.envs import make_from, wrap_user_env
+
+IMAGE = Box(0, 255, (48, 96, 3), np.uint8)
+ACTIONS = Box(np.array([0.0, -4.0], np.float32), np.array([2.0, 4.0], np.float32))
+
+
+class Clock(gymnasium.Env):
+    """Its picture is as bright as the number of steps taken; its reward is the first action."""
+
+    def __init__(self, observation_space=IMAGE, action_space=ACTIONS):
+        self.observation_space = observation_space
+        self.action_space = action_space
+        self.picture = np.zeros(observation_space.shape or (1,), np.uint8)
+        self.actions = []
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.picture[:] = 0
+        return self.picture, {"start": self.np_random.random()}
+
+    def step(self, action):
+        self.actions.append(action)
+        self.picture += 1  # the same array every time, on purpose
+        return self.picture, action[0], bool(self.picture.max() == 7), False, {}
+
+
+def test_pictures_are_resized_and_never_changed_later():
+    env = wrap_user_env(Clock())
+    first, _ = env.reset()
+    second, *_ = env.step(np.zeros(2))
+    assert first.shape == second.shape == (64, 64, 3)
+    assert (first == 0).all() and (second == 1).all()
+    assert env.render_large(256).shape == (256, 256, 3)
+
+
+def test_pictures_of_the_right_size_are_copied():
+    env = wrap_user_env(Clock(Box(0, 255, (64, 64, 3), np.uint8)))
+    first, _ = env.reset()
+    env.step(np.zeros(2))
+    assert (first == 0).all()
+
+
+def test_actions_are_scaled_to_the_users_bounds():
+    clock = Clock()
+    env = wrap_user_env(clock)
+    env.reset()
+    for action in ([-1.0, -1.0], [0.0, 0.5], [1.0, 3.0]):
+        env.step(np.array(action))
+    assert np.allclose(clock.actions, [[0.0, -4.0], [1.0, 2.0], [2.0, 4.0]])
+    assert clock.actions[0].dtype == np.float32
+
+
+def test_action_repeat_sums_rewards_and_stops_at_the_end():
+    env = wrap_user_env(Clock(), action_repeat=4)
+    env.reset()
+    _, reward, terminated, _, info = env.step(np.ones(2))
+    assert (reward, terminated, info["env_frames"]) == (8.0, False, 4)
+    frame, reward, terminated, _, info = env.step(np.ones(2))
+    assert (reward, terminated, info["env_frames"]) == (6.0, True, 3)
+    assert (frame == 7).all()
+
+
+def test_a_time_limit_gives_the_decisions_per_episode():
+    assert wrap_user_env(Clock(), action_repeat=4).decisions_per_episode is None
+    gymnasium.register("latentplan-test/Clock-v0", lambda: Clock(), max_episode_steps=10)
+    limited = gymnasium.make("latentplan-test/Clock-v0", disable_env_checker=True)
+    assert isinstance(limited.env, TimeLimit) or isinstance(limited, TimeLimit)
+    assert wrap_user_env(limited, action_repeat=4).decisions_per_episode == 3
+
+
+def test_the_factory_builder_seeds_the_first_reset_only():
+    build = make_from(Clock)
+    starts = [build(EnvConfig(), 5).reset()[1]["start"] for _ in range(2)]
+    env = build(EnvConfig(), 5)
+    assert starts[0] == starts[1] == env.reset()[1]["start"] == env.reset(seed=5)[1]["start"]
+    assert env.reset()[1]["start"] != starts[0]
+
+
+@pytest.mark.parametrize(
+    ("space", "got"),
+    [
+        (Dict({"image": IMAGE}), "got Dict"),
+        (Box(0.0, 1.0, (64, 64, 3), np.float32), "got dtype float32"),
+        (Box(0, 255, (3, 64, 64), np.uint8), r"got shape \(3, 64, 64\)"),
+        (Box(0, 255, (64, 64), np.uint8), r"got shape \(64, 64\)"),
+    ],
+)
+def test_observations_that_are_no_images_are_refused(space, got):
+    with pytest.raises(UserError, match=f"observations must be .*{got}"):
+        wrap_user_env(Clock(observation_space=space))
+
+
+@pytest.mark.parametrize(
+    ("space", "got"),
+    [
+        (Discrete(3), "got Discrete"),
+        (Box(0, 3, (2,), np.int32), "got dtype int32"),
+        (Box(-1.0, 1.0, (2, 2), np.float32), r"got shape \(2, 2\)"),
+        (Box(-np.inf, 1.0, (2,), np.float32), "got bounds"),
+    ],
+)
+def test_actions_that_are_no_bounded_box_are_refused(space, got):
+    with pytest.raises(UserError, match=f"actions must be .*{got}"):
+        wrap_user_env(Clock(action_space=space))
+
+
+def test_a_factory_of_something_else_is_refused():
+    with pytest.raises(UserError, match=r"make_env must return a gymnasium.Env, got dict"):
+        make_from(dict)(EnvConfig(), 0)

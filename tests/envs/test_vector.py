@@ -1,0 +1,91 @@
+"""Several environments behave as the same environments one by one."""
+
+import os
+
+import numpy as np
+import pytest
+
+from latentplan.config import EnvConfig
+from latentplan.envs import make_env, make_vector_env
+
+CONFIG = EnvConfig(domain="cartpole", render_quality="fastest", action_repeat=250)  # four decisions an episode
+ACTIONS = np.random.default_rng(0).uniform(-1.0, 1.0, (6, 2, 1)).astype(np.float32)
+
+
+@pytest.fixture(scope="module")
+def pair():
+    before = dict(os.environ)
+    pair = make_vector_env(CONFIG, 2, seed=0)
+    assert dict(os.environ) == before
+    yield pair
+    pair.close()
+
+
+def test_a_pair_equals_two_single_environments(pair):
+    singles = [make_env(CONFIG, seed=0) for _ in range(2)]
+    frames, _ = pair.reset(seed=[3, 4])
+    expected = [env.reset(seed=seed)[0] for env, seed in zip(singles, (3, 4), strict=True)]
+    assert np.array_equal(frames, expected)
+    for actions in ACTIONS[:4]:
+        frames, rewards, terminated, truncated, info = pair.step(actions)
+        steps = [env.step(action) for env, action in zip(singles, actions, strict=True)]
+        assert np.array_equal(frames, [step[0] for step in steps])
+        assert np.array_equal(rewards, [step[1] for step in steps])
+        assert np.array_equal(truncated, [step[3] for step in steps])
+        assert not terminated.any()
+        assert np.array_equal(info["env_frames"], [250, 250])
+    assert truncated.all()
+    for env in singles:
+        env.close()
+
+
+def test_only_masked_environments_restart(pair):
+    pair.reset(seed=[3, 4])
+    before, *_ = pair.step(ACTIONS[0])
+    after, _ = pair.reset(options={"reset_mask": np.array([True, False])})
+    assert not np.array_equal(before[0], after[0])
+    assert np.array_equal(before[1], after[1])
+
+
+def test_frames_of_a_pair_are_never_changed_later(pair):
+    frames, _ = pair.reset(seed=[3, 4])
+    copy = frames.copy()
+    pair.step(ACTIONS[0])
+    assert np.array_equal(frames, copy)
+
+
+def test_a_single_environment_needs_no_process_and_restarts_alike():
+    one = make_vector_env(CONFIG, 1, seed=0)
+    first, _ = one.reset()
+    for _ in range(4):
+        last, _, _, truncated, _ = one.step(np.ones((1, 1), np.float32))
+    fresh, _ = one.reset(options={"reset_mask": truncated})
+    assert first.shape == last.shape == fresh.shape == (1, 64, 64, 3)
+    assert not np.array_equal(last, fresh)
+    one.close()
+
+
+def test_a_users_factory_runs_in_every_process():
+    import gymnasium
+    from gymnasium.spaces import Box
+
+    class Noise(gymnasium.Env):
+        observation_space = Box(0, 255, (32, 32, 3), np.uint8)
+        action_space = Box(-2.0, 2.0, (2,), np.float32)
+
+        def reset(self, *, seed=None, options=None):
+            super().reset(seed=seed)
+            return self.np_random.integers(0, 256, (32, 32, 3), np.uint8), {}
+
+        def step(self, action):
+            return self.np_random.integers(0, 256, (32, 32, 3), np.uint8), float(action[0]), False, False, {}
+
+    pictures = []
+    for _ in range(2):
+        pair = make_vector_env(EnvConfig(), 2, seed=9, make_env=lambda: Noise())
+        pictures.append(pair.reset()[0])
+        _, rewards, *_ = pair.step(np.array([[1.0, 0.0], [0.5, 0.0]], np.float32))
+        pair.close()
+    assert np.array_equal(*pictures)  # the same seed, the same streams
+    assert not np.array_equal(pictures[0][0], pictures[0][1])  # and another stream for each
+    assert np.array_equal(rewards, [4.0, 2.0])  # action repeat 2

@@ -1,0 +1,51 @@
+"""Small analytic models that the planner's laws are tested on."""
+
+import pytest
+import torch
+
+from latentplan.planning import CEMPlanner, FunctionModel
+
+
+def point_dynamics(state, action):
+    """A point mass in the plane: state (rows, 4) is position and velocity, the action accelerates."""
+    velocity = state[:, 2:] + 0.3 * action
+    return torch.cat([state[:, :2] + 0.3 * velocity, velocity], dim=1)
+
+
+def point_reward(state, action):
+    return -state[:, :2].square().sum(dim=1) - 0.01 * action.square().sum(dim=1)
+
+
+def point_value(state):
+    return -3.0 * state[:, :2].square().sum(dim=1)
+
+
+def point_policy(state, generator):
+    mode = -state[:, :2] - state[:, 2:]
+    if generator is None:
+        return mode
+    return mode + 0.2 * torch.randn(mode.shape, generator=generator)
+
+
+@pytest.fixture
+def point():
+    return FunctionModel(point_dynamics, point_reward, value=point_value, policy=point_policy)
+
+
+@pytest.fixture
+def states():
+    return torch.randn(5, 4, generator=torch.Generator().manual_seed(3))
+
+
+@pytest.fixture
+def make_planner():
+    def make(**options):
+        defaults = {"action_dim": 2, "horizon": 6, "num_samples": 64, "num_elites": 8, "num_iterations": 3}
+        return CEMPlanner(**defaults | options)
+
+    return make
+
+
+@pytest.fixture
+def seeded():
+    return lambda seed=0: torch.Generator().manual_seed(seed)

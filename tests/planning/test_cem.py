@@ -1,0 +1,383 @@
+"""Laws of a plan: what it may depend on, where it stays, what it does with numbers that cannot happen."""
+
+from typing import NamedTuple
+
+import pytest
+import torch
+
+from latentplan.config import PlannerConfig
+from latentplan.planning import CEMPlanner, FunctionModel, ModelPredictiveController
+
+
+def assert_same_plan(left, right):
+    # 1e-5: rows of a matrix product may be summed in another order when more rows share it.
+    torch.testing.assert_close(left.mean, right.mean, atol=1e-5, rtol=0)
+    torch.testing.assert_close(left.var, right.var, atol=1e-5, rtol=0)
+    torch.testing.assert_close(left.expected_return, right.expected_return, atol=1e-4, rtol=1e-5)
+
+
+def pick(plan, index):
+    return type(plan)(
+        plan.actions[index],
+        plan.mean[index],
+        plan.var[index],
+        plan.expected_return[index],
+        {},
+        None if plan.elites is None else plan.elites[index],
+        plan.is_warm[index],
+        plan.elapsed[index],
+    )
+
+
+RICH = {"num_policy_samples": 6, "keep_elite_fraction": 0.3, "noise_beta": 1.0, "start": "both", "tail": "policy"}
+
+
+@pytest.mark.parametrize("options", [{}, RICH])
+def test_an_environment_has_the_same_plan_alone_and_in_company(point, states, make_planner, seeded, options):
+    planner = make_planner(**options)
+    together = planner.plan(point, states, generator=seeded())
+    warm = planner.plan(point, states + 0.1, together.forget(torch.tensor([0, 1, 0, 0, 1]).bool()), generator=seeded(1))
+    for index in range(len(states)):
+        row = slice(index, index + 1)
+        alone = planner.plan(point, states[row], generator=seeded())
+        assert_same_plan(alone, pick(together, row))
+        before = alone.forget(torch.tensor([index in (1, 4)]))
+        assert_same_plan(planner.plan(point, states[row] + 0.1, before, generator=seeded(1)), pick(warm, row))
+
+
+def test_an_environment_has_the_same_plan_among_64(point, make_planner, seeded):
+    many = torch.randn(64, 4, generator=seeded(9))
+    planner = make_planner(num_policy_samples=4)
+    together = planner.plan(point, many, generator=seeded())
+    for index in (0, 17, 63):
+        row = slice(index, index + 1)
+        assert_same_plan(planner.plan(point, many[row], generator=seeded()), pick(together, row))
+
+
+def test_the_order_of_environments_does_not_matter(point, states, make_planner, seeded):
+    planner, order = make_planner(num_policy_samples=4), torch.tensor([3, 0, 4, 2, 1])
+    plan = planner.plan(point, states, generator=seeded())
+    assert_same_plan(planner.plan(point, states[order], generator=seeded()), pick(plan, order))
+
+
+def test_a_list_of_generators_gives_each_environment_its_own_stream(point, states, make_planner, seeded):
+    planner = make_planner(num_policy_samples=4)
+    plan = planner.plan(point, states, generator=[seeded(seed) for seed in range(5)])
+    alone = planner.plan(point, states[3:4], generator=seeded(3))
+    assert_same_plan(alone, pick(plan, slice(3, 4)))
+    with pytest.raises(ValueError, match="one for each of 5"):
+        planner.plan(point, states, generator=[seeded()])
+
+
+def test_a_stream_stays_aligned_when_a_neighbour_starts_cold(point, states, make_planner, seeded):
+    planner = make_planner(num_iterations=4, warm_start_iterations=2)
+    pair, single = seeded(5), seeded(5)
+    both = planner.plan(point, states[:2], generator=pair)
+    both = planner.plan(point, states[:2], both.forget(torch.tensor([False, True])), generator=pair)
+    assert both.info["iterations"].tolist() == [2, 4]
+    both = planner.plan(point, states[:2], both, generator=pair)
+    one = None
+    for _ in range(3):
+        one = planner.plan(point, states[:1], one, generator=single)
+    assert_same_plan(one, pick(both, slice(0, 1)))
+
+
+def test_equal_seeds_give_equal_plans_and_others_do_not(point, states, make_planner, seeded):
+    planner = make_planner()
+    first, again, other = (planner.plan(point, states, generator=seeded(seed)) for seed in (0, 0, 1))
+    assert torch.equal(first.mean, again.mean)
+    assert not torch.equal(first.mean, other.mean)
+
+
+def test_candidates_meet_their_own_environments_state(make_planner, seeded):
+    """Each environment's goal is its state: pairing a candidate with another's state would miss it."""
+    model = FunctionModel(lambda state, action: state, lambda state, action: -(action - state).square().sum(dim=1))
+    goals = torch.tensor([[0.8, -0.6], [-0.7, 0.1], [0.0, 0.9]])
+    plan = make_planner(num_samples=256, num_iterations=8).plan(model, goals, generator=seeded())
+    torch.testing.assert_close(plan.action, goals, atol=0.02, rtol=0)
+
+
+@pytest.mark.parametrize("options", [{}, RICH, {"final": "best"}, {"gradient_steps": 3}])
+def test_asymmetric_bounds_hold_in_the_model_and_in_the_plan(point, states, make_planner, seeded, options):
+    low, high = torch.tensor([0.2, -3.0]), torch.tensor([0.7, -0.5])
+    seen = []
+
+    def dynamics(state, action):
+        seen.append(action.detach())
+        return point.dynamics(state, action)
+
+    model = FunctionModel(dynamics, point.reward, value=point.value, policy=point.policy)
+    planner = make_planner(action_low=low, action_high=high, **options)
+    plan = planner.plan(model, states, generator=seeded())
+    plan = planner.plan(model, states, plan, generator=seeded())
+    for actions in [torch.cat(seen), plan.mean, plan.actions]:
+        assert (actions >= low).all() and (actions <= high).all()
+
+
+def test_the_zero_tail_and_the_cold_start_lie_within_asymmetric_bounds(make_planner, seeded):
+    model = FunctionModel(lambda state, action: state, lambda state, action: 0 * action.sum(dim=1))
+    planner = make_planner(action_low=0.5, action_high=1.5, init_std=0.0, num_elites=64, smoothing=1.0)
+    cold = planner.plan(model, torch.zeros(1, 4), generator=seeded())
+    torch.testing.assert_close(cold.mean, torch.full_like(cold.mean, 0.5))
+    warm = planner.plan(model, torch.zeros(1, 4), cold, generator=seeded())
+    torch.testing.assert_close(warm.mean, torch.full_like(cold.mean, 0.5))
+
+
+def test_bounds_and_start_std_are_in_action_units(make_planner, seeded):
+    seen = []
+    model = FunctionModel(
+        lambda state, action: state, lambda state, action: (seen.append(action.clone()), action.sum(dim=1))[1]
+    )
+    planner = make_planner(action_low=-20.0, action_high=20.0, init_std=(2.0, 5.0), num_samples=4000, num_iterations=1)
+    planner.plan(model, torch.zeros(1, 4), generator=seeded())
+    torch.testing.assert_close(torch.cat(seen).std(dim=0), torch.tensor([2.0, 5.0]), rtol=0.05, atol=0)
+
+
+def test_the_default_start_std_is_half_the_range(make_planner, seeded):
+    plan = make_planner(action_low=-1.0, action_high=3.0, num_iterations=1, smoothing=1e-9).plan(
+        FunctionModel(lambda state, action: state, lambda state, action: action.sum(dim=1)),
+        torch.zeros(1, 4),
+        generator=seeded(),
+    )
+    torch.testing.assert_close(plan.var, torch.full_like(plan.var, 4.0))
+
+
+def test_min_std_floors_the_sampling_and_not_the_variance(point, states, make_planner, seeded):
+    planner = make_planner(init_std=0.0, min_std=0.3, num_iterations=1, smoothing=1e-9)
+    plan = planner.plan(point, states, generator=seeded())
+    assert plan.var.max() < 1e-6
+    torch.testing.assert_close(plan.info["std"], torch.full_like(plan.info["std"], 0.3))
+    wide, narrow = (make_planner(init_std=0.0, min_std=std).plan(point, states, generator=seeded()) for std in (0.3, 0))
+    assert (narrow.mean == 0).all() and (wide.mean != 0).any()
+
+
+@pytest.mark.parametrize("broken", [float("nan"), float("inf")])
+def test_nonfinite_candidates_never_win_and_are_counted(states, make_planner, seeded, broken):
+    """Everything with a positive first action is broken: the plan must not go there."""
+
+    def reward(state, action):
+        return torch.where(action[:, 0] > 0, broken, action[:, 0])
+
+    model = FunctionModel(lambda state, action: state, reward)
+    plan = make_planner(final="best").plan(model, states, generator=seeded())
+    assert (plan.actions[..., 0] <= 0).all() and torch.isfinite(plan.mean).all()
+    assert (plan.info["num_nonfinite"] > 0).all() and not plan.info["is_fallback"].any()
+
+
+def test_when_nothing_is_finite_the_last_plans_tail_is_executed(point, states, make_planner, seeded):
+    planner = make_planner(action_low=-0.4)
+    last = planner.plan(point, states, generator=seeded())
+    broken = FunctionModel(point.dynamics, lambda state, action: torch.full_like(state[:, 0], float("nan")))
+    plan = planner.plan(broken, states, last.forget(torch.tensor([1, 0, 0, 0, 0]).bool()), generator=seeded())
+    assert plan.info["is_fallback"].all() and plan.expected_return.isnan().all()
+    torch.testing.assert_close(plan.actions[1:, :-1], last.actions[1:, 1:])
+    assert (plan.actions[0] == 0).all() and (plan.actions[:, -1] == 0).all()
+
+
+def test_a_broken_environment_does_not_disturb_its_neighbours(point, states, make_planner, seeded):
+    planner = make_planner()
+    spoiled = states.clone()
+    spoiled[2] = float("nan")
+    plan, good = planner.plan(point, spoiled, generator=seeded()), planner.plan(point, states, generator=seeded())
+    assert plan.info["is_fallback"].tolist() == [False, False, True, False, False]
+    others = torch.tensor([0, 1, 3, 4])
+    assert_same_plan(pick(plan, others), pick(good, others))
+
+
+@pytest.mark.parametrize("start", ["shifted", "policy", "both"])
+def test_a_policy_that_answers_nan_is_left_out(point, states, make_planner, seeded, start):
+    model = FunctionModel(
+        point.dynamics, point.reward, policy=lambda state, generator: torch.full_like(state[:, :2], float("nan"))
+    )
+    plan = make_planner(num_policy_samples=8, start=start).plan(model, states, generator=seeded())
+    assert torch.isfinite(plan.mean).all() and not plan.info["is_fallback"].any()
+
+
+def test_a_done_candidate_ends_only_itself(make_planner, seeded):
+    """Reward 1 for every step alive; action above 0 ends the episode."""
+
+    def dynamics(state, action):
+        return torch.maximum(state, (action[:, :1] > 0).float())
+
+    model = FunctionModel(
+        dynamics,
+        lambda state, action: torch.ones(len(state)),
+        continues=lambda state: 1.0 - state[:, 0],
+        value=lambda state: torch.full((len(state),), 10.0),
+    )
+    plan = make_planner(use_continues=True, final="best", num_samples=512).plan(
+        model, torch.zeros(2, 1), generator=seeded()
+    )
+    assert (plan.actions[..., 0] <= 0).all()
+    torch.testing.assert_close(plan.expected_return, torch.full((2,), 16.0))
+
+
+def test_expected_return_is_discounted_reward_plus_discounted_value(make_planner, seeded):
+    model = FunctionModel(
+        lambda state, action: state + 1,
+        lambda state, action: state[:, 0] + 0 * action[:, 0],
+        value=lambda state: 100 * state[:, 0],
+    )
+    plan = make_planner(horizon=3, discount=0.5).plan(model, torch.zeros(1, 1), generator=seeded())
+    assert plan.expected_return.item() == pytest.approx(0 + 0.5 * 1 + 0.25 * 2 + 0.125 * 300)
+
+
+def test_asking_for_what_the_model_lacks_is_an_error(point, states, make_planner):
+    bare = FunctionModel(point.dynamics, point.reward)
+    for options, method in [
+        ({"terminal_value": True}, "value"),
+        ({"num_policy_samples": 4}, "policy"),
+        ({"use_continues": True}, "continues"),
+    ]:
+        with pytest.raises(ValueError, match=rf"{method}\(\)"):
+            make_planner(**options).plan(bare, states)
+    last = make_planner().plan(bare, states)
+    with pytest.raises(ValueError, match=r"policy\(\)"):
+        make_planner(tail="policy").plan(bare, states, last)
+
+
+def test_the_terminal_value_is_used_when_the_model_has_one_unless_it_is_refused(point, states, make_planner, seeded):
+    detected, asked, refused = (
+        make_planner(terminal_value=choice).plan(point, states, generator=seeded()).mean
+        for choice in (None, True, False)
+    )
+    assert torch.equal(detected, asked) and not torch.equal(detected, refused)
+
+
+def test_a_fused_rollout_gives_the_same_plan_as_steps(point, states, make_planner, seeded):
+    def rollout(state, actions):
+        rewards = []
+        for action in actions.unbind(1):
+            rewards.append(point.reward(state, action))
+            state = point.dynamics(state, action)
+        return torch.stack(rewards, dim=1), state
+
+    fused = FunctionModel(point.dynamics, point.reward, value=point.value, rollout=rollout)
+    stepped = FunctionModel(point.dynamics, point.reward, value=point.value)
+    plans = [make_planner().plan(model, states, generator=seeded()) for model in (fused, stepped)]
+    assert_same_plan(*plans)
+
+
+class Nested(NamedTuple):
+    position: torch.Tensor
+    rest: dict
+
+
+def test_states_may_be_nested(point, states, make_planner, seeded):
+    def flat(state):
+        return torch.cat([state.position, state.rest["velocity"]], dim=1)
+
+    def nest(state):
+        return Nested(state[:, :2], {"velocity": state[:, 2:]})
+
+    nested = FunctionModel(
+        lambda state, action: nest(point.dynamics(flat(state), action)),
+        lambda state, action: point.reward(flat(state), action),
+        value=lambda state: point.value(flat(state)),
+        policy=lambda state, generator: point.policy(flat(state), generator),
+    )
+    planner = make_planner(num_policy_samples=3)
+    left, right = planner.plan(nested, nest(states), generator=seeded()), planner.plan(point, states, generator=seeded())
+    assert_same_plan(left, right)
+
+
+def test_the_shifted_last_plan_is_always_a_candidate(make_planner, seeded):
+    """Only the last plan, shifted, is worth anything: it wins although nothing is sampled near it."""
+    last_actions = torch.linspace(-0.9, 0.9, 12).reshape(1, 6, 2)
+    wanted = torch.cat([last_actions[:, 1:], torch.zeros(1, 1, 2)], dim=1)
+
+    def dynamics(state, action):
+        return torch.cat([state[:, :1] + 1, state[:, 1:]], dim=1)
+
+    def reward(state, action):
+        target = wanted[0][state[:, 0].long()]
+        return ((action - target).abs().amax(dim=1) < 1e-6).float()
+
+    model = FunctionModel(dynamics, reward)
+    for start in ("shifted", "policy"):
+        model.policy = lambda state, generator: torch.full((len(state), 2), 0.99)
+        planner = make_planner(
+            init_std=1e-4, num_policy_samples=4, start=start, final="best", num_elites=1, num_iterations=3
+        )
+        previous = planner.plan(model, torch.zeros(1, 2), generator=seeded())
+        previous = type(previous)(last_actions, last_actions, *[getattr(previous, name) for name in _REST])
+        plan = planner.plan(model, torch.zeros(1, 2), previous, generator=seeded())
+        torch.testing.assert_close(plan.actions, wanted)
+
+
+_REST = ("var", "expected_return", "info", "elites", "is_warm", "elapsed")
+
+
+def test_the_policys_mode_is_among_the_candidates(make_planner, seeded):
+    """A sampled policy is useless here: only the mode itself earns anything."""
+    model = FunctionModel(
+        lambda state, action: state,
+        lambda state, action: (action - 0.625).abs().amax(dim=1).lt(1e-6).float(),
+        policy=lambda state, generator: (
+            torch.full((len(state), 2), 0.625) if generator is None else torch.zeros(len(state), 2)
+        ),
+    )
+    plan = make_planner(num_policy_samples=2, final="best").plan(model, torch.zeros(3, 1), generator=seeded())
+    torch.testing.assert_close(plan.actions, torch.full_like(plan.actions, 0.625))
+
+
+def test_plans_are_ordinary_tensors_without_gradient(point, states, make_planner):
+    weight = torch.ones(2, requires_grad=True)
+    model = FunctionModel(point.dynamics, lambda state, action: point.reward(state, action * weight))
+    plan = make_planner().plan(model, states)
+    assert not plan.mean.requires_grad
+    (plan.mean * weight).sum().backward()  # usable as a training target
+
+
+def test_double_states_are_planned_in_double(point, states, make_planner):
+    plan = make_planner().plan(point, states.double())
+    assert plan.mean.dtype == plan.expected_return.dtype == torch.float64
+
+
+def test_a_planner_follows_its_configuration(point, states, seeded):
+    config = PlannerConfig(horizon=4, num_samples=32, num_elites=5, num_policy_samples=3, final="best")
+    planner = CEMPlanner.from_config(config, action_dim=2, discount=0.9)
+    assert (planner.horizon, planner.num_elites, planner.final, planner.discount) == (4, 5, "best", 0.9)
+    assert planner.plan(point, states, generator=seeded()).mean.shape == (5, 4, 2)
+
+
+def test_the_optimum_of_a_point_mass_is_found(point, make_planner, seeded):
+    """Controlled for 40 steps, the mass comes to rest at the origin."""
+    planner = make_planner(horizon=10, num_samples=256, num_elites=24, num_iterations=4, warm_start_iterations=3)
+    controller = ModelPredictiveController(planner, point, generator=seeded())
+    state = torch.tensor([[1.5, -1.0, 0.0, 0.5], [-1.0, 1.0, 0.5, 0.0]])
+    for _ in range(40):
+        state = point.dynamics(state, controller.act(state))
+    assert state.abs().max() < 0.1
+
+
+@pytest.mark.parametrize(
+    ("options", "name"),
+    [
+        ({"num_elites": 65}, "num_elites"),
+        ({"num_policy_samples": 64}, "num_policy_samples"),
+        ({"smoothing": 0.0}, "smoothing"),
+        ({"discount": 1.1}, "discount"),
+        ({"start": "middle"}, "start"),
+        ({"action_low": 1.0, "action_high": -1.0}, "action_low"),
+        ({"action_low": [0.0, 0.0, 0.0]}, "action_low"),
+        ({"action_high": float("inf")}, "action_high"),
+        ({"init_std": -1.0}, "init_std"),
+        ({"temperature": 0.0}, "temperature"),
+        ({"warm_start_iterations": 0}, "warm_start_iterations"),
+        ({"keep_elite_fraction": 1.5}, "keep_elite_fraction"),
+    ],
+)
+def test_bad_settings_are_named(make_planner, options, name):
+    with pytest.raises(ValueError, match=name):
+        make_planner(**options)
+
+
+def test_wrong_shapes_from_the_model_are_named(point, states, make_planner):
+    with pytest.raises(ValueError, match=r"step\(\)'s reward must have shape \(320,\), got \(320, 1\)"):
+        make_planner().plan(FunctionModel(point.dynamics, lambda state, action: state[:, :1]), states)
+    with pytest.raises(TypeError, match="tensor or a pytree"):
+        make_planner().plan(point, [1.0, 2.0])
+    plan = make_planner(horizon=3).plan(point, states)
+    with pytest.raises(ValueError, match="last plan has shape"):
+        make_planner().plan(point, states, plan)

@@ -1,0 +1,71 @@
+from types import SimpleNamespace
+
+import cv2
+import gymnasium
+import numpy as np
+
+from latentplan.reporting.film import filming
+
+
+class SharpEnv(gymnasium.Env):
+    """Renders green at any size."""
+
+    metadata = {"render_modes": ["rgb_array"], "render_fps": 12.5}
+
+    def render_large(self, size):
+        return np.full((size, size, 3), (0, 200, 0), np.uint8)
+
+
+class BlueDreamer:
+    def imagine(self):
+        return np.full((64, 64, 3), (0, 0, 200), np.uint8)
+
+
+def moment(decision, episode=0, action=(0.0,)):
+    frame = np.full((64, 64, 3), (200, 0, 0), np.uint8)
+    return SimpleNamespace(episode=episode, decision=decision, total_return=1.5 * decision, frame=frame, action=action)
+
+
+def film_of(path, env, planner, moments):
+    with filming(path, env, planner, horizon=6) as film:
+        for each in moments:
+            film(each)
+    capture = cv2.VideoCapture(str(path))
+    frames = []
+    while (result := capture.read())[0]:
+        frames.append(result[1][..., ::-1].astype(int))
+    return capture, frames
+
+
+def share(frame, color):
+    """Share of the picture that is nearly of a colour."""
+    return (np.abs(frame - color).max(axis=2) < 30).mean()
+
+
+def test_only_the_first_episode_is_filmed(tmp_path):
+    moments = [moment(0), moment(1), moment(2, action=None), moment(0, episode=1), moment(1, episode=1)]
+    _, frames = film_of(tmp_path / "film.mp4", SharpEnv(), None, moments)
+    assert len(frames) == 3
+
+
+def test_films_run_at_the_rate_of_the_environment(tmp_path):
+    capture, _ = film_of(tmp_path / "film.mp4", SharpEnv(), None, [moment(0)])
+    assert round(capture.get(cv2.CAP_PROP_FPS), 2) == 12.5
+
+
+def test_the_large_picture_is_filmed_where_there_is_one(tmp_path):
+    _, (frame,) = film_of(tmp_path / "film.mp4", SharpEnv(), None, [moment(0)])
+    assert share(frame, (0, 200, 0)) > 0.35
+    assert share(frame, (200, 0, 0)) == 0
+
+
+def test_the_agents_frame_is_filmed_where_there_is_no_larger(tmp_path):
+    _, (frame,) = film_of(tmp_path / "film.mp4", gymnasium.Env(), None, [moment(0)])
+    assert share(frame, (200, 0, 0)) > 0.35
+
+
+def test_what_the_plan_imagines_is_filmed_until_the_episode_is_over(tmp_path):
+    moments = [moment(0), moment(1), moment(2, action=None)]
+    _, frames = film_of(tmp_path / "film.mp4", SharpEnv(), BlueDreamer(), moments)
+    shown = [share(frame, (0, 0, 200)) > 0.35 for frame in frames]
+    assert shown == [True, True, False]

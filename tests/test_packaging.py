@@ -1,0 +1,100 @@
+"""What the project promises to installers: pins, ranges, entry points, targets."""
+
+import ast
+import re
+import subprocess
+import tomllib
+from importlib import metadata
+from pathlib import Path
+
+import pytest
+from packaging.requirements import Requirement
+from packaging.utils import canonicalize_name
+from packaging.version import Version
+
+ROOT = Path(__file__).resolve().parent.parent
+PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())
+REQUIREMENTS = [
+    Requirement(text)
+    for text in PROJECT["project"]["dependencies"] + PROJECT["project"]["optional-dependencies"]["dev"]
+]
+
+
+@pytest.fixture(scope="module")
+def pins():
+    lines = [line for line in (ROOT / "constraints.txt").read_text().splitlines() if not line.startswith("#")]
+    return {canonicalize_name(line.split("==")[0]): Version(line.split("==")[1]) for line in lines}
+
+
+def test_constraints_pin_without_local_suffixes(pins):
+    assert all(version.local is None for version in pins.values())
+
+
+@pytest.mark.parametrize("requirement", REQUIREMENTS, ids=str)
+def test_every_dependency_is_pinned_inside_its_range(requirement, pins):
+    assert pins[canonicalize_name(requirement.name)] in requirement.specifier
+
+
+@pytest.mark.parametrize("name", ["torch", "mujoco", "dm-control", "lightning"])
+def test_versions_known_to_break_lie_outside_the_ranges(name):
+    broken = {"torch": "2.9.1", "mujoco": "4.0.0", "dm-control": "1.1.0", "lightning": "2.6.3"}
+    works = {"torch": "2.11.0", "mujoco": "3.17.0", "dm-control": "1.0.50", "lightning": "2.6.6"}
+    requirement = next(item for item in REQUIREMENTS if item.name == name)
+    assert broken[name] not in requirement.specifier
+    assert works[name] in requirement.specifier
+
+
+def test_new_pythons_get_all_that_dm_control_needs_but_labmaze():
+    environment = {"python_version": "3.13", "extra": ""}
+    listed = {
+        canonicalize_name(item.name) for item in REQUIREMENTS if not item.marker or item.marker.evaluate(environment)
+    }
+    wanted = [Requirement(text) for text in metadata.requires("dm-control")]
+    needed = {canonicalize_name(item.name) for item in wanted if not item.marker or item.marker.evaluate(environment)}
+    assert needed - listed == {"labmaze"}
+    assert "dm-control" not in listed
+
+
+def test_every_subpackage_is_packaged():
+    listed = set(PROJECT["tool"]["setuptools"]["packages"])
+    found = {f"latentplan.{path.parent.name}" for path in (ROOT / "latentplan").glob("*/*.py")}
+    assert {"latentplan", "latentplan.configs", *found} == listed
+
+
+def test_the_package_says_that_it_is_typed():
+    assert (ROOT / "latentplan" / "py.typed").is_file()
+
+
+def test_the_console_script_exists():
+    module, function = PROJECT["project"]["scripts"]["latentplan"].split(":")
+    tree = ast.parse((ROOT / (module.replace(".", "/") + ".py")).read_text())
+    assert function in [node.name for node in tree.body if isinstance(node, ast.FunctionDef)]
+
+
+@pytest.mark.parametrize("target", ["setup", "train", "test", "check", "doctor", "soak"])
+def test_make_knows_its_targets(target):
+    result = subprocess.run(["make", "-n", target], cwd=ROOT, capture_output=True, text=True)
+    assert result.returncode == 0, result.stderr
+
+
+def test_arguments_of_make_follow_the_default_domain():
+    command = ["make", "-n", "train", "ARGS=--domain cartpole --minutes 5"]
+    output = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True).stdout
+    assert "scripts/train.py --domain walker --domain cartpole --minutes 5" in output
+
+
+def test_continuous_integration_runs_the_two_commands_and_nothing_else():
+    path = ROOT / ".ci" / "run"
+    assert path.stat().st_mode & 0o100
+    script = path.read_text().replace("\\\n", " ")
+    commands = [line.split()[0:2] for line in script.splitlines() if line and not line.startswith("#")]
+    assert commands[:2] == [["set", "-euo"], ["cd", commands[1][1]]]
+    assert commands[2:] == [["make", "test"], ["make", "train"]]
+
+
+def test_the_flags_of_continuous_integration_are_valid():
+    from latentplan.cli import parse_train
+
+    script = (ROOT / ".ci" / "run").read_text().replace("\\\n", " ")
+    arguments = re.search(r'ARGS="([^"]*)"', script)[1].split()
+    assert parse_train(["--domain", "walker", *arguments]).config.env.domain == "cartpole"
