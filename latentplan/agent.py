@@ -136,7 +136,9 @@ class PlanningAgent(ModelAgent):
         return self.model.decoder.picture(last.features.float())[0].cpu().numpy()
 
     def _choose(self, state: State) -> Tensor:
-        return self.controller.act(state)
+        # One autocast around the whole search converts each weight once, not once per model call.
+        with self.model.trunk_precision():
+            return self.controller.act(state)
 
 
 class ActorAgent(ModelAgent):

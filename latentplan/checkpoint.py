@@ -7,7 +7,6 @@ import json
 from pathlib import Path
 from typing import Any
 
-import torch
 from safetensors.torch import load_file, save_file
 
 from latentplan.agent import ActorAgent, Agent, PlanningAgent, RandomAgent

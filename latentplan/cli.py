@@ -151,9 +151,9 @@ def _train(argv: Sequence[str]) -> int:
 
 
 def _evaluate(argv: Sequence[str]) -> int:
-    from latentplan import evaluate
+    from latentplan.evaluate import main as evaluate_main
 
-    return evaluate.main(argv)
+    return evaluate_main(argv)
 
 
 def _doctor(argv: Sequence[str]) -> int:

@@ -23,7 +23,10 @@ LAYERS = {
     "agent": (("config", "models", "planning"), {"torch", "numpy", "einops"}),
     "rollout": (("config", "envs", "replay", "agent"), {"numpy"}),
     "checkpoint": (("config", "models", "planning", "agent"), {"torch", "numpy", "safetensors"}),
-    "training": ((*ALL, "compose"), {"lightning", "torch", "numpy", "einops", "rich", "tensorboard", "gymnasium"}),
+    "training": (
+        (*ALL, "compose"),
+        {"lightning", "torch", "numpy", "einops", "rich", "tensorboard", "gymnasium", "yaml"},
+    ),
     "compose": (("config",), {"jsonargparse", "yaml"}),
     "cli": None,
     "doctor": None,

@@ -94,6 +94,8 @@ class SuiteEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         limit = self._task_env._step_limit
         self._steps_per_episode = _UNLIMITED_EPISODE_STEPS if math.isinf(limit) else math.ceil(limit)
         self.action_repeat = config.action_repeat
+        frames_per_second = 1.0 / (self._task_env.control_timestep() * config.action_repeat)
+        self.metadata = {**SuiteEnv.metadata, "render_fps": frames_per_second}
         self.decisions_per_episode = math.ceil(self._steps_per_episode / config.action_repeat)
         spec = self._task_env.action_spec()
         bounded = np.isfinite(spec.minimum) & np.isfinite(spec.maximum)

@@ -20,7 +20,7 @@ class Decoder(nn.Module):
     def __init__(self, in_features: int, channels: int) -> None:
         super().__init__()
         self.tokens = nn.Linear(in_features, channels * GRID * GRID)
-        self.mix = nn.Conv2d(channels, 4 * channels, kernel_size=3, padding=1).to(memory_format=torch.channels_last)
+        self.mix = nn.Conv2d(channels, 4 * channels, kernel_size=3, padding=1)
         self.paint = nn.Linear(4 * channels, 3 * PATCH * PATCH)
 
     def forward(self, features: Tensor) -> Tensor:

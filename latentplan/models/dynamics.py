@@ -58,7 +58,8 @@ class Rssm(nn.Module):
         gates = self.gates_norm(self.gates(torch.cat([hidden, state.deter.to(hidden.dtype)], -1)))
         reset, candidate, update = gates.chunk(3, -1)
         candidate = torch.tanh(torch.sigmoid(reset) * candidate)
-        return torch.lerp(state.deter, candidate.to(state.deter.dtype), torch.sigmoid(update - 1.0).to(state.deter.dtype))
+        dtype = state.deter.dtype
+        return torch.lerp(state.deter, candidate.to(dtype), torch.sigmoid(update - 1.0).to(dtype))
 
     def prior(self, deter: Tensor) -> Gaussian:
         """What the latent will be, judged from the past alone, for deter (..., deter)."""
@@ -81,7 +82,9 @@ class Rssm(nn.Module):
         Returns:
             The states and their posteriors, (batch, time + 1, ...) each.
         """
-        deters, stochs, posteriors = [], [], []
+        deters: list[Tensor] = []
+        stochs: list[Tensor] = []
+        posteriors: list[Gaussian] = []
         for time in range(embeddings.shape[1]):
             if time > 0:
                 deter = self.advance(State(deter, stochs[-1]), actions[:, time - 1])

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from itertools import pairwise
 
-import torch
 from einops import rearrange
 from torch import Tensor, nn
 from torch.nn import functional
@@ -25,7 +24,7 @@ class Encoder(nn.Module):
         self.patches = nn.Linear(3 * PATCH * PATCH, channels[0])
         self.convolutions = nn.ModuleList(
             nn.Conv2d(before, after, kernel_size=4, stride=2, padding=1) for before, after in pairwise(channels)
-        ).to(memory_format=torch.channels_last)
+        )
         side = FRAME_SIZE // PATCH // 2 ** (len(channels) - 1)
         self.linear = nn.Linear(channels[-1] * side * side, embedding_dim)
 

@@ -1,6 +1,6 @@
 """Planning in any model: cross-entropy search, objectives, constraints and receding-horizon control.
 
-Imports torch, einops and numpy, and of this project only the settings.
+Imports torch and einops, and of this project only the settings.
 """
 
 from latentplan.planning.adapters import CEMTrajectoryOptimizer

@@ -6,8 +6,8 @@ Same equations, same planner; only the arrays and the names of the arguments dif
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import TYPE_CHECKING
 
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -15,7 +15,10 @@ from latentplan.planning.cem import CEMPlanner
 from latentplan.planning.elites import refit
 from latentplan.planning.plan import Plan
 
-RolloutFunction = Callable[[np.ndarray, np.ndarray], float]
+if TYPE_CHECKING:
+    import numpy as np
+
+    RolloutFunction = Callable[[np.ndarray, np.ndarray], float]
 
 
 class CEMTrajectoryOptimizer:
@@ -113,8 +116,9 @@ class RolloutController:
     def act(self, current_state: np.ndarray) -> np.ndarray:
         """The first action (action,) of a new plan; the rest, padded with zeros, starts the next search."""
         mean, _ = self.optimizer.plan(current_state, self.rollout_fn, self.warm_start)
-        self.warm_start = np.zeros_like(mean)
+        self.warm_start = mean.copy()
         self.warm_start[:-1] = mean[1:]
+        self.warm_start[-1] = 0.0
         return mean[0]
 
     def reset(self) -> None:

@@ -52,8 +52,16 @@ def _problems(model: Any, state: State, actions: Tensor, tolerance: float) -> It
     if not isinstance(answer, tuple) or len(answer) != 2:
         yield f"step() must return (next_state, reward), got {type(answer).__name__}"
         return
-    following, reward = answer
-    yield from _vector_problems("step()'s reward", reward, (_ROWS,))
+    basic = [*_vector_problems("step()'s reward", answer[1], (_ROWS,)), *_state_problems(state, answer[0])]
+    yield from basic
+    if not basic:
+        yield from _row_problems(model, state, actions[:, 0], tolerance)
+    yield from _optional_problems(model, state, actions)
+    if not basic and supports(model, "rollout"):
+        yield from _rollout_problems(model, state, actions, tolerance)
+
+
+def _state_problems(state: State, following: State) -> Iterator[str]:
     if tree_structure(following) != tree_structure(state):
         yield "step() returns a state of another structure than it was given"
         return
@@ -64,10 +72,6 @@ def _problems(model: Any, state: State, actions: Tensor, tolerance: float) -> It
             )
         elif not _is_finite(after):
             yield "step() returns NaN or infinity in the state"
-    yield from _row_problems(model, state, actions[:, 0], tolerance)
-    yield from _optional_problems(model, state, actions)
-    if supports(model, "rollout"):
-        yield from _rollout_problems(model, state, actions, tolerance)
 
 
 def _optional_problems(model: Any, state: State, actions: Tensor) -> Iterator[str]:

@@ -109,13 +109,12 @@ def shift_plan(
         return torch.take_along_dim(sequence, index, dim=1)  # past its end this repeats the last action: `hold`
 
     is_warm = previous.is_warm.to(device)[:, None, None]
-    zeros = torch.zeros_like(low).clamp(low, high)
     mean = move(previous.actions)
     if tail == "zero":
-        mean = torch.where(is_tail, zeros, mean)
+        mean = torch.where(is_tail, 0.0, mean)
     elif tail == "policy":
         mean = policy_tail(mean, is_tail)
-    mean = torch.where(is_warm, mean.clamp(low, high), zeros)
+    mean = torch.where(is_warm, mean, 0.0).clamp(low, high)
 
     var = initial_var.expand_as(mean)
     if variance != "reset":

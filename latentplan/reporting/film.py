@@ -49,7 +49,12 @@ class Imagining(Protocol):
 
 @contextlib.contextmanager
 def filming(
-    path: str | os.PathLike[str], env: gymnasium.Env[Any, Any], planner: Imagining | None, horizon: int | None = None
+    path: str | os.PathLike[str],
+    env: gymnasium.Env[Any, Any],
+    planner: Imagining | None,
+    horizon: int | None = None,
+    *,
+    every: int = 1,
 ) -> Iterator[Callable[[Moment], None]]:
     """Films the first episode that is played inside the block, in real time where the environment tells its rate.
 
@@ -58,6 +63,7 @@ def filming(
         env: The environment that is played; `render_large` gives the picture where it has that.
         planner: The agent, where it plans; None leaves the plan's side empty.
         horizon: Model steps that its plans look ahead.
+        every: Decisions per picture; the film keeps the time of the episode.
 
     Yields:
         The callback to hand to the rollouts.
@@ -66,12 +72,12 @@ def filming(
         films: list[VideoWriter] = []
 
         def film(moment: Moment) -> None:
-            if moment.episode > 0:
+            if moment.episode > 0 or moment.decision % every:
                 return
             picture = _compose(moment, env, planner, horizon)
             if not films:
                 fps = float(env.unwrapped.metadata.get("render_fps") or DEFAULT_FPS)
-                films.append(stack.enter_context(VideoWriter(path, fps, (picture.shape[1], picture.shape[0]))))
+                films.append(stack.enter_context(VideoWriter(path, fps / every, (picture.shape[1], picture.shape[0]))))
             films[0].write(picture)
 
         yield film

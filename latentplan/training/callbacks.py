@@ -36,8 +36,8 @@ class Experience(lightning.Callback):
     with the weights of its start, while the learner learns.
     """
 
-    def __init__(self, config: Config, replay: Replay, state: RunState, worker: Worker) -> None:
-        self.config, self.replay, self.state, self.worker = config, replay, state, worker
+    def __init__(self, config: Config, replay: Replay, state: RunState, worker: Worker, videos: Path) -> None:
+        self.config, self.replay, self.state, self.worker, self.videos = config, replay, state, worker, videos
         self.episode_returns: list[float] = []
         self._asked_evaluation: dict[str, Any] | None = None
         self._asked_round = False
@@ -52,9 +52,11 @@ class Experience(lightning.Callback):
         weights = {name: value.detach().cpu().numpy().copy() for name, value in learner.model.state_dict().items()}
         both = ("planner", "actor")[state.rounds % 2]
         behaviour = both if settings.behaviour == "both" else settings.behaviour
-        self.worker.submit("collect", weights, behaviour, settings.round_decisions, state.rounds)
-        self._asked_round = True
-        if state.env_frames >= state.next_evaluation:
+        decisions = min(settings.round_decisions, self._decisions_left())
+        if decisions > 0:
+            self.worker.submit("collect", weights, behaviour, decisions, state.rounds)
+            self._asked_round = True
+        if self._asked_round and state.env_frames >= state.next_evaluation:
             self._ask_evaluation(learner.updates)
 
     def take(self) -> None:
@@ -68,10 +70,17 @@ class Experience(lightning.Callback):
             self.state.evaluations.append(entry)
             self._asked_evaluation = None
 
+    def _decisions_left(self) -> int:
+        frames = self.config.run.frames
+        if frames is None:
+            return self.config.collection.round_decisions
+        return -(-(frames - self.state.env_frames) // self.config.env.action_repeat)
+
     def _ask_evaluation(self, updates: int) -> None:
         state, settings = self.state, self.config.evaluation
         self._asked_evaluation = {"env_frames": state.env_frames, "updates": updates, "minutes": state.minutes}
-        self.worker.submit("evaluate", settings.episodes)
+        film = self.videos / f"{state.env_frames:09d}.webm" if settings.video else None
+        self.worker.submit("evaluate", settings.episodes, film)
         state.next_evaluation = (state.env_frames // settings.every_frames + 1) * settings.every_frames
 
     def _take_round(self) -> None:
@@ -167,8 +176,13 @@ class Stop(lightning.Callback):
             self._previous[number] = signal.signal(number, self._interrupt)
 
     def on_train_batch_end(self, trainer: lightning.Trainer, *_: Any) -> None:  # type: ignore[override]
-        """Stop between two updates."""
-        if self.state.interrupted or self.is_spent():
+        """Stop between two updates when time is up or the user asks."""
+        if self.state.interrupted or self._is_late():
+            trainer.should_stop = True
+
+    def on_train_epoch_end(self, trainer: lightning.Trainer, learner: lightning.LightningModule) -> None:
+        """Stop when the last round has been learned from."""
+        if self.is_spent():
             trainer.should_stop = True
 
     def on_train_end(self, trainer: lightning.Trainer, learner: lightning.LightningModule) -> None:
@@ -178,9 +192,11 @@ class Stop(lightning.Callback):
 
     def is_spent(self) -> bool:
         """Whether the budget of frames or minutes is used up."""
-        frames, minutes = self.run.frames, self.run.minutes
-        out_of_frames = frames is not None and self.state.env_frames >= frames
-        return out_of_frames or (minutes is not None and self.state.minutes >= minutes)
+        frames = self.run.frames
+        return self._is_late() or (frames is not None and self.state.env_frames >= frames)
+
+    def _is_late(self) -> bool:
+        return self.run.minutes is not None and self.state.minutes >= self.run.minutes
 
     def _interrupt(self, number: int, frame: Any) -> None:
         if self.state.interrupted:

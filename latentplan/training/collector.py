@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import gymnasium
@@ -16,9 +18,11 @@ from latentplan.config import Config, derive_seed
 from latentplan.envs import make_env, make_from, make_vector_env, render_info
 from latentplan.models import WorldModel
 from latentplan.replay import Rows
+from latentplan.reporting.film import filming
 from latentplan.rollout import episode_seed, run_episodes
 
 TIMED_FRAMES = 5
+FILMED_FRAMES = 250
 
 EnvFactory = Callable[[], gymnasium.Env[Any, Any]]
 
@@ -72,9 +76,9 @@ class Collector:
         self.envs = make_vector_env(config.env, config.env.num_envs, config.run.seed, make_user_env)
         build = make_env if make_user_env is None else make_from(make_user_env)
         self._eval_env = build(config.env, 0)
-        action_dim = self.envs.single_action_space.shape[0]
-        decisions = self._eval_env.unwrapped.decisions_per_episode
-        self.discount = discount = config.learning.discount or _discount_for(decisions)
+        action_dim = int(np.prod(self.envs.single_action_space.shape or ()))
+        self._decisions: int | None = getattr(self._eval_env.unwrapped, "decisions_per_episode", None)
+        self.discount = discount = config.learning.discount or _discount_for(self._decisions)
         self.model = WorldModel(config.model, action_dim).to(device)
         noise = config.collection.noise_std
         self._agents: dict[str, ModelAgent] = {
@@ -118,26 +122,37 @@ class Collector:
             self._acting = agent
         agent.seed(derive_seed(self.config.run.seed, "collect", counter))
         steps = -(-decisions // len(self._ended))
-        log = _Log(len(self._ended), self.envs.single_action_space.shape[0], self.config.model.deter_dim)
+        log = _Log(len(self._ended), self.model.action_dim, self.config.model.deter_dim)
         for _ in range(steps):
             self._restart_ended(agent, counter)
             self._step(agent, log)
         return Collected(log.rows(), log.env_frames, steps * len(self._ended), log.returns)
 
-    def evaluate(self, episodes: int, weights: dict[str, np.ndarray] | None = None) -> dict[str, list[float]]:
+    def evaluate(
+        self, episodes: int, film: Path | None = None, weights: dict[str, np.ndarray] | None = None
+    ) -> dict[str, list[float]]:
         """Returns of planner and actor on the same starts, without exploration.
 
         Args:
             episodes: Episodes of each.
+            film: Where the planner's first episode is filmed, if anywhere.
             weights: State of the world model; None keeps that of the last round.
         """
         if weights is not None:
             self._load(weights)
         stream = derive_seed(self.config.run.seed, "evaluation")
         seeds = [episode_seed(stream, index) for index in range(episodes)]
+        planner, actor = self._judged["planner"], self._judged["actor"]
+        with contextlib.ExitStack() as stack:
+            on_step = None
+            if film is not None:
+                horizon, every = self.config.planner.horizon, -(-(self._decisions or 0) // FILMED_FRAMES) or 1
+                on_step = stack.enter_context(filming(film, self._eval_env, planner, horizon, every=every))
+            planned = run_episodes(self._eval_env, planner, seeds, on_step=on_step)
+        acted = run_episodes(self._eval_env, actor, seeds)
         return {
-            mode: [episode.total_return for episode in run_episodes(self._eval_env, agent, seeds)]
-            for mode, agent in self._judged.items()
+            "planner": [episode.total_return for episode in planned],
+            "actor": [episode.total_return for episode in acted],
         }
 
     def close(self) -> None:
@@ -169,7 +184,7 @@ class Collector:
         self._returns += rewards
         log.append(frames, deter, actions, rewards, ~terminated, first, np.asarray(info["env_frames"]))
         for lane in np.flatnonzero(self._ended):
-            log.finish(lane, self._frames[lane].copy(), float(self._returns[lane]))
+            log.finish(int(lane), self._frames[lane].copy(), float(self._returns[lane]))
 
 
 def _discount_for(decisions: int | None) -> float:
@@ -209,11 +224,16 @@ class _Log:
         self.returns.append(total_return)
 
     def rows(self) -> list[Rows]:
-        return [
-            Rows(
-                *(np.stack(column) for column in columns[:3]),
-                *(np.asarray(column, np.float32) for column in columns[3:5]),
-                np.asarray(columns[5], bool),
-            )
-            for columns in (list(zip(*entries, strict=True)) for entries in self._lanes)
-        ]
+        return [_stack(entries) for entries in self._lanes]
+
+
+def _stack(entries: list[tuple[Any, ...]]) -> Rows:
+    frames, deter, actions, rewards, continues, is_first = zip(*entries, strict=True)
+    return Rows(
+        frames=np.stack(frames),
+        deter=np.stack(deter),
+        actions=np.stack(actions),
+        rewards=np.asarray(rewards, np.float32),
+        continues=np.asarray(continues, np.float32),
+        is_first=np.asarray(is_first, bool),
+    )

@@ -50,7 +50,9 @@ class Learner(lightning.LightningModule):
 
     def training_step(self, batch: Batch, batch_index: int) -> None:
         """One update of everything from one batch of sequences."""
-        world_optimizer, behaviour_optimizer = self.optimizers(use_pl_optimizer=False)
+        optimizers = self.optimizers(use_pl_optimizer=False)
+        assert isinstance(optimizers, list)
+        world_optimizer, behaviour_optimizer = optimizers
         generator = torch.Generator(self.device).manual_seed(derive_seed(self.seed, "update", self.updates))
         loss, states, parts = world_model_loss(self.model, batch, self.config, generator)
         parts["model_grad_norm"] = self._descend(world_optimizer, loss)

@@ -12,10 +12,11 @@ from typing import TYPE_CHECKING, Any
 import lightning
 import numpy as np
 import torch
-import yaml
 from lightning.pytorch.loggers import TensorBoardLogger
 
-from latentplan.config import Config, RunConfig, UserError, derive_seed, from_dict, to_dict
+from latentplan.compose import dump_config, read_config
+from latentplan.config import Config, RunConfig, UserError, derive_seed
+from latentplan.envs import default_task
 from latentplan.models import WorldModel
 from latentplan.replay import Replay
 from latentplan.training.callbacks import Experience, Record, Save, Stop
@@ -64,16 +65,21 @@ def train(config: Config, make_env: EnvFactory | None = None) -> Result:
     """
     if config.run.frames is None and config.run.minutes is None:
         raise UserError("a run needs an end: give --frames or --minutes")
+    if make_env is None and config.env.task is None:
+        config = replace(config, env=replace(config.env, task=default_task(config.env.domain)))
     if config.run.run_dir is None:
         stamp = datetime.now().strftime("%Y%m%d-%H%M%S")
-        name = f"{config.env.domain}-{config.env.task or 'default'}-seed{config.run.seed}-{stamp}"
+        name = f"{_task_name(config)}-seed{config.run.seed}-{stamp}"
         config = replace(config, run=replace(config.run, run_dir=str(Path("runs") / name)))
     folder = Path(str(config.run.run_dir))
     if (folder / "config.yaml").exists():
-        raise UserError(f"{folder} already holds a run: continue it with --resume {folder}, or choose another --run-dir")
+        raise UserError(
+            f"{folder} already holds a run: continue it with --resume {folder}, or choose another --run-dir"
+        )
     folder.mkdir(parents=True, exist_ok=True)
-    (folder / "config.yaml").write_text(yaml.safe_dump(to_dict(config), sort_keys=False))
-    return _Run(config, folder, make_env, resume=False).execute()
+    run = _Run(config, folder, make_env, resume=False)
+    dump_config(config, folder / "config.yaml")
+    return run.execute()
 
 
 def resume(
@@ -88,8 +94,8 @@ def resume(
 
     Args:
         run_dir: Folder of the run.
-        frames: New budget of frames in all; None keeps the old one.
-        minutes: New budget of minutes in all; None keeps the old one.
+        frames: New budget of frames in all; with None for both, the old budget stays.
+        minutes: New budget of minutes in all.
         device: New device; None keeps the old one.
         make_env: As given to `train`.
 
@@ -99,9 +105,12 @@ def resume(
     folder = Path(run_dir)
     if not (folder / "config.yaml").exists():
         raise UserError(f"nothing to resume in {folder}: config.yaml is missing")
-    config = from_dict(yaml.safe_load((folder / "config.yaml").read_text()))
-    changes = {"frames": frames, "minutes": minutes, "device": device}
-    run = replace(config.run, **{name: value for name, value in changes.items() if value is not None})
+    config = read_config(folder / "config.yaml")
+    run = config.run
+    if frames is not None or minutes is not None:
+        run = replace(run, frames=frames, minutes=minutes)
+    if device is not None:
+        run = replace(run, device=device)
     return _Run(replace(config, run=run), folder, make_env, resume=True).execute()
 
 
@@ -115,7 +124,9 @@ class _Run:
             torch.set_num_threads(config.run.threads)
         self.console = Progress(config.run)
         overlap = config.collection.overlap and self.device.type == "cpu"
-        self.worker: Worker = RemoteWorker(config, make_env) if overlap else LocalWorker(config, make_env, str(self.device))
+        self.worker: Worker = (
+            RemoteWorker(config, make_env) if overlap else LocalWorker(config, make_env, str(self.device))
+        )
         try:
             self.worker.submit("describe")
             self.description: Description = self.worker.result()
@@ -152,10 +163,13 @@ class _Run:
     def _execute(self) -> Result:
         config = self.config
         self._announce()
-        experience = Experience(config, self.replay, self.state, self.worker)
+        videos = self.folder / "videos"
+        videos.mkdir(exist_ok=True)
+        experience = Experience(config, self.replay, self.state, self.worker, videos)
         save = Save(self.folder, config, self.state, self.replay, self._facts())
         stop = Stop(config, self.state)
-        trainer = self._trainer([experience, Record(self.folder / "metrics.csv", self.state, experience, self.console), save, stop])
+        record = Record(self.folder / "metrics.csv", self.state, experience, self.console)
+        trainer = self._trainer([experience, record, save, stop])
         length = max(1, round(config.collection.round_decisions * config.collection.updates_per_decision))
         batches = ReplayBatches(self.replay, config.learning, self.state, config.run.seed, length)
         if not stop.is_spent():
@@ -169,7 +183,7 @@ class _Run:
             self.console.console.print(f"stopped; to go on: python scripts/train.py --resume {self.folder}")
             return Result(self.folder, INTERRUPTED, {})
         experience.take()
-        return Result(self.folder, 0, self._finish(save))
+        return Result(self.folder, 0, self._finish(videos / "final.webm"))
 
     def _trainer(self, callbacks: list[lightning.Callback]) -> lightning.Trainer:
         logging.getLogger("lightning.pytorch").setLevel(logging.ERROR)
@@ -193,35 +207,38 @@ class _Run:
             log_every_n_steps=10**9,
         )
 
-    def _finish(self, save: Save) -> dict[str, float]:
+    def _finish(self, film: Path) -> dict[str, float]:
         weights = {name: value.detach().cpu().numpy() for name, value in self.learner.model.state_dict().items()}
         episodes = self.config.evaluation.final_episodes
         self.console.console.print(f"final evaluation: {episodes} episodes each of planner and actor")
-        self.worker.submit("evaluate", episodes, weights)
+        self.worker.submit("evaluate", episodes, film if self.config.evaluation.video else None, weights)
         returns = self.worker.result()
         summary = {mode: float(np.mean(values)) for mode, values in returns.items()}
         self.console.console.print(
-            f"trained {self.state.env_frames:,} frames in {self.state.minutes:.1f} min: "
-            f"planner {summary['planner']:.1f}, actor {summary['actor']:.1f} ({episodes} episodes)\nrun folder: {self.folder}"
+            f"trained {self.state.env_frames:,} frames in {self.state.minutes:.1f} min: planner "
+            f"{summary['planner']:.1f}, actor {summary['actor']:.1f} ({episodes} episodes)\nrun folder: {self.folder}"
         )
         return summary
 
     def _announce(self) -> None:
-        run, description = self.config.run, self.description
+        config, description = self.config, self.description
         parameters = sum(parameter.numel() for parameter in self.learner.model.parameters())
-        budget = " or ".join(
-            part for part in (f"{run.frames:,} frames" if run.frames else "", f"{run.minutes:g} min" if run.minutes else "") if part
-        )
+        frames, minutes = config.run.frames, config.run.minutes
+        budget = [f"{frames:,} frames"] if frames else []
+        budget += [f"{minutes:g} minutes"] if minutes else []
         renderer = ", ".join(f"{name} {value}" for name, value in description.renderer.items())
-        self.console.console.print(
-            f"task        {self.config.env.domain} {self.config.env.task or '(usual task)'}, action repeat {self.config.env.action_repeat}\n"
-            f"device      {self.device}, {torch.get_num_threads()} threads\n"
-            f"renderer    {renderer}, {description.render_ms:.1f} ms per frame, quality {self.config.env.render_quality}\n"
-            f"parameters  {parameters:,}, discount {description.discount:g}\n"
-            f"replay      {self.replay.num_bytes / 2**20:,.0f} MiB for {self.replay.lane_size * self.replay.num_lanes:,} frames\n"
-            f"budget      {budget}\n"
-            f"run folder  {self.folder}"
-        )
+        rows = self.replay.lane_size * self.replay.num_lanes
+        lines = {
+            "task": f"{_task_name(config)}, action repeat {config.env.action_repeat}",
+            "device": f"{self.device}, {torch.get_num_threads()} threads",
+            "renderer": f"{renderer}; {description.render_ms:.1f} ms per frame, quality {config.env.render_quality}",
+            "parameters": f"{parameters:,}; discount {description.discount:g}",
+            "replay": f"{self.replay.num_bytes / 2**20:,.0f} MiB for {rows:,} frames",
+            "budget": " or ".join(budget),
+            "run folder": str(self.folder),
+        }
+        for name, line in lines.items():
+            self.console.console.print(f"{name:<12}{line}", soft_wrap=True)
 
     def _facts(self) -> dict[str, Any]:
         from latentplan import __version__
@@ -234,6 +251,10 @@ class _Run:
             "discount": self.description.discount,
             "renderer": self.description.renderer,
         }
+
+
+def _task_name(config: Config) -> str:
+    return f"{config.env.domain}-{config.env.task}"
 
 
 def _choose_device(run: RunConfig) -> torch.device:

@@ -47,7 +47,7 @@ class RemoteWorker:
     def __init__(self, config: Config, make_user_env: EnvFactory | None) -> None:
         context = multiprocessing.get_context("spawn")
         self._connection, theirs = context.Pipe()
-        arguments = (theirs, CloudpickleWrapper(make_user_env), config)
+        arguments = (theirs, make_user_env and CloudpickleWrapper(make_user_env), config)
         self._process = context.Process(target=_serve, args=arguments, daemon=config.env.num_envs == 1)
         with _single_threaded():
             self._process.start()
@@ -94,7 +94,7 @@ class RemoteWorker:
 Worker = LocalWorker | RemoteWorker
 
 
-def _serve(connection: Connection, factory: CloudpickleWrapper, config: Config) -> None:
+def _serve(connection: Connection, factory: EnvFactory | None, config: Config) -> None:
     import signal
 
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches the whole group; the learner decides what follows
@@ -107,7 +107,7 @@ def _serve(connection: Connection, factory: CloudpickleWrapper, config: Config) 
             return
         try:
             if collector is None:
-                collector = Collector(config, factory.fn, "cpu")
+                collector = Collector(config, factory, "cpu")
             connection.send(("ok", getattr(collector, method)(*arguments)))
         except UserError as error:
             connection.send(("user_error", str(error)))

@@ -242,6 +242,14 @@ def test_gradient_steps_improve_the_plan_and_none_gets_worse(point, states, make
     assert (tiny.actions - plain.actions).abs().max() < 2e-3 < (refined.actions - plain.actions).abs().max()
 
 
+def test_gradient_steps_that_overshoot_are_halved(make_planner, seeded):
+    """The optimum is a narrow ridge at 0.37; the first step of 0.5 jumps over it."""
+    model = FunctionModel(lambda state, action: state, lambda state, action: -(action - 0.37).abs().sum(dim=1))
+    planner = make_planner(init_std=0.0, horizon=1, gradient_steps=25, gradient_step_size=0.5)
+    plan = planner.plan(model, torch.zeros(1, 1), generator=seeded())
+    torch.testing.assert_close(plan.action, torch.full((1, 2), 0.37), atol=1e-3, rtol=0)
+
+
 def test_gradient_steps_work_under_inference_mode_and_refuse_what_cannot_be_differentiated(
     point, states, make_planner, seeded
 ):

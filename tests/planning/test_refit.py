@@ -4,6 +4,7 @@ import pytest
 import torch
 
 from latentplan.planning import CEMTrajectoryOptimizer, ModelPredictiveController, refit
+from latentplan.planning.elites import Scores, select_elites
 
 CANDIDATES = torch.tensor([[0.5, 0.8], [-0.5, 0.2], [0.8, 0.6], [-1.0, -0.5]], dtype=torch.float64)[..., None]
 RETURNS = torch.tensor([3.2, 1.0, 4.0, -0.5], dtype=torch.float64)
@@ -68,8 +69,10 @@ def test_fewer_finite_candidates_than_elites_are_used_alone():
     torch.testing.assert_close(var, torch.zeros_like(var))
 
 
-def test_a_distribution_without_finite_candidates_stays():
-    mean, var = refit(CANDIDATES, torch.full((4,), float("nan")).double(), MEAN, VAR, num_elites=2, smoothing=0.8)
+@pytest.mark.parametrize("temperature", [None, 0.5])
+def test_a_distribution_without_finite_candidates_stays(temperature):
+    nothing = torch.full((4,), float("nan"), dtype=torch.float64)
+    mean, var = refit(CANDIDATES, nothing, MEAN, VAR, num_elites=2, smoothing=0.8, temperature=temperature)
     torch.testing.assert_close(mean, MEAN)
     torch.testing.assert_close(var, VAR)
 
@@ -111,3 +114,15 @@ def test_refit_names_shapes_that_do_not_fit():
         refit(CANDIDATES, RETURNS[:3], MEAN, VAR, num_elites=2, smoothing=0.8)
     with pytest.raises(ValueError, match="num_elites"):
         refit(CANDIDATES, RETURNS, MEAN, VAR, num_elites=5, smoothing=0.8)
+
+
+def test_feasible_candidates_come_first_and_outweigh_the_others():
+    violations = torch.tensor([[0.0, 0.0, 2.0, 1.0]], dtype=torch.float64)
+    scores = Scores(RETURNS[None], violations)
+    order = select_elites(CANDIDATES[None], scores, num_elites=4, temperature=None)
+    assert order.scores.returns.tolist() == [[3.2, 1.0, -0.5, 4.0]]
+    weighted = select_elites(CANDIDATES[None], scores, num_elites=4, temperature=1.0)
+    torch.testing.assert_close(weighted.weights[0, :2], torch.softmax(RETURNS[:2], dim=0))
+    assert (weighted.weights[0, 2:] == 0).all()
+    none = select_elites(CANDIDATES[None], Scores(RETURNS[None], violations + 1), num_elites=4, temperature=1.0)
+    torch.testing.assert_close(none.weights[0], torch.softmax(-torch.tensor([1.0, 1.0, 2.0, 3.0]).double(), dim=0))

@@ -7,18 +7,32 @@ imports nothing but the standard library, so that every layer and the command li
 from __future__ import annotations
 
 import dataclasses
-import hashlib
 from dataclasses import dataclass, field
 from typing import Any
+
+from latentplan.config.checks import UserError, above_zero, at_least, derive_seed, one_of, within
+from latentplan.config.planner import PlannerConfig
+
+__all__ = [
+    "Config",
+    "CollectionConfig",
+    "EnvConfig",
+    "EvaluationConfig",
+    "LearningConfig",
+    "ModelConfig",
+    "PlannerConfig",
+    "ReplayConfig",
+    "RunConfig",
+    "UserError",
+    "derive_seed",
+    "from_dict",
+    "to_dict",
+]
 
 LATENT_DIM = 32
 RENDER_QUALITIES = ("exact", "fast", "fastest")
 BEHAVIOURS = ("planner", "actor", "both")
 DEVICES = ("auto", "cpu", "cuda")
-
-
-class UserError(ValueError):
-    """Something the user gave cannot work; the message is one line that says what to give instead."""
 
 
 @dataclass(frozen=True)
@@ -43,8 +57,8 @@ class EnvConfig:
     num_envs: int = 1
 
     def __post_init__(self) -> None:
-        _at_least(self, action_repeat=1, num_envs=1, camera=-1)
-        _one_of(self, render_quality=RENDER_QUALITIES)
+        at_least(self, action_repeat=1, num_envs=1, camera=-1)
+        one_of(self, render_quality=RENDER_QUALITIES)
 
 
 @dataclass(frozen=True)
@@ -55,7 +69,7 @@ class ModelConfig:
         latent_dim: Size of the stochastic latent, the space in which the planner searches.
         deter_dim: Size of the GRU state.
         hidden_dim: Width of the hidden layers of every head.
-        encoder_channels: Channels of the encoder's layers: the first reads 4 x 4 patches, each later one halves the grid.
+        encoder_channels: Channels of the encoder's layers: the first reads 4 x 4 patches, each other halves the grid.
         decoder_channels: Channels of the decoder's 8 x 8 grid of tokens.
         num_bins: Bins of the distributional reward and value heads.
     """
@@ -68,64 +82,9 @@ class ModelConfig:
     num_bins: int = 63
 
     def __post_init__(self) -> None:
-        _at_least(self, latent_dim=1, deter_dim=1, hidden_dim=1, decoder_channels=1, num_bins=3)
+        at_least(self, latent_dim=1, deter_dim=1, hidden_dim=1, decoder_channels=1, num_bins=3)
         if not 1 <= len(self.encoder_channels) <= 5 or min(self.encoder_channels) < 1:
             raise ValueError(f"encoder_channels must hold 1 to 5 positive sizes, got {self.encoder_channels}")
-
-
-@dataclass(frozen=True)
-class PlannerConfig:
-    """CEM-MPC: the search over action sequences.
-
-    Attributes:
-        horizon: Model steps that a plan looks ahead.
-        num_samples: Candidate sequences per iteration.
-        num_elites: Best candidates that refit the search distribution.
-        num_iterations: Refits of a cold start.
-        warm_start_iterations: Refits when the last plan is handed on.
-        smoothing: Weight of the new statistics in the Polyak update of mean and variance, in (0, 1].
-        init_std: Standard deviation at the start of a search, in action units.
-        min_std: Floor of the sampling standard deviation, in action units.
-        num_policy_samples: Candidates proposed by the actor, its own mode first; 0 leaves the actor out.
-        warm_start: Whether a search starts from the shifted last plan.
-        terminal_value: Whether the value of the last imagined state completes the return.
-        use_continues: Whether the predicted probability of going on discounts what follows.
-        start: Centre of the search: `shifted` (the last plan), `policy` (the actor's) or `both`.
-        tail: What fills the end of the shifted plan: `zero`, `hold` or `policy`.
-        warm_start_variance: Variance of a warm start: `reset`, `keep` or `inflate`.
-        final: What is executed: the `mean` of the distribution or the `best` candidate.
-        noise_beta: Exponent of coloured sampling noise; 0 is white.
-        keep_elite_fraction: Share of the elites kept for the next iteration and the next plan.
-    """
-
-    horizon: int = 6
-    num_samples: int = 256
-    num_elites: int = 32
-    num_iterations: int = 4
-    warm_start_iterations: int = 3
-    smoothing: float = 0.9
-    init_std: float = 0.5
-    min_std: float = 0.05
-    num_policy_samples: int = 24
-    warm_start: bool = True
-    terminal_value: bool = True
-    use_continues: bool = False
-    start: str = "shifted"
-    tail: str = "zero"
-    warm_start_variance: str = "reset"
-    final: str = "mean"
-    noise_beta: float = 0.0
-    keep_elite_fraction: float = 0.0
-
-    def __post_init__(self) -> None:
-        _at_least(self, horizon=1, num_samples=2, num_elites=1, num_iterations=1, warm_start_iterations=1)
-        _at_least(self, num_policy_samples=0, init_std=0.0, min_std=0.0, noise_beta=0.0)
-        _within(self, smoothing=(0.0, 1.0), keep_elite_fraction=(0.0, 1.0))
-        _one_of(self, start=("shifted", "policy", "both"), tail=("zero", "hold", "policy"))
-        _one_of(self, warm_start_variance=("reset", "keep", "inflate"), final=("mean", "best"))
-        for name in ("num_elites", "num_policy_samples"):
-            if getattr(self, name) > self.num_samples - (name == "num_policy_samples"):
-                raise ValueError(f"{name} ({getattr(self, name)}) is too many for num_samples ({self.num_samples})")
 
 
 @dataclass(frozen=True)
@@ -171,11 +130,11 @@ class LearningConfig:
     target_rate: float = 0.02
 
     def __post_init__(self) -> None:
-        _at_least(self, batch_size=1, sequence_length=1, imagination_horizon=1, imagination_starts=1)
-        _at_least(self, reconstruction_scale=0.0, dynamics_scale=0.0, representation_scale=0.0, free_nats=0.0)
-        _at_least(self, reward_scale=0.0, replay_value_scale=0.0, entropy_scale=0.0)
-        _above_zero(self, "model_learning_rate", "behaviour_learning_rate", "max_grad_norm", "target_rate")
-        _within(self, lambda_=(0.0, 1.0), target_rate=(0.0, 1.0))
+        at_least(self, batch_size=1, sequence_length=1, imagination_horizon=1, imagination_starts=1)
+        at_least(self, reconstruction_scale=0.0, dynamics_scale=0.0, representation_scale=0.0, free_nats=0.0)
+        at_least(self, reward_scale=0.0, replay_value_scale=0.0, entropy_scale=0.0)
+        above_zero(self, "model_learning_rate", "behaviour_learning_rate", "max_grad_norm", "target_rate")
+        within(self, lambda_=(0.0, 1.0), target_rate=(0.0, 1.0))
         if self.discount is not None and not 0.0 < self.discount <= 1.0:
             raise ValueError(f"discount must lie in (0, 1], got {self.discount}")
 
@@ -201,9 +160,9 @@ class CollectionConfig:
     overlap: bool = True
 
     def __post_init__(self) -> None:
-        _one_of(self, behaviour=BEHAVIOURS)
-        _at_least(self, noise_std=0.0, prefill_decisions=1, round_decisions=1)
-        _above_zero(self, "updates_per_decision")
+        one_of(self, behaviour=BEHAVIOURS)
+        at_least(self, noise_std=0.0, prefill_decisions=1, round_decisions=1)
+        above_zero(self, "updates_per_decision")
 
 
 @dataclass(frozen=True)
@@ -219,8 +178,7 @@ class ReplayConfig:
     on_device: bool = False
 
     def __post_init__(self) -> None:
-        if self.capacity is not None and self.capacity < 1:
-            raise ValueError(f"capacity must be at least 1, got {self.capacity}")
+        above_zero(self, "capacity")
 
 
 @dataclass(frozen=True)
@@ -240,7 +198,7 @@ class EvaluationConfig:
     video: bool = True
 
     def __post_init__(self) -> None:
-        _at_least(self, every_frames=1, episodes=1, final_episodes=1)
+        at_least(self, every_frames=1, episodes=1, final_episodes=1)
 
 
 @dataclass(frozen=True)
@@ -264,12 +222,9 @@ class RunConfig:
     run_dir: str | None = None
 
     def __post_init__(self) -> None:
-        _one_of(self, device=DEVICES)
-        _at_least(self, seed=0)
-        for name in ("frames", "minutes", "threads"):
-            value = getattr(self, name)
-            if value is not None and value <= 0:
-                raise ValueError(f"{name} must be positive, got {value}")
+        one_of(self, device=DEVICES)
+        at_least(self, seed=0)
+        above_zero(self, "frames", "minutes", "threads")
 
 
 @dataclass(frozen=True)
@@ -284,12 +239,6 @@ class Config:
     replay: ReplayConfig = field(default_factory=ReplayConfig)
     evaluation: EvaluationConfig = field(default_factory=EvaluationConfig)
     run: RunConfig = field(default_factory=RunConfig)
-
-
-def derive_seed(seed: int, name: str, counter: int = 0) -> int:
-    """A seed in [0, 2**31) for the stream `name` of a run, the same on every machine."""
-    digest = hashlib.sha256(f"{seed}/{name}/{counter}".encode()).digest()
-    return int.from_bytes(digest[:4], "little") >> 1
 
 
 def to_dict(config: Any) -> dict[str, Any]:
@@ -318,27 +267,3 @@ def from_dict(values: dict[str, Any]) -> Config:
                 raise ValueError(f"unknown setting {section}.{name}; available: {', '.join(sorted(names))}")
         built[section] = kind(**{k: tuple(v) if isinstance(v, list) else v for k, v in settings.items()})
     return Config(**built)
-
-
-def _at_least(config: Any, **bounds: float) -> None:
-    for name, bound in bounds.items():
-        if not getattr(config, name) >= bound:
-            raise ValueError(f"{name} must be at least {bound}, got {getattr(config, name)}")
-
-
-def _above_zero(config: Any, *names: str) -> None:
-    for name in names:
-        if not getattr(config, name) > 0.0:
-            raise ValueError(f"{name} must be above 0, got {getattr(config, name)}")
-
-
-def _within(config: Any, **bounds: tuple[float, float]) -> None:
-    for name, (low, high) in bounds.items():
-        if not low <= getattr(config, name) <= high:
-            raise ValueError(f"{name} must lie in [{low}, {high}], got {getattr(config, name)}")
-
-
-def _one_of(config: Any, **choices: tuple[str, ...]) -> None:
-    for name, allowed in choices.items():
-        if getattr(config, name) not in allowed:
-            raise ValueError(f"{name} must be one of {', '.join(allowed)}, got {getattr(config, name)!r}")

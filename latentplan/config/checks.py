@@ -1,0 +1,46 @@
+"""What settings have in common: how they are checked, how their errors read, how their seeds derive."""
+
+from __future__ import annotations
+
+import hashlib
+from typing import Any
+
+
+class UserError(ValueError):
+    """Something the user gave cannot work; the message is one line that says what to give instead."""
+
+
+def derive_seed(seed: int, name: str, counter: int = 0) -> int:
+    """A seed in [0, 2**31) for the stream `name` of a run, the same on every machine."""
+    digest = hashlib.sha256(f"{seed}/{name}/{counter}".encode()).digest()
+    return int.from_bytes(digest[:4], "little") >> 1
+
+
+def at_least(config: Any, **bounds: float) -> None:
+    """Require fields to be at least a bound."""
+    for name, bound in bounds.items():
+        _require(config, name, getattr(config, name) >= bound, f"at least {bound}")
+
+
+def above_zero(config: Any, *names: str) -> None:
+    """Require fields to be above 0, or None."""
+    for name in names:
+        value = getattr(config, name)
+        _require(config, name, value is None or value > 0.0, "above 0")
+
+
+def within(config: Any, **bounds: tuple[float, float]) -> None:
+    """Require fields to lie in a closed interval."""
+    for name, (low, high) in bounds.items():
+        _require(config, name, low <= getattr(config, name) <= high, f"in [{low}, {high}]")
+
+
+def one_of(config: Any, **choices: tuple[str, ...]) -> None:
+    """Require fields to be one of the values allowed."""
+    for name, allowed in choices.items():
+        _require(config, name, getattr(config, name) in allowed, f"one of {', '.join(allowed)}")
+
+
+def _require(config: Any, name: str, holds: bool, allowed: str) -> None:
+    if not holds:
+        raise ValueError(f"{name} must be {allowed}, got {getattr(config, name)!r}")

@@ -1,0 +1,62 @@
+"""Settings of the planner."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from latentplan.config.checks import at_least, one_of, within
+
+
+@dataclass(frozen=True)
+class PlannerConfig:
+    """CEM-MPC: the search over action sequences.
+
+    Attributes:
+        horizon: Model steps that a plan looks ahead.
+        num_samples: Candidate sequences per iteration.
+        num_elites: Best candidates that refit the search distribution.
+        num_iterations: Refits of a cold start.
+        warm_start_iterations: Refits when the last plan is handed on.
+        smoothing: Weight of the new statistics in the Polyak update of mean and variance, in (0, 1].
+        init_std: Standard deviation at the start of a search, in action units.
+        min_std: Floor of the sampling standard deviation, in action units.
+        num_policy_samples: Candidates proposed by the actor, its own mode first; 0 leaves the actor out.
+        warm_start: Whether a search starts from the shifted last plan.
+        terminal_value: Whether the value of the last imagined state completes the return.
+        use_continues: Whether the predicted probability of going on discounts what follows.
+        start: Centre of the search: `shifted` (the last plan), `policy` (the actor's) or `both`.
+        tail: What fills the end of the shifted plan: `zero`, `hold` or `policy`.
+        warm_start_variance: Variance of a warm start: `reset`, `keep` or `inflate`.
+        final: What is executed: the `mean` of the distribution or the `best` candidate.
+        noise_beta: Exponent of coloured sampling noise; 0 is white.
+        keep_elite_fraction: Share of the elites kept for the next iteration and the next plan.
+    """
+
+    horizon: int = 6
+    num_samples: int = 256
+    num_elites: int = 32
+    num_iterations: int = 4
+    warm_start_iterations: int = 3
+    smoothing: float = 0.9
+    init_std: float = 0.5
+    min_std: float = 0.05
+    num_policy_samples: int = 24
+    warm_start: bool = True
+    terminal_value: bool = True
+    use_continues: bool = False
+    start: str = "shifted"
+    tail: str = "zero"
+    warm_start_variance: str = "reset"
+    final: str = "mean"
+    noise_beta: float = 0.0
+    keep_elite_fraction: float = 0.0
+
+    def __post_init__(self) -> None:
+        at_least(self, horizon=1, num_samples=2, num_elites=1, num_iterations=1, warm_start_iterations=1)
+        at_least(self, num_policy_samples=0, init_std=0.0, min_std=0.0, noise_beta=0.0)
+        within(self, smoothing=(0.0, 1.0), keep_elite_fraction=(0.0, 1.0))
+        one_of(self, start=("shifted", "policy", "both"), tail=("zero", "hold", "policy"))
+        one_of(self, warm_start_variance=("reset", "keep", "inflate"), final=("mean", "best"))
+        for name in ("num_elites", "num_policy_samples"):
+            if getattr(self, name) > self.num_samples - (name == "num_policy_samples"):
+                raise ValueError(f"{name} ({getattr(self, name)}) is too many for num_samples ({self.num_samples})")

@@ -1,0 +1,68 @@
+"""`check_model` names what is wrong before the first plan does."""
+
+import pytest
+import torch
+
+from latentplan.planning import FunctionModel, check_model
+
+STATE = torch.randn(3, 4, generator=torch.Generator().manual_seed(0))
+
+
+def test_a_good_model_passes_and_its_abilities_are_listed(point):
+    assert check_model(point, STATE, 2) == ("value", "policy")
+
+
+@pytest.mark.parametrize(
+    ("change", "complaint"),
+    [
+        ({"reward": lambda state, action: action[:, :1]}, r"reward must have shape \(4,\), got \(4, 1\)"),
+        ({"reward": lambda state, action: (state[:, 0] > 0).long()}, "floating point"),
+        ({"reward": lambda state, action: state[:, 0] / 0}, "NaN"),
+        ({"reward": lambda state, action: 1.0}, "must be a tensor"),
+        ({"dynamics": lambda state, action: state[:, :2]}, r"turns a state of \(4, 4\)"),
+        ({"dynamics": lambda state, action: state.double()}, "float64"),
+        ({"dynamics": lambda state, action: state * float("nan")}, "in the state"),
+        ({"dynamics": lambda state, action: (state, state)}, "another structure"),
+        ({"dynamics": lambda state, action: state + action.mean()}, "influence each other"),
+        ({"value": lambda state: state[:, :1]}, r"value\(\) must have shape"),
+        ({"policy": lambda state, generator: state}, r"policy\(\)'s mode must have shape"),
+        ({"continues": lambda state: state[:, 0] * float("inf")}, r"continues\(\) is NaN"),
+        ({"uncertainty": lambda state, action: state}, r"uncertainty\(\) must have shape"),
+        ({"rollout": lambda state, actions: (actions[:, :, 0], state)}, "does not agree with step"),
+        ({"rollout": lambda state, actions: (actions, state)}, r"rollout\(\)'s rewards must have shape"),
+        ({"particles": lambda state, num: state}, r"particles\(\) must return 8 rows"),
+    ],
+)
+def test_what_is_wrong_is_named(point, change, complaint):
+    for name, function in change.items():
+        setattr(point, name, function)
+    with pytest.raises(ValueError, match=complaint):
+        check_model(point, STATE, 2)
+
+
+def test_all_problems_are_named_at_once(point):
+    point.value = lambda state: state
+    point.policy = lambda state, generator: state
+    with pytest.raises(ValueError, match=r"value\(\)[^$]*policy\(\)"):
+        check_model(point, STATE, 2)
+
+
+def test_a_model_without_step_and_a_state_that_is_none_are_named():
+    with pytest.raises(ValueError, match="no step"):
+        check_model(object(), STATE, 2)
+    model = FunctionModel(lambda state, action: state, lambda state, action: action[:, 0])
+    with pytest.raises(TypeError, match="tensor"):
+        check_model(model, "state", 2)
+    model.step = lambda state, action: state
+    with pytest.raises(ValueError, match=r"\(next_state, reward\)"):
+        check_model(model, STATE, 2)
+
+
+def test_a_layer_that_mixes_the_batch_is_found():
+    layer = torch.nn.BatchNorm1d(4)
+    model = FunctionModel(lambda state, action: layer(state + action[:, :1]), lambda state, action: action[:, 0])
+    layer.eval()
+    check_model(model, STATE, 2)
+    layer.train()
+    with pytest.raises(ValueError, match="influence each other|Expected more than 1 value"):
+        check_model(model, STATE, 2)

@@ -1,0 +1,110 @@
+"""Receding-horizon control: what is kept between steps, and what forgets it."""
+
+import pytest
+import torch
+
+from latentplan.planning import ModelPredictiveController, action_penalty, goal_term
+
+
+@pytest.fixture
+def make_controller(point, make_planner, seeded):
+    def make(replan_every=1, seed=0, **options):
+        return ModelPredictiveController(
+            make_planner(**options), point, generator=seeded(seed), replan_every=replan_every
+        )
+
+    return make
+
+
+def test_acting_is_planning_with_the_last_plan(point, states, make_controller, make_planner, seeded):
+    controller, planner, generator = make_controller(), make_planner(), seeded()
+    first = planner.plan(point, states, generator=generator)
+    torch.testing.assert_close(controller.act(states), first.action)
+    second = planner.plan(point, states + 0.1, first, generator=generator)
+    torch.testing.assert_close(controller.act(states + 0.1), second.action)
+
+
+def test_reset_forgets_everything(states, make_controller):
+    controller = make_controller(num_iterations=4, warm_start_iterations=1, keep_elite_fraction=0.5)
+    controller.act(states)
+    controller.act(states)
+    assert controller.plan.info["iterations"].tolist() == [1] * 5
+    controller.reset()
+    assert controller.plan is None
+    controller.act(states)
+    assert controller.plan.info["iterations"].tolist() == [4] * 5
+
+
+def test_reset_by_mask_forgets_those_environments_only(states, make_controller):
+    controller = make_controller(num_iterations=4, warm_start_iterations=1)
+    controller.reset(torch.tensor([True, False]))  # nothing to forget yet
+    controller.act(states)
+    controller.reset(torch.tensor([0, 1, 0, 0, 1]).bool())
+    controller.act(states)
+    assert controller.plan.info["iterations"].tolist() == [1, 4, 1, 1, 4]
+    controller.act(states)
+    assert controller.plan.info["iterations"].tolist() == [1] * 5
+
+
+def test_a_plan_is_executed_for_as_long_as_asked(point, states, make_controller):
+    controller = make_controller(replan_every=3)
+    actions = [controller.act(states) for _ in range(3)]
+    plan = controller.plan
+    torch.testing.assert_close(torch.stack(actions, dim=1), plan.actions[:, :3])
+    controller.act(states)
+    assert controller.plan.mean is not plan.mean
+
+
+def test_the_warm_start_skips_all_that_was_executed(states, make_controller):
+    controller = make_controller(replan_every=3)
+    for _ in range(3):
+        controller.act(states)
+    last = controller.plan
+    frozen = make_controller(replan_every=3, init_std=0.0, num_iterations=1, keep_elite_fraction=0.2)
+    frozen.plan = last
+    frozen.act(states)
+    torch.testing.assert_close(frozen.plan.mean[:, :3], last.actions[:, 3:])
+    assert (frozen.plan.mean[:, 3:] == 0).all()
+
+
+def test_a_reset_environment_is_replanned_at_once_and_the_others_go_on(states, make_controller):
+    controller = make_controller(replan_every=4)
+    controller.act(states)
+    before = controller.plan
+    controller.reset(torch.tensor([0, 0, 1, 0, 0]).bool())
+    action = controller.act(states)
+    others = torch.tensor([0, 1, 3, 4])
+    torch.testing.assert_close(action[others], before.actions[others, 1])
+    torch.testing.assert_close(action[2], controller.plan.actions[2, 0])
+    assert controller.plan.elapsed.tolist() == [2, 2, 1, 2, 2]
+
+
+def test_another_objective_takes_effect_at_once_and_keeps_the_plan_as_its_start(states, make_controller):
+    controller = make_controller(replan_every=4, num_samples=256, num_iterations=6, num_elites=16)
+    first = controller.act(states)
+    controller.set_objective(action_penalty())
+    calm = controller.act(states)
+    assert calm.abs().max() < 0.1 < first.abs().max()
+    controller.set_objective(goal_term(torch.tensor([3.0, 3.0]), select=lambda state: state[:, :2]))
+    assert (controller.act(torch.zeros(5, 4)) > 0.3).all()
+
+
+def test_another_number_of_environments_starts_cold(states, make_controller):
+    controller = make_controller(num_iterations=4, warm_start_iterations=1)
+    controller.act(states)
+    assert controller.act(states[:2]).shape == (2, 2)
+    assert controller.plan.info["iterations"].tolist() == [4, 4]
+
+
+def test_latency_is_measured(states, make_controller):
+    controller = make_controller()
+    assert controller.latency == {}
+    for _ in range(5):
+        controller.act(states)
+    latency = controller.latency
+    assert 0 < latency["p50_ms"] <= latency["p95_ms"] <= latency["p99_ms"]
+
+
+def test_more_steps_per_plan_than_it_has_are_refused(make_controller):
+    with pytest.raises(ValueError, match=r"replan_every \(7\)"):
+        make_controller(replan_every=7)
