@@ -132,7 +132,7 @@ class PlanningAgent(ModelAgent):
         if self.controller.plan is None or self.state is None:
             return None
         first = State(*(part[:1] for part in self.state))
-        _, last = self.model.rollout(first, self.controller.plan.mean[:1].to(first.deter.dtype))
+        _, last = self.model.rollout(first, self.controller.plan.actions[:1].to(first.deter.dtype))
         return self.model.decoder.picture(last.features.float())[0].cpu().numpy()
 
     def _choose(self, state: State) -> Tensor:

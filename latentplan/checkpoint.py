@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import difflib
 import hashlib
 import json
 from pathlib import Path
@@ -16,6 +17,7 @@ from latentplan.models import WorldModel
 WEIGHTS = "weights.safetensors"
 INFO = "info.json"
 MODES = ("planner", "actor", "random")
+REQUIRED = ("domain", "task", "env_frames", "discount", "action_dim", "config", "sha256")
 
 
 def save_checkpoint(folder: Path, model: WorldModel, config: Config, info: dict[str, Any]) -> None:
@@ -51,7 +53,7 @@ def read_info(path: str | Path) -> dict[str, Any]:
         info = json.loads((folder / INFO).read_text())
     except (OSError, ValueError) as error:
         raise UserError(f"{folder / INFO} cannot be read: {error}") from None
-    missing = [key for key in ("config", "sha256", "action_dim", "discount") if key not in info]
+    missing = [key for key in REQUIRED if not isinstance(info, dict) or key not in info]
     if missing:
         raise UserError(f"{folder} is not a latentplan checkpoint: {INFO} lacks {', '.join(missing)}")
     return info
@@ -61,20 +63,26 @@ def load_model(path: str | Path, device: str = "cpu") -> tuple[WorldModel, Confi
     """The world model of a checkpoint, its settings, and what it says of itself.
 
     Raises:
-        UserError: The checkpoint is missing, foreign or damaged.
+        UserError: The checkpoint is missing, foreign or damaged, or the device cannot be used.
     """
     info, folder = read_info(path), resolve_checkpoint(path)
     weights = folder / WEIGHTS
     if hashlib.sha256(weights.read_bytes()).hexdigest() != info["sha256"]:
         raise UserError(f"{weights} is damaged: its checksum is not the one in {INFO}")
-    config = from_dict(info["config"])
+    try:
+        config = from_dict(info["config"])
+    except (AttributeError, TypeError, ValueError) as error:
+        raise UserError(f"the settings in {folder / INFO} cannot be used: {error}") from None
     model = WorldModel(config.model, info["action_dim"])
     state = {name: value.float() for name, value in load_file(weights).items()}
     try:
         model.load_state_dict(state)
     except RuntimeError as error:
         raise UserError(f"{weights} does not fit its own settings: {str(error).splitlines()[0]}") from None
-    return model.to(device), config, info
+    try:
+        return model.to(device), config, info
+    except (AssertionError, RuntimeError) as error:
+        raise UserError(f"device {device!r} cannot be used: {str(error).splitlines()[0]}") from None
 
 
 def load_agent(path: str | Path, mode: str = "planner", device: str = "cpu", **planner: Any) -> Agent:
@@ -96,11 +104,14 @@ def load_agent(path: str | Path, mode: str = "planner", device: str = "cpu", **p
         return RandomAgent(model.action_dim)
     if mode == "actor":
         return ActorAgent(model, config)
+    known = to_dict(config.planner)
+    for name in planner:
+        if name not in known:
+            raise UserError(f"unknown planner setting {name!r}{_suggestion(name, {key: key for key in known})}")
     try:
-        settings = PlannerConfig(**(to_dict(config.planner) | planner))
+        return PlanningAgent(model, config, info["discount"], planner=PlannerConfig(**(known | planner)))
     except (TypeError, ValueError) as error:
         raise UserError(f"planner settings: {error}") from None
-    return PlanningAgent(model, config, info["discount"], planner=settings)
 
 
 def resolve_checkpoint(path: str | Path) -> Path:
@@ -110,15 +121,26 @@ def resolve_checkpoint(path: str | Path) -> Path:
         UserError: There is none.
     """
     root = Path(path)
+    folder = _find(root)
+    if folder is not None:
+        return folder
+    reason = f"expected {WEIGHTS} and {INFO}" if root.exists() else "the folder does not exist"
+    parents = [parent for parent in (Path("checkpoints"), root.parent) if parent.is_dir()]
+    known = {path.name: str(path) for parent in parents for path in sorted(parent.iterdir()) if _find(path)}
+    raise UserError(f"no checkpoint at {root}: {reason}{_suggestion(root.name, known)}")
+
+
+def _find(root: Path) -> Path | None:
+    """The root itself, or the best or last checkpoint of the run in it; None where there is none."""
     for folder in (root, root / "checkpoints" / "best", root / "checkpoints" / "last"):
-        if (folder / INFO).exists() and (folder / WEIGHTS).exists():
+        if (folder / INFO).is_file() and (folder / WEIGHTS).is_file():
             return folder
-    if not root.exists():
-        raise UserError(f"no checkpoint at {root}: the folder does not exist{_nearby(root)}")
-    raise UserError(f"no checkpoint at {root}: expected {WEIGHTS} and {INFO}{_nearby(root)}")
+    return None
 
 
-def _nearby(root: Path) -> str:
-    parent = root.parent if root.parent.is_dir() else Path("checkpoints")
-    names = sorted(str(path.parent) for path in parent.glob(f"*/{INFO}"))
-    return f"; available: {', '.join(names)}" if names else ""
+def _suggestion(name: str, known: dict[str, str]) -> str:
+    """What to give in place of a name: the nearest of those known, else all of them."""
+    nearest = difflib.get_close_matches(name, known, n=1)
+    if nearest:
+        return f"; did you mean {known[nearest[0]]}?"
+    return f"; available: {', '.join(known.values())}" if known else ""

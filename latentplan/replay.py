@@ -7,7 +7,8 @@ row of an episode has no action. Alignment is drawn at the top of a batch: obser
 
 from __future__ import annotations
 
-import json
+import os
+import sys
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
@@ -19,8 +20,12 @@ from torch import Tensor
 from latentplan.config import UserError
 
 FRAME_SHAPE = (64, 64, 3)
+FRAME_BYTES = 64 * 64 * 3
 MEMORY_SHARE = 0.9
 SAMPLING_ROUNDS = 1000
+COLUMNS = ("deter", "actions", "rewards", "continues")
+LOADED_AT_ONCE = 1024
+MEMORY_FACTS = Path("/proc/meminfo")
 
 
 @dataclass
@@ -100,13 +105,14 @@ class Replay:
     def add(self, lane: int, rows: Rows) -> None:
         """Append consecutive rows to a lane, overwriting its oldest when it is full."""
         count = len(rows.frames)
-        positions = (self.written[lane] + np.arange(count)) % self.lane_size
+        newest = np.arange(count)[-self.lane_size :]
+        positions = (self.written[lane] + newest) % self.lane_size
         previous = self.episode[lane, (self.written[lane] - 1) % self.lane_size] if self.written[lane] else -1
-        self.episode[lane, positions] = previous + np.cumsum(rows.is_first)
+        self.episode[lane, positions] = previous + np.cumsum(rows.is_first)[newest]
         index = torch.as_tensor(positions + lane * self.lane_size, device=self.device)
-        for name in ("frames", "deter", "actions", "rewards", "continues"):
+        for name in ("frames", *COLUMNS):
             store = getattr(self, name)
-            store[index] = torch.as_tensor(getattr(rows, name), device=self.device).to(store.dtype)
+            store[index] = torch.as_tensor(getattr(rows, name)[newest], device=self.device).to(store.dtype)
         self.written[lane] += count
 
     def sample(self, batch_size: int, sequence_length: int, rng: np.random.Generator) -> Batch:
@@ -130,8 +136,15 @@ class Replay:
         )
 
     def refresh(self, rows: Tensor, deter: Tensor) -> None:
-        """Replace the stored beliefs at rows (batch, time) with newer ones (batch, time, deter)."""
-        self.deter[rows.flatten()] = deter.flatten(0, 1).to(self.deter.dtype)
+        """Replace the stored beliefs at rows (batch, time) with newer ones (batch, time, deter).
+
+        Where a row occurs more than once, its last occurrence counts.
+        """
+        index = rows.flatten().to(self.device)
+        # Every occurrence writes the value of the last one: parallel writes to one place have no order.
+        in_order, order = index.sort(stable=True)
+        last = order[torch.searchsorted(in_order, index, right=True) - 1]
+        self.deter[index] = deter.flatten(0, 1).to(self.deter)[last]
 
     def save(self, folder: Path) -> None:
         """Write what is new since the last save; `load` restores exactly what the last whole save held."""
@@ -143,41 +156,59 @@ class Replay:
             with path.open("r+b") as file:
                 for position in range(first, self.written[lane]):
                     slot = position % self.lane_size
-                    file.seek(slot * int(np.prod(FRAME_SHAPE)))
+                    file.seek(slot * FRAME_BYTES)
                     file.write(self.frames[lane * self.lane_size + slot].cpu().numpy().tobytes())
-        parts = {name: getattr(self, name).cpu() for name in ("deter", "actions", "rewards", "continues")}
+        parts = {name: getattr(self, name).cpu() for name in COLUMNS}
         state = parts | {"episode": torch.from_numpy(self.episode), "written": torch.from_numpy(self.written)}
         torch.save(state, folder / "rows.pt.part")
         (folder / "rows.pt.part").replace(folder / "rows.pt")
-        (folder / "shape.json").write_text(json.dumps({"lane_size": self.lane_size, "num_lanes": self.num_lanes}))
         self._saved = self.written.copy()
 
     def load(self, folder: Path) -> None:
-        """Restore what `save` wrote, into a replay of at least the same lane size.
+        """Restore what `save` wrote; where the capacity is smaller now, the newest rows of it.
 
         Raises:
-            UserError: The folder holds no replay of the same number of lanes.
+            UserError: The folder holds no whole replay of the same lanes, actions and beliefs.
         """
         if not (folder / "rows.pt").exists():
             raise UserError(f"no replay found in {folder}")
-        shape = json.loads((folder / "shape.json").read_text())
-        if shape["num_lanes"] != self.num_lanes or shape["lane_size"] != self.lane_size:
-            raise UserError(f"the replay in {folder} has another shape: {shape}")
         state = torch.load(folder / "rows.pt", weights_only=True)
-        for name in ("deter", "actions", "rewards", "continues"):
-            getattr(self, name).copy_(state[name])
-        self.episode, self.written = state["episode"].numpy(), state["written"].numpy()
-        self._saved = self.written.copy()
-        for lane in range(self.num_lanes):
-            count = int(min(self.written[lane], self.lane_size))
-            frames = np.fromfile(folder / f"frames_{lane}.u8", np.uint8, count * int(np.prod(FRAME_SHAPE)))
-            first = lane * self.lane_size
-            self.frames[first : first + count] = torch.from_numpy(frames.reshape(count, *FRAME_SHAPE))
+        saved = (len(state["episode"]), state["actions"].shape[1], state["deter"].shape[1])
+        own = (self.num_lanes, self.actions.shape[1], self.deter.shape[1])
+        if saved != own:
+            raise UserError(f"the replay in {folder} has (environments, action, deter) {saved}, this run {own}")
+        saved_size = state["episode"].shape[1]
+        for lane, written in enumerate(state["written"].numpy()):
+            held = min(written, saved_size, self.lane_size)
+            old = np.arange(written - held, written) % saved_size
+            new = old if saved_size == self.lane_size else np.arange(held)
+            self.written[lane] = written if saved_size == self.lane_size else held
+            self._saved[lane] = self.written[lane] if np.array_equal(old, new) else 0
+            self.episode[lane, new] = state["episode"].numpy()[lane, old]
+            index = torch.from_numpy(new + lane * self.lane_size).to(self.device)
+            for name in COLUMNS:
+                store = getattr(self, name)
+                store[index] = state[name][old + lane * saved_size].to(self.device)
+            self._load_frames(folder / f"frames_{lane}.u8", min(written, saved_size), old, index)
+
+    def _load_frames(self, path: Path, count: int, slots: np.ndarray, index: Tensor) -> None:
+        """Copy frames from slots of a file that holds `count` of them to rows of this replay."""
+        if count == 0:
+            return
+        if not path.exists() or path.stat().st_size < count * FRAME_BYTES:
+            raise UserError(f"{path} is damaged: it must hold {count:,} frames")
+        stored = np.memmap(path, np.uint8, "r", shape=(count, *FRAME_SHAPE))
+        for start in range(0, len(slots), LOADED_AT_ONCE):
+            part = slice(start, start + LOADED_AT_ONCE)
+            self.frames[index[part]] = torch.from_numpy(stored[slots[part]]).to(self.device)
 
     def _draw_starts(self, count: int, length: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
         held = np.minimum(self.written, self.lane_size)
         oldest = self.written - held
         lanes, starts = np.empty(0, np.int64), np.empty(0, np.int64)
+        too_short = f"no episode in replay has sequence_length ({length}) decisions: lower --learning.sequence_length"
+        if held.max() <= length:
+            raise UserError(too_short)
         for _ in range(SAMPLING_ROUNDS):
             lane = rng.choice(self.num_lanes, size=2 * count, p=held / held.sum())
             offset = rng.integers(0, held[lane])
@@ -188,12 +219,12 @@ class Replay:
             lanes, starts = np.concatenate([lanes, lane[keep]]), np.concatenate([starts, start[keep]])
             if len(starts) >= count:
                 return lanes[:count], starts[:count]
-        raise UserError(f"no episode in replay is longer than sequence_length ({length}) decisions")
+        raise UserError(too_short)
 
 
 def replay_bytes(num_rows: int, action_dim: int, deter_dim: int) -> int:
     """Memory that a replay of `num_rows` rows takes, in bytes."""
-    return num_rows * (int(np.prod(FRAME_SHAPE)) + 2 * deter_dim + 4 * action_dim + 4 + 4 + 8)
+    return num_rows * (FRAME_BYTES + 2 * deter_dim + 4 * action_dim + 4 + 4 + 8)
 
 
 def _check_memory(num_bytes: int, device: torch.device) -> None:
@@ -206,8 +237,11 @@ def _check_memory(num_bytes: int, device: torch.device) -> None:
 
 
 def _free_memory() -> int:
-    with open("/proc/meminfo") as file:
-        for line in file:
+    """Bytes of main memory that can be had; without /proc all there is, and no limit where even that is unknown."""
+    if MEMORY_FACTS.exists():
+        for line in MEMORY_FACTS.read_text().splitlines():
             if line.startswith("MemAvailable:"):
                 return int(line.split()[1]) * 1024
-    raise UserError("cannot read the free memory of this machine")
+    if "SC_PHYS_PAGES" in getattr(os, "sysconf_names", {}):
+        return os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+    return sys.maxsize

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import csv
 import signal
 from pathlib import Path
@@ -9,9 +10,11 @@ from typing import TYPE_CHECKING, Any
 
 import lightning
 import numpy as np
+import torch
 
 from latentplan.checkpoint import save_checkpoint
 from latentplan.config import Config
+from latentplan.models import WorldModel
 from latentplan.replay import Replay
 from latentplan.training.collector import Collected
 from latentplan.training.state import RunState, save_state
@@ -39,6 +42,7 @@ class Experience(lightning.Callback):
     def __init__(self, config: Config, replay: Replay, state: RunState, worker: Worker, videos: Path) -> None:
         self.config, self.replay, self.state, self.worker, self.videos = config, replay, state, worker, videos
         self.episode_returns: list[float] = []
+        self.evaluated_weights: dict[str, np.ndarray] = {}
         self._asked_evaluation: dict[str, Any] | None = None
         self._asked_round = False
 
@@ -58,6 +62,7 @@ class Experience(lightning.Callback):
             self._asked_round = True
         if self._asked_round and state.env_frames >= state.next_evaluation:
             self._ask_evaluation(learner.updates)
+            self.evaluated_weights = weights
 
     def take(self) -> None:
         """Wait for what was asked for, if anything was."""
@@ -78,7 +83,8 @@ class Experience(lightning.Callback):
 
     def _ask_evaluation(self, updates: int) -> None:
         state, settings = self.state, self.config.evaluation
-        self._asked_evaluation = {"env_frames": state.env_frames, "updates": updates, "minutes": state.minutes}
+        self._asked_evaluation = {"env_frames": state.env_frames, "decisions": state.decisions, "updates": updates}
+        self._asked_evaluation["minutes"] = round(state.minutes, 3)
         film = self.videos / f"{state.env_frames:09d}.webm" if settings.video else None
         self.worker.submit("evaluate", settings.episodes, film)
         state.next_evaluation = (state.env_frames // settings.every_frames + 1) * settings.every_frames
@@ -105,8 +111,14 @@ class Record(lightning.Callback):
         self.progress.update(self.state, learner.updates)
 
     def on_train_epoch_end(self, trainer: lightning.Trainer, learner: Learner) -> None:  # type: ignore[override]
-        """Append one row."""
+        """Append one row for the epoch, after one for each evaluation that came in, with the clocks of its weights."""
         state = self.state
+        for entry in state.evaluations[self._shown_evaluations :]:
+            clocks = {name: entry[name] for name in ("env_frames", "decisions", "updates", "minutes")}
+            returns = {"planner_return": entry["planner"], "actor_return": entry["actor"]}
+            self._append(trainer, clocks | returns | {"planner_minus_actor": entry["planner"] - entry["actor"]})
+            self.progress.show_evaluation(entry)
+        self._shown_evaluations = len(state.evaluations)
         row: dict[str, float] = {name: float(value) for name, value in learner.metrics.items()}
         clocks = {"env_frames": state.env_frames, "decisions": state.decisions, "updates": learner.updates}
         row |= clocks | {"minutes": round(state.minutes, 3)}
@@ -114,16 +126,11 @@ class Record(lightning.Callback):
             row["episode_return"] = float(np.mean(self.experience.episode_returns))
             self.progress.episode_return = row["episode_return"]
             self.experience.episode_returns.clear()
-        for entry in state.evaluations[self._shown_evaluations :]:
-            row |= {"planner_return": entry["planner"], "actor_return": entry["actor"]}
-            row["planner_minus_actor"] = entry["planner"] - entry["actor"]
-            self.progress.show_evaluation(entry)
-        self._shown_evaluations = len(state.evaluations)
-        self._append(row)
-        if trainer.logger is not None:
-            trainer.logger.log_metrics(row, step=state.env_frames)
+        self._append(trainer, row)
 
-    def _append(self, row: dict[str, float]) -> None:
+    def _append(self, trainer: lightning.Trainer, row: dict[str, float]) -> None:
+        if trainer.logger is not None:
+            trainer.logger.log_metrics(row, step=int(row["env_frames"]))
         is_new = not self.path.exists()
         with self.path.open("a", newline="") as file:
             writer = csv.DictWriter(file, COLUMNS)
@@ -135,8 +142,10 @@ class Record(lightning.Callback):
 class Save(lightning.Callback):
     """Keeps the last agent, the best one, and what it takes to resume."""
 
-    def __init__(self, folder: Path, config: Config, state: RunState, replay: Replay, facts: dict[str, Any]) -> None:
-        self.folder, self.config, self.state, self.replay, self.facts = folder, config, state, replay, facts
+    def __init__(
+        self, folder: Path, config: Config, experience: Experience, state: RunState, facts: dict[str, Any]
+    ) -> None:
+        self.folder, self.config, self.experience, self.state, self.facts = folder, config, experience, state, facts
         self._kept_evaluations = len(state.evaluations)
 
     def on_train_epoch_end(self, trainer: lightning.Trainer, learner: Learner) -> None:  # type: ignore[override]
@@ -144,23 +153,30 @@ class Save(lightning.Callback):
         if len(self.state.evaluations) == self._kept_evaluations:
             return
         self._kept_evaluations = len(self.state.evaluations)
-        if self.state.evaluations[-1]["planner"] > self.state.best_return:
-            self.state.best_return = self.state.evaluations[-1]["planner"]
-            self.save_agent("best", learner)
+        latest = self.state.evaluations[-1]
+        if latest["planner"] > self.state.best_return:
+            self.state.best_return = latest["planner"]
+            judged = copy.deepcopy(learner.model)
+            weights = self.experience.evaluated_weights
+            judged.load_state_dict({name: torch.from_numpy(value) for name, value in weights.items()})
+            self.save_agent("best", judged, {name: latest[name] for name in ("env_frames", "updates", "minutes")})
         self.save(trainer, learner)
 
     def save(self, trainer: lightning.Trainer, learner: Learner) -> None:
         """Save the last agent and the state of the run."""
-        self.save_agent("last", learner)
+        self.save_agent("last", learner.model, self.clocks(learner))
         optimizers = [optimizer.state_dict() for optimizer in trainer.optimizers]
         saved = {"weights": learner.state_dict(), "updates": learner.updates}
-        save_state(self.folder / "resume", self.state, saved, optimizers, self.replay)
+        save_state(self.folder / "resume", self.state, saved, optimizers, self.experience.replay)
 
-    def save_agent(self, name: str, learner: Learner) -> None:
-        """Save the present agent under a name."""
-        clocks = {"env_frames": self.state.env_frames, "updates": learner.updates, "minutes": self.state.minutes}
-        info = self.facts | clocks | {"metrics": self.state.evaluations}
-        save_checkpoint(self.folder / "checkpoints" / name, learner.model, self.config, info)
+    def save_agent(self, name: str, model: WorldModel, info: dict[str, Any]) -> None:
+        """Save an agent under a name, with facts of its own beside those of the run."""
+        facts = self.facts | info | {"metrics": self.state.evaluations}
+        save_checkpoint(self.folder / "checkpoints" / name, model, self.config, facts)
+
+    def clocks(self, learner: Learner) -> dict[str, Any]:
+        """Where the present agent stands."""
+        return {"env_frames": self.state.env_frames, "updates": learner.updates, "minutes": self.state.minutes}
 
 
 class Stop(lightning.Callback):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import logging
 import warnings
 from dataclasses import dataclass, replace
@@ -166,7 +167,7 @@ class _Run:
         videos = self.folder / "videos"
         videos.mkdir(exist_ok=True)
         experience = Experience(config, self.replay, self.state, self.worker, videos)
-        save = Save(self.folder, config, self.state, self.replay, self._facts())
+        save = Save(self.folder, config, experience, self.state, self._facts())
         stop = Stop(config, self.state)
         record = Record(self.folder / "metrics.csv", self.state, experience, self.console)
         trainer = self._trainer([experience, record, save, stop])
@@ -183,7 +184,7 @@ class _Run:
             self.console.console.print(f"stopped; to go on: python scripts/train.py --resume {self.folder}")
             return Result(self.folder, INTERRUPTED, {})
         experience.take()
-        return Result(self.folder, 0, self._finish(videos / "final.webm"))
+        return Result(self.folder, 0, self._finish(save, videos / "final.webm"))
 
     def _trainer(self, callbacks: list[lightning.Callback]) -> lightning.Trainer:
         logging.getLogger("lightning.pytorch").setLevel(logging.ERROR)
@@ -207,13 +208,18 @@ class _Run:
             log_every_n_steps=10**9,
         )
 
-    def _finish(self, film: Path) -> dict[str, float]:
+    def _finish(self, save: Save, film: Path) -> dict[str, float]:
         weights = {name: value.detach().cpu().numpy() for name, value in self.learner.model.state_dict().items()}
         episodes = self.config.evaluation.final_episodes
         self.console.console.print(f"final evaluation: {episodes} episodes each of planner and actor")
         self.worker.submit("evaluate", episodes, film if self.config.evaluation.video else None, weights)
         returns = self.worker.result()
         summary = {mode: float(np.mean(values)) for mode, values in returns.items()}
+        info = save.clocks(self.learner) | {"final_evaluation": returns}
+        (self.folder / "final.json").write_text(json.dumps(info | summary, indent=1))
+        save.save_agent("last", self.learner.model, info)
+        if summary["planner"] >= self.state.best_return:
+            save.save_agent("best", self.learner.model, info)
         self.console.console.print(
             f"trained {self.state.env_frames:,} frames in {self.state.minutes:.1f} min: planner "
             f"{summary['planner']:.1f}, actor {summary['actor']:.1f} ({episodes} episodes)\nrun folder: {self.folder}"

@@ -70,7 +70,9 @@ class RemoteWorker:
         try:
             kind, value = self._futures.popleft().result()
         except (EOFError, OSError):
-            raise RuntimeError("the process that collects has ended unexpectedly") from None
+            self._process.join(timeout=5.0)
+            code = self._process.exitcode
+            raise RuntimeError(f"the process that collects has ended unexpectedly (exit code {code})") from None
         if kind == "user_error":
             raise UserError(value)
         if kind == "error":

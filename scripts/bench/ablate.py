@@ -1,0 +1,127 @@
+"""`benchmark.py ablate`: what each part of a trained planner earns, in paired episodes."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+from bench.arms import NAMES, REFERENCE, Arm, Outcome, check_checkpoint, parse_arms, play_arm, single_thread
+from bench.options import DEVICE_FLAGS, Flags, choose_device, output_path, whole_number
+from bench.report import format_table, interval, number, write_csv, write_json
+from latentplan.config import UserError, to_dict
+
+FLAGS = {
+    "--checkpoint": ("DIR", "trained agent, or run (its best checkpoint)"),
+    "--episodes": ("N", "episodes of each arm, on the same starts (20)"),
+    "--seed": ("S", "episode i starts from a state that depends only on S and i (0)"),
+    "--arms": ("A,A", f"any of {','.join(NAMES)} (all), and name:field=value,field=value for settings of the search"),
+    "--workers": ("N", "arms played at once, each in its own process (1)"),
+    "--device": DEVICE_FLAGS["--device"],
+    "--json": ("FILE", "result as JSON"),
+    "--csv": ("FILE", "every episode as CSV"),
+}
+SETTINGS = ()
+
+
+def run(flags: Flags) -> int:
+    """Play every arm from the same starts and compare with the full planner."""
+    if "--checkpoint" not in flags:
+        raise UserError("flag --checkpoint is missing; give the folder of a trained agent or of a run")
+    episodes, seed = whole_number(flags, "--episodes", 20), whole_number(flags, "--seed", 0, least=0)
+    workers = whole_number(flags, "--workers", 1)
+    json_path, csv_path = output_path(flags, "--json"), output_path(flags, "--csv")
+    checkpoint = flags["--checkpoint"]
+    info, planner = check_checkpoint(Path(checkpoint))
+    arms = parse_arms(flags.get("--arms", ",".join(NAMES)), planner)
+    device = str(choose_device(flags))
+    from latentplan.rollout import episode_seed
+
+    seeds = [episode_seed(seed, index) for index in range(episodes)]
+    about = {
+        "checkpoint": checkpoint,
+        "domain": info.get("domain"),
+        "task": info.get("task"),
+        "env_frames_trained": info.get("env_frames"),
+        "render_quality": info["config"]["env"]["render_quality"],
+        "planner": to_dict(planner),
+        "seed": seed,
+        "episodes": episodes,
+    }
+    print(f"{about['domain']}-{about['task']}, {episodes} episodes per arm, {workers} at once", flush=True)
+    outcomes: dict[str, Outcome] = {}
+    for outcome in _play(checkpoint, arms, seeds, device, workers):
+        outcomes[outcome.arm.name] = outcome
+        print(f"{outcome.arm.name}: mean return {sum(outcome.returns) / episodes:.1f}", flush=True)
+        write_csv(csv_path, episode_rows(list(outcomes.values()), seeds))
+        write_json(json_path, {**about, "arms": compare_arms(list(outcomes.values()))})
+    print(summary_table(compare_arms(list(outcomes.values()))))
+    return 0
+
+
+def compare_arms(outcomes: Sequence[Outcome]) -> dict[str, dict[str, Any]]:
+    """Each arm's mean return and its paired difference to the reference, which comes first, as plain values."""
+    from bench.statistics import mean_estimate, paired_difference
+
+    reference = outcomes[0].returns
+    compared = {}
+    for outcome in outcomes:
+        mean, difference = mean_estimate(outcome.returns), paired_difference(outcome.returns, reference)
+        is_reference = outcome.arm.name == REFERENCE
+        compared[outcome.arm.name] = {
+            "mode": outcome.arm.mode,
+            "planner": outcome.arm.planner,
+            "returns": outcome.returns,
+            "mean_return": mean.mean,
+            "ci95": [mean.low, mean.high],
+            "minus_full": None if is_reference else difference.mean,
+            "minus_full_ci95": [None, None] if is_reference else [difference.low, difference.high],
+            "decision_ms": outcome.decision_ms,
+            "differs_from_actor": outcome.differs_from_actor,
+        }
+    return compared
+
+
+def summary_table(compared: dict[str, dict[str, Any]]) -> str:
+    """The comparison for people."""
+    header = ["arm", "return", "95 %", "minus full", "95 %", "ms p50", "differs from actor"]
+    rows = []
+    for name, facts in compared.items():
+        share = facts["differs_from_actor"]
+        rows.append(
+            [
+                name,
+                number(facts["mean_return"]),
+                interval(facts["ci95"]),
+                number(facts["minus_full"], sign=True),
+                interval(facts["minus_full_ci95"], sign=True),
+                number(facts["decision_ms"]["p50"], 2),
+                "-" if share is None else f"{100.0 * share:.0f} %",
+            ]
+        )
+    return format_table(header, rows)
+
+
+def episode_rows(outcomes: Sequence[Outcome], seeds: Sequence[int]) -> list[dict[str, Any]]:
+    """One row per arm and episode."""
+    return [
+        {"arm": outcome.arm.name, "episode": index, "start_seed": seed, "return": total, "decision_ms_p50": median_ms}
+        for outcome in outcomes
+        for index, (seed, total, median_ms) in enumerate(zip(seeds, outcome.returns, outcome.episode_ms, strict=True))
+    ]
+
+
+def _play(checkpoint: str, arms: Sequence[Arm], seeds: Sequence[int], device: str, workers: int) -> Iterator[Outcome]:
+    """The outcomes in the order of the arms, each as soon as it and those before it are there."""
+    if workers == 1:
+        for arm in arms:
+            yield play_arm(checkpoint, arm, seeds, device, 1)
+        return
+    import multiprocessing
+    from concurrent.futures import ProcessPoolExecutor
+
+    context = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(min(workers, len(arms)), context, single_thread) as pool:
+        futures = [pool.submit(play_arm, checkpoint, arm, seeds, device, 1) for arm in arms]
+        for future in futures:
+            yield future.result()

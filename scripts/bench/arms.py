@@ -1,0 +1,178 @@
+"""Arms of an ablation: how they are named, and what each earns."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from latentplan.compose import build_config, field_names, raise_unknown
+from latentplan.config import PlannerConfig, UserError, to_dict
+
+REFERENCE = "full"
+NAMES = (REFERENCE, "no_actor", "no_value", "cold", "horizon1", "actor", "random")
+DIFFERENT_ACTION = 0.1
+
+
+class Arm(NamedTuple):
+    """One way to decide.
+
+    Attributes:
+        name: In the table.
+        mode: `planner`, `actor` or `random`.
+        planner: Settings of the search laid over the checkpoint's.
+    """
+
+    name: str
+    mode: str
+    planner: dict[str, Any]
+
+
+class Outcome(NamedTuple):
+    """What an arm earned.
+
+    Attributes:
+        arm: Who played.
+        returns: Of each episode.
+        episode_ms: Median milliseconds per decision of each episode.
+        decision_ms: `p50`, `p95` and `p99` over all decisions.
+        differs_from_actor: Share of the decisions in which a planner's action and the actor's mode on the same
+            belief are more than 0.1 apart in some dimension; None for the other modes.
+    """
+
+    arm: Arm
+    returns: list[float]
+    episode_ms: list[float]
+    decision_ms: dict[str, float]
+    differs_from_actor: float | None
+
+
+def parse_arms(text: str, base: PlannerConfig) -> list[Arm]:
+    """The arms that `full,actor,wide:init_std=1.0,num_iterations=6` names; the reference is first, named or not.
+
+    Args:
+        text: Known names, and `name:field=value,field=value` for settings laid over `base`.
+        base: The checkpoint's own settings of the search.
+
+    Raises:
+        UserError: A name or field is unknown, a value is not allowed, or a name comes twice.
+    """
+    given: dict[str, dict[str, str]] = {}  # settings of each arm, as typed
+    for name, words in _split_arms(text):
+        if name in given:
+            raise UserError(f"arm {name!r} comes twice; give each arm its own name")
+        if not words and name not in NAMES:
+            raise_unknown("arm", name, NAMES)
+        if words and (not name or name in NAMES):
+            raise UserError(f"arm {name!r} takes no settings; write newname:{words[0]}")
+        given[name] = dict(_setting(name, word) for word in words)
+    names = [REFERENCE, *(name for name in given if name != REFERENCE)]
+    return [_arm(name, given.get(name, {}), base) for name in names]
+
+
+def without_actor(base: PlannerConfig) -> dict[str, Any]:
+    """The settings that keep the actor out of a search."""
+    tail = {"tail": "zero"} if base.tail == "policy" else {}
+    return {"num_policy_samples": 0, "start": "shifted", **tail}
+
+
+def play_arm(checkpoint: str, arm: Arm, seeds: Sequence[int], device: str, threads: int) -> Outcome:
+    """Play one episode per seed with the checkpoint's own pictures.
+
+    Args:
+        checkpoint: A checkpoint, or a run folder.
+        arm: Who plays.
+        seeds: Of the starts.
+        device: `cpu` or `cuda`.
+        threads: CPU threads.
+    """
+    import numpy as np
+    import torch
+
+    from latentplan.checkpoint import load_agent, load_model
+    from latentplan.envs import make_env
+    from latentplan.rollout import Step, latency_percentiles, run_episodes
+
+    torch.set_num_threads(threads)
+    _, config, _ = load_model(checkpoint)
+    agent: Any = load_agent(checkpoint, mode=arm.mode, device=device, **arm.planner)
+    differs: list[bool] = []
+
+    @torch.no_grad()
+    def compare(step: Step) -> None:
+        if step.action is not None:
+            mode = agent.model.actor(agent.state.features)[0][0].float().cpu().numpy()
+            differs.append(bool((np.abs(mode - step.action) > DIFFERENT_ACTION).any()))
+
+    env = make_env(config.env)
+    try:
+        episodes = run_episodes(env, agent, seeds, on_step=compare if arm.mode == "planner" else None)
+    finally:
+        env.close()
+    return Outcome(
+        arm,
+        [episode.total_return for episode in episodes],
+        [float(np.median(episode.decision_ms)) for episode in episodes],
+        latency_percentiles(np.concatenate([episode.decision_ms for episode in episodes])),
+        float(np.mean(differs)) if differs else None,
+    )
+
+
+def single_thread() -> None:
+    """Settles the threads of a fresh process before torch and a renderer are imported."""
+    for name in ("OMP_NUM_THREADS", "MKL_NUM_THREADS"):
+        os.environ[name] = "1"
+
+
+def check_checkpoint(path: Path) -> tuple[dict[str, Any], PlannerConfig]:
+    """What a checkpoint says of itself, and its settings of the search.
+
+    Raises:
+        UserError: There is none, or it is damaged.
+    """
+    from latentplan.checkpoint import load_model
+
+    _, config, info = load_model(path)
+    return info, config.planner
+
+
+def _split_arms(text: str) -> list[tuple[str, list[str]]]:
+    """Names and the settings that follow them: a word without `=` or with `:` begins an arm."""
+    arms: list[tuple[str, list[str]]] = []
+    for word in (part.strip() for part in text.split(",")):
+        name, colon, setting = word.partition(":")
+        if colon or "=" not in word:
+            arms.append((name, [setting] if colon else []))
+        elif arms:
+            arms[-1][1].append(word)
+        else:
+            raise UserError(f"{word!r} belongs to no arm; write name:{word}")
+    return arms
+
+
+def _setting(arm: str, word: str) -> tuple[str, str]:
+    field, equals, value = word.partition("=")
+    if not equals:
+        raise UserError(f"arm {arm!r} must be name:field=value,field=value, got {word!r}")
+    if field not in field_names("planner"):
+        raise_unknown("planner setting", field, field_names("planner"))
+    return field, value
+
+
+def _arm(name: str, settings: dict[str, str], base: PlannerConfig) -> Arm:
+    if name in ("actor", "random"):
+        return Arm(name, name, {})
+    known: dict[str, dict[str, Any]] = {
+        REFERENCE: {},
+        "no_actor": without_actor(base),
+        "no_value": {"terminal_value": False},
+        "cold": {"warm_start": False},
+        "horizon1": {"horizon": 1},
+    }
+    changes = known.get(name, settings)
+    try:
+        planner = build_config({"planner": {**to_dict(base), **changes}}).planner
+    except UserError as error:
+        raise UserError(f"arm {name!r}: {error}") from None
+    return Arm(name, "planner", {field: getattr(planner, field) for field in changes})

@@ -1,0 +1,150 @@
+"""`benchmark.py decide`: how long planner and actor think."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from bench.options import (
+    COMPOSE_FLAGS,
+    DEVICE_FLAGS,
+    Flags,
+    action_size,
+    choose_device,
+    composed_config,
+    output_path,
+    settings_layer,
+    whole_number,
+)
+from bench.report import format_table, number, write_json
+from latentplan.compose import build_config
+from latentplan.config import Config, UserError, to_dict
+
+if TYPE_CHECKING:
+    import torch
+
+    from latentplan.agent import Agent
+    from latentplan.models import WorldModel
+
+FLAGS = {
+    "--checkpoint": ("DIR", "trained agent, or run; without it an untrained one is timed"),
+    **COMPOSE_FLAGS,
+    "--batch": ("B", "environments decided for at once (1)"),
+    "--decisions": ("N", "decisions that are timed (50)"),
+    **DEVICE_FLAGS,
+    "--json": ("FILE", "result as JSON"),
+}
+SETTINGS = ("planner",)
+WARM_UP_DECISIONS = 3
+UNTRAINED_DISCOUNT = 0.99
+
+
+def run(flags: Flags) -> int:
+    """Time decisions on random frames and print their percentiles."""
+    batch, decisions = whole_number(flags, "--batch", 1), whole_number(flags, "--decisions", 50)
+    json_path = output_path(flags, "--json")
+    for name in ("--domain", "--preset", "--action-dim"):
+        if "--checkpoint" in flags and name in flags:
+            raise UserError(f"{name} has no effect with --checkpoint; give one of them")
+    composed = None if "--checkpoint" in flags else composed_config(flags)
+    device = choose_device(flags)
+    from bench.machine import describe_machine
+
+    model, config, discount = _load(flags, composed, device)
+    arms = {
+        name: measure_decisions(agent, batch, decisions) for name, agent in _agents(model, config, discount).items()
+    }
+    rows = [
+        [name, *(number(facts["decision_ms"][key], 2) for key in ("p50", "p95", "p99")), f"{facts['model_steps']:,}"]
+        for name, facts in arms.items()
+    ]
+    machine = describe_machine(device)
+    print(f"{config.env.domain} on {machine['name']} ({device.type}, {machine['threads']} threads), batch {batch}")
+    print(format_table(["decides", "ms p50", "p95", "p99", "model steps per decision"], rows))
+    about = {"domain": config.env.domain, "batch": batch, "decisions": decisions, "machine": machine}
+    write_json(json_path, {**about, "planner": to_dict(config.planner), "arms": arms})
+    return 0
+
+
+def measure_decisions(agent: Agent, batch: int, decisions: int) -> dict[str, Any]:
+    """Time from frames in memory to actions, and imagined model steps per decision and environment.
+
+    Args:
+        agent: Who decides; warm-started where it plans.
+        batch: Frames per decision; a single one is given without a batch axis.
+        decisions: Decisions that are timed.
+
+    Returns:
+        `decision_ms` with `p50`, `p95` and `p99`, and `model_steps`.
+    """
+    import numpy as np
+
+    from latentplan.rollout import latency_percentiles
+
+    shape = (64, 64, 3) if batch == 1 else (batch, 64, 64, 3)
+    rng, milliseconds = np.random.default_rng(0), []
+    agent.reset()
+    for index in range(WARM_UP_DECISIONS + decisions):
+        frames = rng.integers(0, 256, shape, dtype=np.uint8)
+        started = time.perf_counter()
+        agent.act(frames)
+        if index >= WARM_UP_DECISIONS:
+            milliseconds.append(1000.0 * (time.perf_counter() - started))
+    with counted_model_steps(agent.model) as counts:  # type: ignore[union-attr]
+        agent.act(frames)
+    return {"decision_ms": latency_percentiles(np.asarray(milliseconds)), "model_steps": counts["rows"] // batch}
+
+
+@contextmanager
+def counted_model_steps(model: WorldModel) -> Iterator[dict[str, int]]:
+    """Counts the rows that the model imagines one step further, under `rows`, while the context lasts."""
+    counts = {"rows": 0}
+
+    def counting(method: Any) -> Any:
+        def call(state: Any, actions: torch.Tensor) -> Any:
+            counts["rows"] += math.prod(actions.shape[:-1])
+            return method(state, actions)
+
+        return call
+
+    names = ("step", "rollout")
+    for name in names:
+        setattr(model, name, counting(getattr(model, name)))
+    try:
+        yield counts
+    finally:
+        for name in names:
+            delattr(model, name)
+
+
+def _load(flags: Flags, composed: Config | None, device: torch.device) -> tuple[WorldModel, Config, float]:
+    """Model, settings and discount: of the checkpoint, or of an untrained agent."""
+    if composed is not None:
+        import torch
+
+        from latentplan.models import WorldModel
+
+        torch.manual_seed(0)
+        return WorldModel(composed.model, action_size(flags, composed)).to(device), composed, UNTRAINED_DISCOUNT
+    from latentplan.checkpoint import load_model
+
+    model, config, info = load_model(Path(flags["--checkpoint"]), str(device))
+    layer = {"planner": {**to_dict(config.planner), **settings_layer(flags).get("planner", {})}}
+    return model, replace(config, planner=build_config(layer).planner), float(info["discount"])
+
+
+def _agents(model: WorldModel, config: Config, discount: float) -> dict[str, Agent]:
+    from bench.arms import without_actor
+    from latentplan.agent import ActorAgent, PlanningAgent
+
+    alone = replace(config.planner, **without_actor(config.planner))
+    return {
+        "planner": PlanningAgent(model, config, discount),
+        "planner without actor": PlanningAgent(model, config, discount, planner=alone),
+        "actor": ActorAgent(model, config),
+    }

@@ -1,0 +1,192 @@
+"""`benchmark.py learn`: learning curves over tasks and seeds."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from bench.options import Flags, choice, numbers, words
+from bench.report import format_table, interval, number, write_csv, write_json
+from latentplan.cli import parse_train
+from latentplan.compose import SECTIONS
+from latentplan.config import UserError
+
+FLAGS = {
+    "--tasks": ("T,T", "domain-task each (cartpole-swingup,walker-walk)"),
+    "--seeds": ("S,S", "seeds of each task (0,1)"),
+    "--frames": ("N", "simulator frames of each run (without a budget, the preset's)"),
+    "--minutes": ("M", "minutes of each run; given with --frames, whichever ends first"),
+    "--thresholds": ("R,R", "evaluation returns to wait for (250,500,750)"),
+    "--mode": ("planner|actor", "whose evaluation return counts (planner)"),
+    "--out": ("DIR", "folder of the runs and results (runs/learn); finished runs in it are not repeated"),
+    "--preset": ("auto|cpu|gpu", "as in train.py"),
+    "--device": ("auto|cpu|cuda", "as in train.py"),
+    "--config": ("FILE", "as in train.py"),
+}
+SETTINGS = tuple(SECTIONS)
+FORWARDED = ("--preset", "--device", "--config")
+FINISHED = "finished.json"
+MODES = ("planner", "actor")
+
+
+class Point(NamedTuple):
+    """One evaluation of a run."""
+
+    env_frames: float
+    minutes: float
+    total_return: float
+
+
+class Curve(NamedTuple):
+    """The evaluations of one run, in order."""
+
+    task: str
+    seed: int
+    points: list[Point]
+
+
+def run(flags: Flags) -> int:
+    """Train what is missing, then collect, tabulate and plot the curves."""
+    tasks, seeds = words(flags, "--tasks", "cartpole-swingup,walker-walk"), numbers(flags, "--seeds", "0,1")
+    thresholds = numbers(flags, "--thresholds", "250,500,750")
+    mode = choice(flags, "--mode", "planner", MODES)
+    budget = [word for name in ("--frames", "--minutes") if name in flags for word in (name, flags[name])]
+    extra = [word for name, value in flags.items() if name in FORWARDED or "." in name for word in (name, value)]
+    out = Path(flags.get("--out", "runs/learn"))
+    folders = {(task, seed): out / f"{task}-seed{seed}" for task in tasks for seed in seeds}
+    for (task, seed), folder in folders.items():
+        parse_train(_new_run(task, seed, folder, budget, extra))  # a mistake in any run stops before the first
+    out.mkdir(parents=True, exist_ok=True)
+    for (task, seed), folder in folders.items():
+        _train(task, seed, folder, budget, extra)
+    curves = [read_run(task, seed, folder / "metrics.csv", mode) for (task, seed), folder in folders.items()]
+    write_csv(out / "curves.csv", [{"task": c.task, "seed": c.seed, **p._asdict()} for c in curves for p in c.points])
+    print(run_table(curves, thresholds))
+    finals = final_estimates(curves)
+    print(format_table(["task", "runs", "interquartile mean", "95 %"], [_final_row(*item) for item in finals.items()]))
+    write_json(out / "summary.json", {"mode": mode, "runs": run_facts(curves, thresholds), "final": finals})
+    plot_runs(curves, mode, out / "curves.png")
+    print(f"curves.csv, summary.json and curves.png are in {out}")
+    return 0
+
+
+def read_run(task: str, seed: int, metrics_csv: Path, mode: str) -> Curve:
+    """The evaluations that a run recorded.
+
+    Raises:
+        UserError: There are none.
+    """
+    from latentplan.reporting.curves import read_curve
+
+    column = f"{mode}_return"
+    frames, returns = read_curve(metrics_csv, "env_frames", column)
+    minutes, _ = read_curve(metrics_csv, "minutes", column)
+    if not frames:
+        raise UserError(f"{metrics_csv} holds no evaluation; lower --evaluation.every_frames or train longer")
+    return Curve(task, seed, [Point(*point) for point in zip(frames, minutes, returns, strict=True)])
+
+
+def first_reaching(curve: Curve, threshold: float) -> Point | None:
+    """The first evaluation of at least `threshold`, or None."""
+    return next((point for point in curve.points if point.total_return >= threshold), None)
+
+
+def run_facts(curves: Sequence[Curve], thresholds: Sequence[int]) -> list[dict[str, Any]]:
+    """Per run: its clocks, final return, and frames and minutes to each threshold (None where not reached)."""
+    facts = []
+    for curve in curves:
+        reached = {str(threshold): first_reaching(curve, threshold) for threshold in thresholds}
+        last = curve.points[-1]
+        facts.append(
+            {
+                "task": curve.task,
+                "seed": curve.seed,
+                "env_frames": last.env_frames,
+                "minutes": last.minutes,
+                "final_return": last.total_return,
+                "frames_to": {name: point and point.env_frames for name, point in reached.items()},
+                "minutes_to": {name: point and point.minutes for name, point in reached.items()},
+            }
+        )
+    return facts
+
+
+def run_table(curves: Sequence[Curve], thresholds: Sequence[int]) -> str:
+    """`run_facts` for people; frames and minutes to a threshold share a cell."""
+    rows = []
+    for facts in run_facts(curves, thresholds):
+        cells = [f"{facts['task']} seed {facts['seed']}", number(facts["env_frames"], 0), number(facts["minutes"])]
+        for threshold in map(str, thresholds):
+            frames, minutes = facts["frames_to"][threshold], facts["minutes_to"][threshold]
+            cells.append("-" if frames is None else f"{frames:,.0f} / {minutes:.1f}")
+        rows.append([*cells, number(facts["final_return"])])
+    header = ["run", "frames", "minutes", *(f"frames / min to {threshold}" for threshold in thresholds), "final"]
+    return format_table(header, rows)
+
+
+def final_estimates(curves: Sequence[Curve]) -> dict[str, dict[str, Any]]:
+    """Interquartile mean of the final returns with its bootstrap interval, by task and, of several, over all."""
+    from bench.statistics import interquartile_estimate
+
+    groups: dict[str, list[float]] = {}
+    for curve in curves:
+        groups.setdefault(curve.task, []).append(curve.points[-1].total_return)
+    wanted = {task: [group] for task, group in groups.items()}
+    if len(groups) > 1:
+        wanted["all tasks"] = list(groups.values())
+    return {
+        name: {"runs": sum(map(len, chosen)), **interquartile_estimate(chosen)._asdict()}
+        for name, chosen in wanted.items()
+    }
+
+
+def plot_runs(curves: Sequence[Curve], mode: str, png: Path) -> None:
+    """Evaluation return against frames: a panel per task, a line per seed."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    tasks = list(dict.fromkeys(curve.task for curve in curves))
+    figure = Figure(figsize=(5 * len(tasks), 4), layout="constrained")
+    FigureCanvasAgg(figure)
+    panels = figure.subplots(1, len(tasks), squeeze=False)[0]
+    for axes, task in zip(panels, tasks, strict=True):
+        for curve in (curve for curve in curves if curve.task == task):
+            frames, _, returns = zip(*curve.points, strict=True)
+            axes.plot(frames, returns, marker="o", markersize=3, label=f"seed {curve.seed}")
+        axes.set(title=task, xlabel="environment frames", ylabel=f"evaluation return, {mode}")
+        axes.set_ylim(bottom=min(0.0, axes.get_ylim()[0]))
+        axes.grid(alpha=0.25)
+        axes.legend(loc="upper left", frameon=False)
+    figure.savefig(png, dpi=120, format="png")
+
+
+def _train(task: str, seed: int, folder: Path, budget: list[str], extra: list[str]) -> None:
+    """Run `train.py` in its own process, unless the folder holds the finished run already."""
+    marker = folder / FINISHED
+    if marker.exists() and json.loads(marker.read_text())["budget"] == budget:
+        print(f"{folder} is finished and not repeated", flush=True)
+        return
+    is_begun = (folder / "config.yaml").exists()
+    arguments = ["--resume", str(folder), *budget] if is_begun else _new_run(task, seed, folder, budget, extra)
+    script = Path(__file__).resolve().parent.parent / "train.py"
+    print(f"training {task}, seed {seed}", flush=True)
+    code = subprocess.run([sys.executable, str(script), *arguments], check=False).returncode
+    if code == 130:
+        raise KeyboardInterrupt
+    if code != 0:
+        raise UserError(f"training {task} with seed {seed} ended with exit code {code}; see above")
+    write_json(marker, {"budget": budget})
+
+
+def _new_run(task: str, seed: int, folder: Path, budget: list[str], extra: list[str]) -> list[str]:
+    domain, _, name = task.partition("-")
+    chosen = ["--domain", domain, *(["--task", name] if name else []), "--seed", str(seed)]
+    return [*chosen, "--run-dir", str(folder), *budget, *extra]
+
+
+def _final_row(name: str, facts: dict[str, Any]) -> list[str]:
+    return [name, str(facts["runs"]), number(facts["mean"]), interval((facts["low"], facts["high"]))]

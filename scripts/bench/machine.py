@@ -1,0 +1,63 @@
+"""What the machine can do at best, to judge what the program does by."""
+
+from __future__ import annotations
+
+import platform
+import time
+from pathlib import Path
+from typing import Any
+
+import torch
+
+PRODUCT_SIZES = {"cpu": 2048, "cuda": 8192}
+PRECISIONS = {"bfloat16": torch.bfloat16, "float32": torch.float32}
+
+
+def describe_machine(device: torch.device) -> dict[str, Any]:
+    """Processor, threads, device and versions, as plain values for JSON."""
+    name = torch.cuda.get_device_name(device) if device.type == "cuda" else processor_name()
+    return {
+        "device": device.type,
+        "name": name,
+        "threads": torch.get_num_threads(),
+        "torch": torch.__version__,
+        "float32_matmul_precision": torch.get_float32_matmul_precision(),
+    }
+
+
+def processor_name() -> str:
+    """What the processor calls itself."""
+    try:
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+        return next(line.partition(":")[2].strip() for line in lines if line.startswith("model name"))
+    except (OSError, StopIteration):  # not Linux, or an architecture that names no model
+        return platform.processor() or platform.machine()
+
+
+def product_limits(device: torch.device, size: int | None = None, repeats: int = 4) -> dict[str, float]:
+    """FLOP/s of the fastest of a few big square matrix products, by precision.
+
+    Args:
+        device: Where to compute.
+        size: Rows and columns; None takes a size that fills the device.
+        repeats: Products timed, after one that is not.
+    """
+    size = size or PRODUCT_SIZES[device.type]
+    limits = {}
+    for name, dtype in PRECISIONS.items():
+        left = torch.randn(size, size, device=device, dtype=dtype)
+        right = torch.randn(size, size, device=device, dtype=dtype)
+        seconds = []
+        for _ in range(repeats + 1):
+            started = now(device)
+            torch.mm(left, right)
+            seconds.append(now(device) - started)
+        limits[name] = 2.0 * size**3 / min(seconds[1:])
+    return limits
+
+
+def now(device: torch.device) -> float:
+    """Seconds on a steady clock, when everything asked of the device is done."""
+    if device.type == "cuda":
+        torch.cuda.synchronize(device)
+    return time.perf_counter()

@@ -1,0 +1,142 @@
+"""Values of the benchmarks' flags, checked before any work is done."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from latentplan.compose import PRESETS, Layer, compose, raise_unknown
+from latentplan.config import DEVICES, Config, UserError
+
+if TYPE_CHECKING:
+    import torch
+
+Flags = Mapping[str, str]
+
+DEVICE_FLAGS = {
+    "--device": ("|".join(DEVICES), "where to compute (auto: cuda where usable)"),
+    "--threads": ("T", "CPU threads (torch's own choice)"),
+}
+COMPOSE_FLAGS = {
+    "--domain": ("D", "domain of dm_control.suite, whose settings hold (walker)"),
+    "--preset": ("|".join(PRESETS), "machine class, as in train.py (auto)"),
+    "--action-dim": ("N", "size of the action; unless given, the simulator is asked"),
+}
+
+
+def whole_number(flags: Flags, name: str, default: int, least: int = 1) -> int:
+    """The whole number that a flag gives.
+
+    Raises:
+        UserError: It is none, or below `least`.
+    """
+    text = flags.get(name, str(default))
+    if not text.isascii() or not text.isdigit() or int(text) < least:
+        raise UserError(f"{name} must be a whole number of at least {least}, got {text!r}")
+    return int(text)
+
+
+def choice(flags: Flags, name: str, default: str, allowed: Sequence[str]) -> str:
+    """The word that a flag gives.
+
+    Raises:
+        UserError: It is not among the allowed ones.
+    """
+    text = flags.get(name, default)
+    if text not in allowed:
+        raise_unknown(name.lstrip("-"), text, allowed)
+    return text
+
+
+def words(flags: Flags, name: str, default: str) -> list[str]:
+    """The distinct words of a list that commas separate, in order.
+
+    Raises:
+        UserError: There is none.
+    """
+    found = list(dict.fromkeys(word.strip() for word in flags.get(name, default).split(",") if word.strip()))
+    if not found:
+        raise UserError(f"{name} must name at least one, separated by commas, got {flags.get(name, default)!r}")
+    return found
+
+
+def numbers(flags: Flags, name: str, default: str) -> list[int]:
+    """The distinct whole numbers of a list that commas separate.
+
+    Raises:
+        UserError: One of them is no whole number.
+    """
+    return [whole_number({name: word}, name, 0, least=0) for word in words(flags, name, default)]
+
+
+def output_path(flags: Flags, name: str) -> Path | None:
+    """The file that a flag names, or None.
+
+    Raises:
+        UserError: It is a folder, or its folder does not exist.
+    """
+    if name not in flags:
+        return None
+    path = Path(flags[name])
+    if path.is_dir():
+        raise UserError(f"{name} {str(path)!r} is a folder; give a file in it")
+    if not path.parent.is_dir():
+        raise UserError(f"{name}: there is no folder {str(path.parent)!r}; make it first")
+    return path
+
+
+def settings_layer(flags: Flags) -> Layer:
+    """The settings among the flags, `--section.name value`, by section and field."""
+    layer: Layer = {}
+    for flag, value in flags.items():
+        section, dot, name = flag[2:].partition(".")
+        if dot:
+            layer.setdefault(section, {})[name] = value
+    return layer
+
+
+def composed_config(flags: Flags) -> Config:
+    """The settings that a run of `--domain` with `--preset` and `--device` would have.
+
+    Raises:
+        UserError: The domain is unknown or a value is not allowed.
+    """
+    layer = settings_layer(flags)
+    layer.setdefault("env", {})["domain"] = flags.get("--domain", "walker")
+    layer.setdefault("run", {})["device"] = choice(flags, "--device", "auto", DEVICES)
+    return compose({}, layer, choice(flags, "--preset", "auto", PRESETS))
+
+
+def action_size(flags: Flags, config: Config) -> int:
+    """The size of the action: `--action-dim`, else what the environment says.
+
+    Raises:
+        UserError: The environment cannot be made.
+    """
+    if "--action-dim" in flags:
+        return whole_number(flags, "--action-dim", 1)
+    from latentplan.envs import make_env
+
+    env = make_env(config.env)
+    try:
+        return int((env.action_space.shape or (1,))[0])
+    finally:
+        env.close()
+
+
+def choose_device(flags: Flags) -> torch.device:
+    """The device that `--device` means, with `--threads` set.
+
+    Raises:
+        UserError: The device cannot be used.
+    """
+    name = choice(flags, "--device", "auto", DEVICES)
+    threads = whole_number(flags, "--threads", 1) if "--threads" in flags else None
+    import torch
+
+    if threads is not None:
+        torch.set_num_threads(threads)
+    if name == "cuda" and not torch.cuda.is_available():
+        raise UserError("device 'cuda' is not usable here; give --device cpu")
+    return torch.device(("cuda" if torch.cuda.is_available() else "cpu") if name == "auto" else name)

@@ -1,0 +1,89 @@
+"""`benchmark.py render`: what each render quality costs, and what it changes."""
+
+from __future__ import annotations
+
+import dataclasses
+import time
+from typing import TYPE_CHECKING, Any
+
+from bench.options import Flags, output_path, whole_number, words
+from bench.report import format_table, number, write_json
+from latentplan.compose import DOMAINS, compose, raise_unknown
+from latentplan.config import RENDER_QUALITIES, EnvConfig
+
+if TYPE_CHECKING:
+    import numpy as np
+
+FLAGS = {
+    "--domains": ("D,D", "domains of dm_control.suite (walker,cheetah,cartpole)"),
+    "--frames": ("N", "frames per domain and quality (30)"),
+    "--json": ("FILE", "result as JSON"),
+}
+SETTINGS = ()
+REPEATS = 3
+
+
+def run(flags: Flags) -> int:
+    """Render the same states in every quality and compare time and pictures."""
+    domains = words(flags, "--domains", "walker,cheetah,cartpole")
+    frames, json_path = whole_number(flags, "--frames", 30), output_path(flags, "--json")
+    for domain in domains:
+        if domain not in DOMAINS:
+            raise_unknown("domain", domain, DOMAINS)
+    from latentplan.envs import render_info
+
+    info = render_info()
+    print(f"pictures by {info['renderer']} (MUJOCO_GL={info['backend']}, mujoco {info['mujoco']})", flush=True)
+    measured = {
+        domain: measure_qualities(compose({}, {"env": {"domain": domain}}, "cpu").env, frames) for domain in domains
+    }
+    rows = [
+        [f"{domain}, {quality}", number(facts["frame_ms"], 2), number(facts["pixel_change"], 2)]
+        for domain, qualities in measured.items()
+        for quality, facts in qualities.items()
+    ]
+    print(format_table(["64 x 64", "ms per frame", "mean pixel change / 255"], rows))
+    write_json(json_path, {"render": info, "frames": frames, "domains": measured})
+    return 0
+
+
+def measure_qualities(config: EnvConfig, num_frames: int) -> dict[str, dict[str, Any]]:
+    """Median time per frame, and mean absolute change of a pixel (in 1/255) to `exact`, by quality.
+
+    Args:
+        config: What to look at; its own quality does not matter.
+        num_frames: States rendered, the same in every quality.
+    """
+    import numpy as np
+
+    measured, exact = {}, None
+    for quality in RENDER_QUALITIES:
+        frame_ms, frames = _render_episode(dataclasses.replace(config, render_quality=quality), num_frames)
+        exact = frames if exact is None else exact  # `exact` comes first
+        change = float(np.abs(frames.astype(np.int16) - exact.astype(np.int16)).mean())
+        measured[quality] = {"frame_ms": frame_ms, "pixel_change": change}
+    return measured
+
+
+def _render_episode(config: EnvConfig, num_frames: int) -> tuple[float, np.ndarray]:
+    """Median milliseconds per frame, and the frames of an episode of random actions that depends on the task alone."""
+    import numpy as np
+
+    from latentplan.envs import make_env
+
+    env, rng = make_env(config, seed=0), np.random.default_rng(0)
+    frames, milliseconds = [], []
+    try:
+        env.reset(seed=0)
+        for _ in range(num_frames):
+            frame, _, terminated, truncated, _ = env.step(rng.uniform(-1.0, 1.0, env.action_space.shape))
+            frames.append(frame)
+            for _ in range(REPEATS):
+                started = time.perf_counter()
+                env.render()
+                milliseconds.append(1000.0 * (time.perf_counter() - started))
+            if terminated or truncated:
+                env.reset(seed=len(frames))
+    finally:
+        env.close()
+    return float(np.median(milliseconds)), np.stack(frames)

@@ -1,0 +1,61 @@
+"""Results as compact tables, JSON and CSV."""
+
+from __future__ import annotations
+
+import csv
+import json
+import math
+import os
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+
+def format_table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    """Columns as wide as they need, the first to the left, the others to the right."""
+    widths = [max(len(line[column]) for line in (header, *rows)) for column in range(len(header))]
+    return "\n".join(_aligned(line, widths) for line in (header, ["-" * width for width in widths], *rows))
+
+
+def number(value: float | None, digits: int = 1, sign: bool = False) -> str:
+    """A number for a table; `-` where there is none."""
+    if value is None or math.isnan(value):
+        return "-"
+    return f"{value:{'+' if sign else ''},.{digits}f}"
+
+
+def interval(ends: Sequence[float | None], digits: int = 1, sign: bool = False) -> str:
+    """An interval for a table; `-` where there is none."""
+    low, high = ends
+    if low is None or high is None:
+        return "-"
+    return f"{number(low, digits, sign)} to {number(high, digits, sign)}"
+
+
+def write_json(path: Path | None, result: Mapping[str, Any]) -> None:
+    """Replace the file whole; without a path, nothing happens."""
+    if path is not None:
+        _replace(path, json.dumps(result, indent=2) + "\n")
+
+
+def write_csv(path: Path | None, rows: Sequence[Mapping[str, Any]]) -> None:
+    """Replace the file whole, its columns those of the first row; without a path, nothing happens."""
+    if path is None:
+        return
+    partial = path.with_name(f".{path.name}.{os.getpid()}")
+    with partial.open("w", newline="") as file:
+        writer = csv.DictWriter(file, list(rows[0]))
+        writer.writeheader()
+        writer.writerows(rows)
+    partial.replace(path)
+
+
+def _aligned(line: Sequence[str], widths: Sequence[int]) -> str:
+    first, *others = zip(line, widths, strict=True)
+    return "  ".join([f"{first[0]:<{first[1]}}", *(f"{text:>{width}}" for text, width in others)]).rstrip()
+
+
+def _replace(path: Path, text: str) -> None:
+    partial = path.with_name(f".{path.name}.{os.getpid()}")
+    partial.write_text(text)
+    partial.replace(path)

@@ -1,0 +1,193 @@
+"""One update of the learner, timed and counted on synthetic replay."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from statistics import median
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.utils._pytree import tree_leaves
+from torch.utils.flop_counter import FlopCounterMode
+
+from bench.machine import now
+from latentplan.config import Config
+from latentplan.models import WorldModel
+from latentplan.replay import Batch, Replay, Rows
+from latentplan.training.module import Learner
+
+NUM_ROWS = 4096
+WARM_UP_UPDATES = 2
+DISCOUNT = 0.99  # any value costs the same
+PARTS = ("sample", "encode", "recurrence", "decode", "heads", "behaviour", "optimizer", "other")
+Lap = dict[str, float]
+Parts = dict[str, Callable[[], Any]]
+
+
+class StandaloneLearner(Learner):
+    """A learner that holds its own optimizers, so that it updates without a Trainer."""
+
+    own_optimizers: list[torch.optim.Optimizer]
+
+    def optimizers(self, use_pl_optimizer: bool = True) -> Any:
+        """The optimizers, as they are."""
+        return self.own_optimizers
+
+
+class PhaseMeter:
+    """Splits an update where its optimizers step, and charges what a meter counted to each phase.
+
+    Args:
+        learner: Whose optimizers are listened to: first the world model's, then the behaviour's.
+        read: What the meter shows: seconds, or operations.
+    """
+
+    def __init__(self, learner: StandaloneLearner, read: Callable[[], float]) -> None:
+        self.read, self.last, self.lap = read, 0.0, Lap()
+        self._handles = []
+        for phase, optimizer in zip(("model", "behaviour"), learner.own_optimizers, strict=True):
+            before = optimizer.register_step_pre_hook(lambda *_, phase=phase: self.mark(phase))
+            after = optimizer.register_step_post_hook(lambda *_: self.mark("optimizer"))
+            self._handles += [before, after]
+
+    def start(self) -> None:
+        """Begin a lap."""
+        self.last, self.lap = self.read(), Lap()
+
+    def mark(self, phase: str) -> None:
+        """Charge what was counted since the last mark."""
+        shown = self.read()
+        self.lap[phase] = self.lap.get(phase, 0.0) + shown - self.last
+        self.last = shown
+
+    def skip(self) -> None:
+        """Leave out what was counted since the last mark."""
+        self.last = self.read()
+
+    def close(self) -> None:
+        """Stop listening."""
+        for handle in self._handles:
+            handle.remove()
+
+
+def measure_update(config: Config, action_dim: int, device: torch.device, updates: int) -> dict[str, Any]:
+    """What an update of the learner that `config` describes costs.
+
+    `sample`, `behaviour`, `optimizer` and `other` are timed within whole updates; `encode`, `recurrence` and
+    `decode` are run forward and backward by themselves on the same batch, and `heads` is what is left of the
+    world model's loss, its gradient clipping included.
+
+    Returns:
+        Plain values: `parts` (ms and counted operations of each), `update_ms`, `flop`, `flop_per_s`,
+        `updates_per_s`, `frames_per_s`, `parameters` and the sizes. Times are medians.
+    """
+    torch.manual_seed(0)
+    replay = synthetic_replay(config, action_dim, device)
+    model = WorldModel(config.model, action_dim).to(device)
+    learner = StandaloneLearner(model, config.learning, DISCOUNT, replay, seed=0).to(device)
+    learner.own_optimizers = learner.configure_optimizers()
+    alone = _parts_alone(model, _sample(learner, np.random.default_rng(3)))
+    laps, flop = _timed_laps(learner, alone, device, updates), _counted_lap(learner, alone)
+    parts = {name: {"ms": 1000.0 * median(lap[name] for lap in laps), "flop": int(flop.get(name, 0))} for name in PARTS}
+    seconds = median(lap["update"] for lap in laps)
+    sizes = config.learning
+    return {
+        "batch_size": sizes.batch_size,
+        "sequence_length": sizes.sequence_length,
+        "parameters": sum(parameter.numel() for parameter in model.parameters()),
+        "updates": updates,
+        "update_ms": 1000.0 * seconds,
+        "updates_per_s": 1.0 / seconds,
+        "frames_per_s": sizes.batch_size * (sizes.sequence_length + 1) / seconds,
+        "flop": int(flop["update"]),
+        "flop_per_s": flop["update"] / seconds,
+        "parts": parts,
+    }
+
+
+def synthetic_replay(config: Config, action_dim: int, device: torch.device) -> Replay:
+    """A replay of noise: random pictures, actions and rewards in episodes four sequences long."""
+    where = device if config.replay.on_device else torch.device("cpu")
+    length = config.learning.sequence_length
+    num_rows = max(NUM_ROWS, 8 * length)
+    replay = Replay(num_rows, action_dim, config.model.deter_dim, 1, where)
+    rng = np.random.default_rng(0)
+    rows = Rows(
+        frames=rng.integers(0, 256, (num_rows, 64, 64, 3), dtype=np.uint8),
+        deter=np.zeros((num_rows, config.model.deter_dim), np.float32),
+        actions=rng.uniform(-1.0, 1.0, (num_rows, action_dim)).astype(np.float32),
+        rewards=rng.uniform(0.0, 1.0, num_rows).astype(np.float32),
+        continues=np.ones(num_rows, np.float32),
+        is_first=np.arange(num_rows) % (4 * length) == 0,
+    )
+    replay.add(0, rows)
+    return replay
+
+
+def _timed_laps(learner: StandaloneLearner, alone: Parts, device: torch.device, updates: int) -> list[Lap]:
+    """Seconds of each part; what is run alone follows every update, so that a busy machine slows both alike."""
+    meter = PhaseMeter(learner, lambda: now(device))
+    rng = np.random.default_rng(1)
+    laps = [_lap(learner, alone, meter, rng) for _ in range(WARM_UP_UPDATES + updates)]
+    meter.close()
+    return laps[WARM_UP_UPDATES:]
+
+
+def _counted_lap(learner: StandaloneLearner, alone: Parts) -> Lap:
+    with FlopCounterMode(display=False) as counter:
+        meter = PhaseMeter(learner, lambda: float(counter.get_total_flops()))
+        lap = _lap(learner, alone, meter, np.random.default_rng(2))
+    meter.close()
+    return lap
+
+
+def _lap(learner: StandaloneLearner, alone: Parts, meter: PhaseMeter, rng: np.random.Generator) -> Lap:
+    meter.start()
+    batch = _sample(learner, rng)
+    meter.mark("sample")
+    learner.training_step(batch, 0)
+    meter.mark("other")
+    update = sum(meter.lap.values())
+    for name, forward in alone.items():
+        learner.model.zero_grad(set_to_none=True)
+        meter.skip()
+        _descend(forward())
+        meter.mark(name)
+    heads = meter.lap["model"] - sum(meter.lap[name] for name in alone)
+    return {**meter.lap, "heads": heads, "update": update}
+
+
+def _sample(learner: StandaloneLearner, rng: np.random.Generator) -> Batch:
+    config = learner.config
+    batch = learner.replay.sample(config.batch_size, config.sequence_length, rng)
+    return Batch(*(part.to(learner.device) for part in batch))
+
+
+def _parts_alone(model: WorldModel, batch: Batch) -> Parts:
+    """Forward passes of encoder, recurrence and decoder."""
+    frames = batch.frames.flatten(0, 1)
+    features = torch.randn(len(frames), model.config.deter_dim + model.config.latent_dim, device=frames.device)
+    noise = torch.randn(*batch.rows.shape, model.config.latent_dim, device=frames.device)
+    with torch.no_grad():
+        embeddings = model.encoder(frames).unflatten(0, tuple(batch.rows.shape)).float()
+
+    def encode() -> Tensor:
+        with model.trunk_precision():
+            return model.encoder(frames)
+
+    def recur() -> Any:
+        return model.dynamics.observe(embeddings.requires_grad_(), batch.actions, batch.deter, noise)
+
+    def decode() -> Tensor:
+        with model.trunk_precision():
+            patches = model.decoder(features.requires_grad_())
+        return model.decoder.loss(patches, frames)
+
+    return {"encode": encode, "recurrence": recur, "decode": decode}
+
+
+def _descend(outputs: Any) -> None:
+    leaves = [leaf for leaf in tree_leaves(outputs) if leaf.requires_grad]
+    torch.autograd.backward(leaves, [torch.ones_like(leaf) for leaf in leaves])

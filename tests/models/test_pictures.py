@@ -1,0 +1,54 @@
+"""Frames in and frames out: uint8 outside, numbers only inside."""
+
+import pytest
+import torch
+from einops import rearrange
+
+from latentplan.models.decoder import Decoder
+from latentplan.models.encoder import Encoder
+
+
+@pytest.mark.parametrize("channels", [(4,), (4, 8), (32, 48, 64), (4, 4, 4, 4, 4)])
+def test_frames_become_float32_embeddings(channels, frames):
+    encoder = Encoder(channels, embedding_dim=10)
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        embedding = encoder(frames)
+    assert embedding.shape == (5, 10) and embedding.dtype == torch.float32
+
+
+def test_encoding_leaves_the_frames_as_they_were(frames):
+    before = frames.clone()
+    Encoder((4, 4), 10)(frames)
+    assert torch.equal(frames, before)
+
+
+def test_every_pixel_is_read():
+    torch.manual_seed(0)
+    encoder = Encoder((8, 8), 10)
+    grey = torch.full((1, 64, 64, 3), 128, dtype=torch.uint8)
+    for row, column in ((0, 0), (0, 63), (63, 0), (63, 63), (31, 32)):
+        spotted = grey.clone()
+        spotted[0, row, column] = 255
+        assert not torch.equal(encoder(grey), encoder(spotted))
+
+
+def test_pictures_are_uint8_frames(model, state):
+    picture = model.decoder.picture(state.features)
+    assert picture.shape == (5, 64, 64, 3) and picture.dtype == torch.uint8
+
+
+def test_the_loss_of_a_picture_is_its_summed_squared_error(frames):
+    torch.manual_seed(0)
+    decoder = Decoder(7, channels=4)
+    patches = decoder(torch.randn(5, 7))
+    pixels = rearrange(patches, "rows h w (y x c) -> rows (h y) (w x) c", y=8, x=8)
+    expected = (pixels - (frames / 255.0 - 0.5)).square().sum((1, 2, 3))
+    assert torch.allclose(decoder.loss(patches, frames), expected, rtol=1e-4)
+
+
+def test_a_perfect_reconstruction_costs_nothing_and_is_the_frame(frames):
+    decoder = Decoder(7, channels=4)
+    perfect = rearrange(frames / 255.0 - 0.5, "rows (h y) (w x) c -> rows h w (y x c)", y=8, x=8)
+    decoder.forward = lambda features: perfect
+    assert decoder.loss(perfect, frames).max() < 1e-6
+    assert torch.equal(decoder.picture(torch.zeros(5, 7)), frames)

@@ -1,0 +1,91 @@
+"""The planner's view of the world model."""
+
+import pytest
+import torch
+
+from latentplan.models import State
+from latentplan.planning import CEMPlanner
+
+# One bfloat16 rounding is 0.4 %; a few of them meet along a rollout.
+LOOSE = {"rtol": 0.05, "atol": 0.05}
+
+
+@pytest.fixture
+def actions(generator):
+    return torch.rand(5, 4, 3, generator=generator) * 2 - 1
+
+
+def test_a_rollout_equals_repeated_steps(model, state, actions):
+    rewards, last = model.rollout(state, actions)
+    stepped = []
+    for action in actions.unbind(1):
+        state, reward = model.step(state, action)
+        stepped.append(reward)
+    assert rewards.shape == (5, 4)
+    assert torch.allclose(rewards, torch.stack(stepped, 1), **LOOSE)
+    assert all(torch.allclose(left, right, **LOOSE) for left, right in zip(last, state, strict=True))
+
+
+def test_rewards_arrive_with_the_state_that_the_action_leads_to(model, state, actions):
+    _, reward = model.step(state, actions[:, 0])
+    _, other = model.step(state, -actions[:, 0])
+    assert not torch.allclose(reward, other)
+    both, _ = model.rollout(state, actions[:, :2])
+    changed, _ = model.rollout(state, torch.stack([actions[:, 0], -actions[:, 1]], 1))
+    assert torch.equal(both[:, 0], changed[:, 0])
+    assert not torch.allclose(both[:, 1], changed[:, 1])
+
+
+def test_what_a_planner_reads_is_float32(model, state, actions):
+    rewards, last = model.rollout(state, actions)
+    following, reward = model.step(state, actions[:, 0])
+    scalars = [rewards, reward, model.value(state), model.continues(state), model.policy(state)]
+    assert all(output.dtype == torch.float32 for output in [*scalars, *last, *following])
+
+
+def test_rows_do_not_depend_on_their_neighbours(model, state, actions):
+    rewards, last = model.rollout(state, actions)
+    values, chosen, continues = model.value(state), model.policy(state), model.continues(state)
+    for row in range(5):
+        own = State(*(part[row : row + 1] for part in state))
+        own_rewards, own_last = model.rollout(own, actions[row : row + 1])
+        assert torch.allclose(own_rewards[0], rewards[row], **LOOSE)
+        assert torch.allclose(own_last.stoch[0], last.stoch[row], **LOOSE)
+        assert torch.allclose(model.value(own)[0], values[row], **LOOSE)
+        assert torch.allclose(model.policy(own)[0], chosen[row], **LOOSE)
+        assert torch.allclose(model.continues(own)[0], continues[row], **LOOSE)
+
+
+def test_a_policy_is_its_mode_without_a_generator_and_a_sample_with_one(model, state):
+    mode = model.policy(state)
+    assert torch.equal(mode, model.policy(state))
+    first, second = (model.policy(state, torch.Generator().manual_seed(seed)) for seed in (0, 1))
+    assert torch.equal(first, model.policy(state, torch.Generator().manual_seed(0)))
+    assert not torch.equal(first, second)
+    assert max(part.abs().max() for part in (mode, first, second)) <= 1.0
+
+
+def test_continues_are_probabilities(model, state):
+    assert ((model.continues(state) > 0.0) & (model.continues(state) < 1.0)).all()
+
+
+def test_the_belief_follows_the_frame(model, state, frames, actions):
+    believed = model.infer(state, actions[:, 0], frames)
+    surprised = model.infer(state, actions[:, 0], 255 - frames)
+    assert torch.equal(believed.deter, surprised.deter)
+    assert not torch.allclose(believed.stoch, surprised.stoch)
+    assert believed.stoch.shape == (5, 32)
+
+
+def test_inferring_is_advancing_and_then_seeing(model, state, frames, actions):
+    deter = model.dynamics.advance(state, actions[:, 0])
+    expected, believed = model.see(deter, frames), model.infer(state, actions[:, 0], frames)
+    assert all(torch.equal(left, right) for left, right in zip(expected, believed, strict=True))
+
+
+def test_the_planner_uses_all_of_it(model, state):
+    planner = CEMPlanner(
+        action_dim=3, horizon=3, num_samples=16, num_elites=4, num_policy_samples=3, use_continues=True
+    )
+    plan = planner.plan(model, state, generator=torch.Generator().manual_seed(0))
+    assert plan.action.shape == (5, 3) and plan.expected_return.isfinite().all()

@@ -1,0 +1,82 @@
+"""Settings: one source of seeds, an exact round trip, and names in every error."""
+
+import dataclasses
+import hashlib
+
+import pytest
+
+from latentplan.compose import compose
+from latentplan.config import (
+    Config,
+    EnvConfig,
+    LearningConfig,
+    ModelConfig,
+    PlannerConfig,
+    RunConfig,
+    derive_seed,
+    from_dict,
+    to_dict,
+)
+
+CHANGED = Config(
+    env=EnvConfig(domain="cartpole", task="swingup", num_envs=3),
+    model=ModelConfig(encoder_channels=(8, 16)),
+    planner=PlannerConfig(horizon=3, num_samples=9, num_elites=4, num_policy_samples=2),
+    learning=LearningConfig(discount=0.9),
+    run=RunConfig(frames=100, minutes=0.5),
+)
+
+
+@pytest.mark.parametrize("preset", ["cpu", "gpu", None])
+def test_the_latent_has_32_dimensions_in_every_preset(preset):
+    config = Config() if preset is None else compose({}, {}, preset)
+    assert config.model.latent_dim == 32
+
+
+@pytest.mark.parametrize("config", [Config(), CHANGED, compose({}, {}, "cpu"), compose({}, {}, "gpu")])
+def test_settings_survive_plain_dictionaries(config):
+    assert from_dict(to_dict(config)) == config
+
+
+def test_absent_settings_take_their_defaults():
+    assert from_dict({"planner": {"horizon": 3}}) == Config(planner=PlannerConfig(horizon=3))
+
+
+def test_unknown_settings_are_named():
+    with pytest.raises(ValueError, match="'plnner'"):
+        from_dict({"plnner": {}})
+    with pytest.raises(ValueError, match="planner.horizn"):
+        from_dict({"planner": {"horizn": 3}})
+
+
+@pytest.mark.parametrize(
+    ("kind", "name", "value"),
+    [
+        (PlannerConfig, "horizon", 0),
+        (PlannerConfig, "num_elites", 1000),
+        (PlannerConfig, "tail", "head"),
+        (LearningConfig, "discount", 1.5),
+        (LearningConfig, "model_learning_rate", float("nan")),
+        (RunConfig, "frames", -1),
+        (ModelConfig, "encoder_channels", ()),
+    ],
+)
+def test_a_bad_value_names_its_field(kind, name, value):
+    with pytest.raises(ValueError, match=name):
+        kind(**{name: value})
+
+
+def test_settings_cannot_be_written_to():
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        Config().planner.horizon = 3
+
+
+def test_a_derived_seed_is_a_digest_of_run_stream_and_counter():
+    expected = int.from_bytes(hashlib.sha256(b"3/replay/7").digest()[:4], "little") >> 1
+    assert derive_seed(3, "replay", 7) == expected
+    assert 0 <= expected < 2**31
+
+
+def test_streams_of_a_run_differ():
+    seeds = {derive_seed(seed, name, count) for seed in (0, 1) for name in ("a", "b") for count in (0, 1)}
+    assert len(seeds) == 8

@@ -1,0 +1,266 @@
+"""Replay, fed by environments whose frames tell the time: nothing is misaligned, torn or lost."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from latentplan import replay as replay_module
+from latentplan.config import UserError
+from latentplan.replay import Replay, Rows, replay_bytes
+
+CPU = torch.device("cpu")
+
+
+class Clock:
+    """Writes episodes of given lengths to one lane; everything about a row follows from its lane, episode and time.
+
+    The frame is filled with time, episode and lane; action[t] leads from t to t + 1, so it holds t + 0.5 (scaled to
+    stay within [-1, 1]), and the reward that arrives with frame t + 1 is t + 1.
+    """
+
+    def __init__(self, lane, lengths):
+        self.entries = [
+            (lane, episode, time, time == length) for episode, length in enumerate(lengths) for time in range(length + 1)
+        ]
+
+    def rows(self, start=0, stop=None):
+        entries = self.entries[start:stop]
+        frames = np.zeros((len(entries), 64, 64, 3), np.uint8)
+        for frame, (lane, episode, time, _) in zip(frames, entries, strict=True):
+            frame[:] = (time, episode, lane)
+        time = np.array([entry[2] for entry in entries], np.float32)
+        last = np.array([entry[3] for entry in entries], bool)
+        return Rows(
+            frames=frames,
+            deter=np.stack([time, time + 1000.0], -1),
+            actions=np.where(last, 0.0, (time + 0.5) / 256)[:, None].astype(np.float32),
+            rewards=np.where(last, 0.0, time + 1.0).astype(np.float32),
+            continues=np.ones(len(entries), np.float32),
+            is_first=time == 0.0,
+        )
+
+
+def make_replay(capacity=60, lanes=1):
+    return Replay(capacity, action_dim=1, deter_dim=2, num_lanes=lanes, device=CPU)
+
+
+def filled(capacity=60, lanes=1, lengths=(7, 4, 9), chunk=5):
+    replay = make_replay(capacity, lanes)
+    for lane in range(lanes):
+        clock = Clock(lane, lengths)
+        for start in range(0, len(clock.entries), chunk):
+            replay.add(lane, clock.rows(start, start + chunk))
+    return replay
+
+
+def sample(replay, batch_size=64, length=3, seed=0):
+    return replay.sample(batch_size, length, np.random.default_rng(seed))
+
+
+def told(batch):
+    """Time, episode and lane that each frame tells, (batch, time + 1) each."""
+    assert (batch.frames == batch.frames[:, :, :1, :1]).all()
+    return batch.frames[:, :, 0, 0].float().unbind(-1)
+
+
+def assert_aligned(batch):
+    time, episode, lane = told(batch)
+    assert (time.diff(dim=1) == 1.0).all()
+    assert (episode == episode[:, :1]).all() and (lane == lane[:, :1]).all()
+    assert torch.allclose(batch.actions[..., 0], (time[:, :-1] + 0.5) / 256)
+    assert torch.equal(batch.rewards, time[:, 1:])
+    assert torch.equal(batch.deter[:, 0], time[:, 0])
+
+
+RINGS = [
+    pytest.param({}, id="one lane"),
+    pytest.param({"capacity": 120, "lanes": 3}, id="three lanes"),
+    pytest.param({"capacity": 17, "lengths": (7, 4, 9, 6, 8)}, id="overwritten"),
+    pytest.param({"capacity": 40, "lanes": 3, "lengths": (7, 4, 9, 6, 8), "chunk": 11}, id="lanes overwritten"),
+    pytest.param({"capacity": 12, "lengths": (7, 4, 9), "chunk": 23}, id="more at once than fits"),
+]
+
+
+@pytest.mark.parametrize("ring", RINGS)
+@pytest.mark.parametrize("length", [1, 3, 6])
+def test_sequences_are_aligned_and_never_cross_episodes(ring, length):
+    batch = sample(filled(**ring), length=length)
+    assert batch.frames.shape == (64, length + 1, 64, 64, 3) and batch.frames.dtype == torch.uint8
+    assert batch.deter.shape == (64, 2) and batch.deter.dtype == torch.float32
+    assert_aligned(batch)
+
+
+@pytest.mark.parametrize("ring", RINGS)
+def test_every_sequence_that_is_held_is_drawn(ring):
+    replay, length = filled(**ring), 3
+    drawn = {tuple(start) for start in torch.stack(told(sample(replay, 1000, length)), -1)[:, 0].tolist()}
+    rows = replay.frames[:, 0, 0].float()
+    held = {tuple(row) for row in rows.tolist()} if len(replay) == len(rows) else None
+    lanes, lengths = ring.get("lanes", 1), ring.get("lengths", (7, 4, 9))
+    for lane in range(lanes):
+        for episode, decisions in enumerate(lengths):
+            for start in range(decisions - length + 1):
+                first = (start, episode, lane)
+                is_held = held is None or {(start + ahead, episode, lane) for ahead in range(length + 1)} <= held
+                assert (first in drawn) == is_held, first
+
+
+def test_an_interrupted_episode_ends_where_the_next_begins():
+    replay, clock = make_replay(), Clock(0, (9,))
+    replay.add(0, clock.rows(0, 4))  # the run stopped here; a resumed one begins a new episode
+    replay.add(0, clock.rows(0, 6))
+    for seed in range(5):
+        assert_aligned(sample(replay, seed=seed))
+
+
+def test_each_frame_is_stored_once():
+    replay = filled(lengths=(7, 4, 9))
+    assert len(replay) == 8 + 5 + 10
+    stored = {tuple(frame) for frame in replay.frames[: len(replay), 0, 0].tolist()}
+    assert len(stored) == len(replay)
+    assert replay.frames.numel() == 60 * 64 * 64 * 3
+
+
+def test_a_ring_keeps_the_newest_rows():
+    replay = filled(capacity=12, lengths=(7, 4, 9))
+    newest = [entry[2::-1] for entry in Clock(0, (7, 4, 9)).entries[-12:]]
+    assert sorted(map(tuple, replay.frames[:, 0, 0].tolist())) == sorted(newest)
+    assert len(replay) == 12
+
+
+def test_batches_follow_from_the_random_stream():
+    replay = filled()
+    first, again, other = (sample(replay, seed=seed) for seed in (0, 0, 1))
+    assert all(torch.equal(left, right) for left, right in zip(first, again, strict=True))
+    assert not torch.equal(first.rows, other.rows)
+
+
+def test_refreshed_beliefs_go_back_to_where_the_batch_came_from():
+    replay = filled(capacity=40, lanes=2, lengths=(7, 4, 9, 6))
+    batch = sample(replay)
+    time, episode, lane = told(batch)
+    replay.refresh(batch.rows, torch.stack([time * 2.0, episode + 100.0 * lane], -1))
+    again = sample(replay, seed=1)
+    time, episode, lane = (part[:, 0] for part in told(again))
+    refreshed = torch.isin(again.rows[:, 0], batch.rows)
+    assert refreshed.any()
+    expected = torch.stack([time * 2.0, episode + 100.0 * lane], -1)
+    untouched = torch.stack([time, time + 1000.0], -1)
+    assert torch.equal(again.deter, torch.where(refreshed[:, None], expected, untouched))
+
+
+def test_where_a_row_is_refreshed_twice_the_last_counts():
+    replay = filled()
+    deter = torch.arange(12.0).reshape(2, 3, 2)
+    replay.refresh(torch.tensor([[4, 5, 4], [6, 4, 5]]), deter)
+    assert replay.deter[4:7].tolist() == [[8.0, 9.0], [10.0, 11.0], [6.0, 7.0]]
+
+
+def assert_same(left, right):
+    assert len(left) == len(right)
+    for seed in range(3):
+        pairs = zip(sample(left, seed=seed), sample(right, seed=seed), strict=True)
+        assert all(torch.equal(first, second) for first, second in pairs)
+
+
+@pytest.mark.parametrize("ring", RINGS)
+def test_a_saved_replay_is_the_same_when_loaded(ring, tmp_path):
+    replay = filled(**ring)
+    replay.save(tmp_path)
+    loaded = make_replay(ring.get("capacity", 60), ring.get("lanes", 1))
+    loaded.load(tmp_path)
+    assert_same(replay, loaded)
+
+
+@pytest.mark.parametrize("capacity", [60, 12])
+def test_saving_now_and_then_equals_saving_once(capacity, tmp_path):
+    replay, clock = make_replay(capacity), Clock(0, (7, 4, 9))
+    for start in range(0, len(clock.entries), 4):
+        replay.add(0, clock.rows(start, start + 4))
+        replay.save(tmp_path)
+        if start == 8:  # go on from disk halfway
+            replay = make_replay(capacity)
+            replay.load(tmp_path)
+    loaded = make_replay(capacity)
+    loaded.load(tmp_path)
+    assert_same(replay, loaded)
+    assert_same(filled(capacity=capacity), loaded)
+
+
+def test_saving_again_writes_new_frames_only(tmp_path):
+    replay, clock = make_replay(), Clock(0, (7, 4, 9))
+    replay.add(0, clock.rows(0, 8))
+    replay.save(tmp_path)
+    (tmp_path / "frames_0.u8").write_bytes(bytes(8 * 64 * 64 * 3))
+    replay.add(0, clock.rows(8, 13))
+    replay.save(tmp_path)
+    stored = np.fromfile(tmp_path / "frames_0.u8", np.uint8).reshape(-1, 64, 64, 3)
+    assert len(stored) == 13
+    assert (stored[:8] == 0).all() and (stored[8:, 0, 0, 1] == 1).all()
+
+
+@pytest.mark.parametrize(("before", "after"), [(60, 100), (12, 60), (60, 14), (12, 8)])
+def test_a_replay_can_be_loaded_into_another_capacity(before, after, tmp_path):
+    replay = filled(capacity=before)
+    replay.save(tmp_path)
+    loaded = make_replay(after)
+    loaded.load(tmp_path)
+    assert len(loaded) == min(len(replay), after)
+    assert_aligned(sample(loaded))
+    newest = [entry[2::-1] for entry in Clock(0, (7, 4, 9)).entries[-len(loaded) :]]
+    held = loaded.frames[torch.from_numpy(loaded.episode[0] >= 0)]
+    assert sorted(map(tuple, held[:, 0, 0].tolist())) == sorted(newest)
+    loaded.add(0, Clock(0, (5,)).rows())
+    loaded.save(tmp_path)
+    again = make_replay(after)
+    again.load(tmp_path)
+    assert_same(loaded, again)
+
+
+def test_what_is_no_replay_of_this_run_is_refused(tmp_path):
+    with pytest.raises(UserError, match="no replay found"):
+        make_replay().load(tmp_path)
+    filled().save(tmp_path)
+    for other in (make_replay(lanes=2), Replay(60, 2, 2, 1, CPU), Replay(60, 1, 3, 1, CPU)):
+        with pytest.raises(UserError, match="this run"):
+            other.load(tmp_path)
+
+
+def test_missing_frames_are_noticed(tmp_path):
+    filled().save(tmp_path)
+    with (tmp_path / "frames_0.u8").open("r+b") as file:
+        file.truncate(10 * 64 * 64 * 3)
+    with pytest.raises(UserError, match="must hold 23 frames"):
+        make_replay().load(tmp_path)
+
+
+@pytest.mark.parametrize("lengths", [(), (2,), (4, 4, 4)])
+def test_too_short_episodes_are_named(lengths):
+    replay = filled(lengths=lengths)
+    with pytest.raises(UserError, match=r"sequence_length \(5\)"):
+        sample(replay, length=5)
+
+
+def test_an_episode_of_the_sequence_length_is_long_enough():
+    assert_aligned(sample(filled(lengths=(2, 5, 3)), length=5))
+
+
+def test_a_replay_beyond_the_free_memory_is_refused(monkeypatch):
+    monkeypatch.setattr(replay_module, "_free_memory", lambda: replay_bytes(100, 1, 2))
+    make_replay(capacity=90)
+    with pytest.raises(UserError, match=r"lower --replay\.capacity"):
+        make_replay(capacity=91)
+
+
+def test_the_memory_a_replay_takes_is_what_its_arrays_hold():
+    replay = make_replay(capacity=10, lanes=3)
+    arrays = [replay.frames, replay.deter, replay.actions, replay.rewards, replay.continues]
+    held = sum(array.numel() * array.element_size() for array in arrays) + replay.episode.nbytes
+    assert held == replay.num_bytes
+
+
+def test_free_memory_is_known_or_unlimited_without_proc(monkeypatch):
+    monkeypatch.setattr(replay_module, "MEMORY_FACTS", Path("/nowhere"))
+    assert replay_module._free_memory() > 2**28

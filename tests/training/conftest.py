@@ -1,0 +1,70 @@
+"""A world small enough to learn from within seconds: a dot to be kept in the middle of a picture."""
+
+from dataclasses import replace
+
+import gymnasium
+import numpy as np
+import pytest
+
+from latentplan.config import (
+    CollectionConfig,
+    Config,
+    EnvConfig,
+    EvaluationConfig,
+    LearningConfig,
+    ModelConfig,
+    PlannerConfig,
+    RunConfig,
+)
+
+TINY = Config(
+    env=EnvConfig(action_repeat=1),
+    model=ModelConfig(deter_dim=16, hidden_dim=16, encoder_channels=(4, 4), decoder_channels=2, num_bins=15),
+    planner=PlannerConfig(
+        horizon=2, num_samples=8, num_elites=2, num_iterations=1, warm_start_iterations=1, num_policy_samples=2
+    ),
+    learning=LearningConfig(batch_size=4, sequence_length=5, imagination_horizon=3, imagination_starts=8),
+    collection=CollectionConfig(prefill_decisions=45, round_decisions=15, updates_per_decision=0.4, overlap=False),
+    evaluation=EvaluationConfig(every_frames=40, episodes=1, final_episodes=2, video=False),
+    run=RunConfig(frames=90, device="cpu", threads=1),
+)
+
+
+class Dot(gymnasium.Env):
+    """A dot in a picture of 16 x 16, pushed sideways by the action; the reward is how near the middle it is."""
+
+    observation_space = gymnasium.spaces.Box(0, 255, (16, 16, 3), np.uint8)
+    action_space = gymnasium.spaces.Box(-1.0, 1.0, (1,), np.float32)
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.place, self.steps = self.np_random.uniform(-1.0, 1.0), 0
+        return self.picture(), {}
+
+    def step(self, action):
+        self.place = float(np.clip(self.place + 0.2 * action[0], -1.0, 1.0))
+        self.steps += 1
+        return self.picture(), 1.0 - abs(self.place), False, self.steps == 20, {}
+
+    def picture(self):
+        picture = np.zeros((16, 16, 3), np.uint8)
+        picture[:, round(7.5 + 7.0 * self.place)] = 255
+        return picture
+
+
+@pytest.fixture(scope="session")
+def dot():
+    """The environment, to be made or to be made worse."""
+    return Dot
+
+
+@pytest.fixture(scope="session")
+def tiny():
+    """The settings of a run in a folder: sections take replacements, as in `tiny(folder, run={"seed": 1})`."""
+
+    def make(folder, **changes):
+        sections = {name: replace(getattr(TINY, name), **fields) for name, fields in changes.items()}
+        config = replace(TINY, **sections)
+        return replace(config, run=replace(config.run, run_dir=str(folder)))
+
+    return make

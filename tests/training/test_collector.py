@@ -1,0 +1,101 @@
+"""Collection: what replay is handed is what the environment did."""
+
+import numpy as np
+import pytest
+import torch
+
+from latentplan.models import WorldModel
+from latentplan.training.collector import Collector
+
+
+def weights_of(config, seed=0):
+    torch.manual_seed(seed)
+    model = WorldModel(config.model, action_dim=1)
+    return {name: value.numpy() for name, value in model.state_dict().items()}
+
+
+@pytest.fixture
+def make_collector(tiny, dot):
+    collectors = []
+
+    def make(env=dot, **changes):
+        collectors.append(Collector(tiny("", **changes), env, "cpu"))
+        return collectors[-1]
+
+    yield make
+    for collector in collectors:
+        collector.close()
+
+
+def place_of(frames):
+    """Where the dot is, in [-1, 1], from frames (n, 64, 64, 3) of a picture of 16 columns."""
+    columns = frames[:, 0, :, 0].astype(float)
+    return ((columns * np.arange(64)).sum(1) / columns.sum(1) / 4.0 - 0.375 - 7.5) / 7.0
+
+
+def test_rows_follow_the_dynamics_of_the_environment(make_collector):
+    collected = make_collector().collect(None, "random", 45, 0)
+    (rows,) = collected.rows
+    assert len(rows.frames) == 47  # every frame once, and the last one of two episodes without an action
+    assert (collected.decisions, collected.env_frames, len(collected.episode_returns)) == (45, 45, 2)
+    assert np.flatnonzero(rows.is_first).tolist() == [0, 21, 42]
+    place = place_of(rows.frames)
+    goes_on = ~rows.is_first[1:]
+    expected = np.clip(place[:-1] + 0.2 * rows.actions[:-1, 0], -1.0, 1.0)
+    half_a_column = 1.0 / 7.0
+    assert np.abs(place[1:] - expected)[goes_on].max() <= half_a_column
+    assert np.abs(1.0 - np.abs(place[1:]) - rows.rewards[:-1])[goes_on].max() <= half_a_column
+    assert (rows.actions[[20, 41]] == 0.0).all() and (rows.rewards[[20, 41]] == 0.0).all()
+    assert collected.episode_returns == pytest.approx([rows.rewards[:20].sum(), rows.rewards[21:41].sum()], rel=1e-5)
+
+
+def test_rounds_continue_the_episode(make_collector):
+    whole, parts = make_collector(), make_collector()
+    (expected,) = whole.collect(None, "random", 30, 0).rows
+    first, second = (parts.collect(None, "random", 15, counter).rows[0] for counter in (0, 1))
+    joined = np.concatenate([first.is_first, second.is_first])
+    assert np.array_equal(joined, expected.is_first)
+    place = place_of(np.concatenate([first.frames[-1:], second.frames[:1]]))
+    assert place[1] == pytest.approx(np.clip(place[0] + 0.2 * first.actions[-1, 0], -1, 1), abs=1.0 / 7.0)
+
+
+def test_an_end_of_the_task_is_told_from_the_time_limit(make_collector, dot):
+    class Ending(dot):
+        def step(self, action):
+            picture, reward, _, truncated, info = super().step(action)
+            return picture, reward, self.steps == 4, truncated, info
+
+    (ending,) = make_collector(Ending).collect(None, "random", 8, 0).rows
+    assert ending.continues.tolist() == [1, 1, 1, 0, 1, 1, 1, 1, 0, 1]
+    (limited,) = make_collector().collect(None, "random", 45, 0).rows
+    assert (limited.continues == 1.0).all()
+
+
+def test_beliefs_are_stored_beside_their_frames(make_collector, tiny):
+    collector = make_collector()
+    (rows,) = collector.collect(weights_of(tiny("")), "actor", 25, 0).rows
+    assert rows.deter.shape == (26, 16)
+    assert (rows.deter[[0, 21]] == 0.0).all()
+    assert (np.abs(rows.deter[1:20]).sum(1) > 0.0).all()
+
+
+@pytest.mark.parametrize("behaviour", ["planner", "actor"])
+def test_collection_follows_from_seed_round_and_weights(make_collector, tiny, behaviour):
+    weights = weights_of(tiny(""))
+    one, same, other = (make_collector().collect(weights, behaviour, 12, counter).rows[0] for counter in (3, 3, 4))
+    assert np.array_equal(one.actions, same.actions) and np.array_equal(one.frames, same.frames)
+    assert not np.array_equal(one.actions, other.actions)
+    assert np.abs(one.actions).max() <= 1.0
+
+
+def test_judging_neither_explores_nor_disturbs_the_collection(make_collector, tiny):
+    weights = weights_of(tiny(""))
+    judged, plain = make_collector(), make_collector()
+    for collector in (judged, plain):
+        collector.collect(weights, "planner", 7, 0)
+    first, again = judged.evaluate(2), judged.evaluate(2)
+    assert first == again and first.keys() == {"planner", "actor"}
+    assert all(len(returns) == 2 for returns in first.values())
+    following = [collector.collect(weights, "planner", 7, 1).rows[0] for collector in (judged, plain)]
+    assert np.array_equal(following[0].actions, following[1].actions)
+    assert np.array_equal(following[0].frames, following[1].frames)

@@ -1,0 +1,166 @@
+"""What is learned, and what must not be learned from it."""
+
+import numpy as np
+import pytest
+import torch
+
+from latentplan.models import State, WorldModel
+from latentplan.replay import Batch, Replay
+from latentplan.training.losses import imagine, lambda_return, world_model_loss
+from latentplan.training.module import Learner
+
+
+@pytest.fixture
+def model(tiny):
+    torch.manual_seed(0)
+    model = WorldModel(tiny("").model, action_dim=1)
+    with torch.no_grad():
+        for head in (model.reward_head, model.value_head):
+            head.mlp.output.weight.normal_(std=0.3)
+        model.continue_head.output.weight.normal_(std=0.3)
+    return model
+
+
+@pytest.fixture
+def batch():
+    rng = np.random.default_rng(0)
+    return Batch(
+        frames=torch.as_tensor(rng.integers(0, 256, (4, 6, 64, 64, 3), dtype=np.uint8)),
+        deter=torch.zeros(4, 16),
+        actions=torch.as_tensor(rng.uniform(-1, 1, (4, 5, 1)).astype(np.float32)),
+        rewards=torch.as_tensor(rng.uniform(-1, 1, (4, 5)).astype(np.float32)),
+        continues=torch.ones(4, 5),
+        rows=torch.arange(24).reshape(4, 6),
+    )
+
+
+@pytest.fixture
+def learner(model, tiny):
+    replay = Replay(24, 1, 16, 1, torch.device("cpu"))
+    return Learner(model, tiny("").learning, 0.9, replay, seed=0)
+
+
+def stream():
+    return torch.Generator().manual_seed(0)
+
+
+def returns_by_hand(rewards, discounts, values, lambda_):
+    """G_t = r_t + d_t ((1 - lambda) v_t+1 + lambda G_t+1), from the last value on."""
+
+    def from_step(time):
+        following = values[-1] if time == len(rewards) - 1 else from_step(time + 1)
+        return rewards[time] + discounts[time] * ((1 - lambda_) * values[time] + lambda_ * following)
+
+    return torch.stack([from_step(time) for time in range(len(rewards))])
+
+
+@pytest.fixture
+def path():
+    rewards, discounts, values = torch.rand(3, 6, 4, generator=stream(), dtype=torch.float64)
+    return rewards, discounts, values * 10.0
+
+
+@pytest.mark.parametrize("lambda_", [0.0, 0.5, 0.95, 1.0])
+def test_lambda_returns_obey_their_recursion(path, lambda_):
+    assert torch.allclose(lambda_return(*path, lambda_), returns_by_hand(*path, lambda_))
+
+
+def test_lambda_zero_looks_one_step_ahead(path):
+    rewards, discounts, values = path
+    assert torch.allclose(lambda_return(*path, 0.0), rewards + discounts * values)
+
+
+def test_lambda_one_is_the_whole_return(path):
+    rewards, discounts, values = path
+    reach = torch.cat([torch.ones(1, 4), discounts]).cumprod(0)
+    whole = (reach[:-1] * rewards).sum(0) + reach[-1] * values[-1]
+    assert torch.allclose(lambda_return(*path, 1.0)[0], whole)
+
+
+def test_nothing_counts_beyond_an_end(path):
+    rewards, discounts, values = path
+    discounts[2] = 0.0
+    before = lambda_return(rewards, discounts, values, 0.9)
+    rewards[3:], values[2:] = 100.0, 100.0
+    assert torch.equal(lambda_return(rewards, discounts, values, 0.9)[:3], before[:3])
+
+
+def test_the_model_loss_is_the_weighted_sum_of_its_parts(model, batch, tiny):
+    config = tiny("", learning={"reconstruction_scale": 2.0, "reward_scale": 3.0, "representation_scale": 0.5}).learning
+    loss, states, parts = world_model_loss(model, batch, config, stream())
+    scales = {"reconstruction": 2.0, "reward": 3.0, "continue": 1.0, "dynamics": 1.0, "representation": 0.5}
+    assert parts.keys() == scales.keys()
+    assert loss.item() == pytest.approx(sum(scale * parts[name].item() for name, scale in scales.items()), rel=1e-5)
+    assert states.deter.shape == (4, 6, 16) and states.stoch.shape == (4, 6, 32)
+    assert not any(part.requires_grad for part in states)
+
+
+def test_less_divergence_than_the_free_nats_teaches_nothing(model, batch, tiny):
+    config = tiny("", learning={"free_nats": 1e6}).learning
+    _, _, parts = world_model_loss(model, batch, config, stream())
+    assert parts["dynamics"] == parts["representation"] == 1e6
+
+
+def test_both_divergences_are_one_number_with_two_gradients(model, batch, tiny):
+    _, _, parts = world_model_loss(model, batch, tiny("", learning={"free_nats": 0.0}).learning, stream())
+    assert parts["dynamics"] == pytest.approx(parts["representation"].item(), rel=1e-6)
+    assert parts["dynamics"] > 0.0
+
+
+def names_with_gradient(model):
+    return {
+        name.split(".")[0]
+        for name, parameter in model.named_parameters()
+        if parameter.grad is not None and parameter.grad.abs().sum() > 0.0
+    }
+
+
+def test_the_model_loss_leaves_actor_and_value_alone(model, batch, tiny):
+    loss, _, _ = world_model_loss(model, batch, tiny("").learning, stream())
+    loss.backward()
+    expected = {"encoder", "dynamics", "decoder", "reward_head", "continue_head"}
+    assert names_with_gradient(model) == expected
+
+
+def test_the_behaviour_loss_leaves_the_world_model_alone(learner, batch):
+    _, states, _ = world_model_loss(learner.model, batch, learner.config, stream())
+    loss, _ = learner._behaviour_loss(states, batch, stream())
+    loss.backward()
+    assert names_with_gradient(learner.model) == {"actor", "value_head"}
+    assert all(parameter.grad is None for parameter in learner.target_value.parameters())
+    assert all(parameter.requires_grad for parameter in learner.model.parameters())
+
+
+def test_the_actor_learns_through_the_dynamics(model):
+    state = State(torch.zeros(3, 16), torch.zeros(3, 32))
+    dream = imagine(model, state, 4, stream())
+    assert dream.features.shape == (5, 3, 48)
+    assert dream.rewards.shape == dream.continues.shape == dream.entropies.shape == (4, 3)
+    dream.rewards.sum().backward()
+    assert "actor" in names_with_gradient(model)
+
+
+def test_imagined_rewards_belong_to_the_states_they_arrive_with(model):
+    dream = imagine(model, State(torch.zeros(3, 16), torch.zeros(3, 32)), 4, stream())
+    for time in range(4):
+        expected = model.reward_head.mean(model.reward_head(dream.features[time + 1]))
+        assert torch.allclose(dream.rewards[time], expected, rtol=1e-4, atol=1e-3)
+
+
+def test_the_entropy_is_that_of_a_gaussian(model):
+    dream = imagine(model, State(torch.zeros(3, 16), torch.zeros(3, 32)), 1, stream())
+    expected = torch.distributions.Normal(*model.actor(dream.features[0])).entropy().sum(-1)
+    assert torch.allclose(dream.entropies[0], expected, atol=1e-5)
+
+
+def test_the_scale_of_returns_is_at_least_one_and_follows_their_spread(learner):
+    assert learner._return_scale(torch.zeros(100)) == 1.0
+    assert learner._return_scale(torch.linspace(0.0, 100.0, 101)).item() == pytest.approx(90.0)
+    learner.updates = 1
+    assert learner._return_scale(torch.linspace(0.0, 200.0, 101)).item() == pytest.approx(0.99 * 90 + 0.01 * 180)
+
+
+def test_every_parameter_has_one_optimizer(learner):
+    groups = [group["params"] for optimizer in learner.configure_optimizers() for group in optimizer.param_groups]
+    owned = [id(parameter) for group in groups for parameter in group]
+    assert sorted(owned) == sorted(id(parameter) for parameter in learner.model.parameters())
