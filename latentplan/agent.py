@@ -43,7 +43,8 @@ class ModelAgent:
         if mask is None or self.state is None:
             self.state = self._action = self._forget = None
         else:
-            self._forget = torch.as_tensor(mask, device=self.model.device)
+            forget = torch.tensor(mask, dtype=torch.bool, device=self.model.device)
+            self._forget = forget if self._forget is None else self._forget | forget
 
     @torch.no_grad()
     def act(self, frame: np.ndarray) -> np.ndarray:

@@ -55,6 +55,7 @@ def test_unknown_settings_are_named():
         (PlannerConfig, "horizon", 0),
         (PlannerConfig, "num_elites", 1000),
         (PlannerConfig, "tail", "head"),
+        (PlannerConfig, "smoothing", 0.0),
         (LearningConfig, "discount", 1.5),
         (LearningConfig, "model_learning_rate", float("nan")),
         (RunConfig, "frames", -1),

@@ -22,7 +22,9 @@ class Clock:
 
     def __init__(self, lane, lengths):
         self.entries = [
-            (lane, episode, time, time == length) for episode, length in enumerate(lengths) for time in range(length + 1)
+            (lane, episode, time, time == length)
+            for episode, length in enumerate(lengths)
+            for time in range(length + 1)
         ]
 
     def rows(self, start=0, stop=None):

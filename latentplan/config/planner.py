@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from latentplan.config.checks import at_least, one_of, within
+from latentplan.config.checks import above_zero, at_least, one_of, within
 
 
 @dataclass(frozen=True)
@@ -54,6 +54,7 @@ class PlannerConfig:
     def __post_init__(self) -> None:
         at_least(self, horizon=1, num_samples=2, num_elites=1, num_iterations=1, warm_start_iterations=1)
         at_least(self, num_policy_samples=0, init_std=0.0, min_std=0.0, noise_beta=0.0)
+        above_zero(self, "smoothing")
         within(self, smoothing=(0.0, 1.0), keep_elite_fraction=(0.0, 1.0))
         one_of(self, start=("shifted", "policy", "both"), tail=("zero", "hold", "policy"))
         one_of(self, warm_start_variance=("reset", "keep", "inflate"), final=("mean", "best"))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import csv
 import signal
+import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -17,7 +18,7 @@ from latentplan.config import Config
 from latentplan.models import WorldModel
 from latentplan.replay import Replay
 from latentplan.training.collector import Collected
-from latentplan.training.state import RunState, save_state
+from latentplan.training.state import INTERRUPTED, RunState, save_state
 from latentplan.training.worker import Worker
 
 if TYPE_CHECKING:
@@ -49,8 +50,8 @@ class Experience(lightning.Callback):
     def on_train_epoch_start(self, trainer: lightning.Trainer, learner: Learner) -> None:  # type: ignore[override]
         """Take what was asked for an epoch ago, and ask for what comes next."""
         settings, state = self.config.collection, self.state
-        while state.decisions < settings.prefill_decisions:
-            self.worker.submit("collect", None, "random", settings.prefill_decisions - state.decisions, state.rounds)
+        while (missing := min(settings.prefill_decisions - state.decisions, self._decisions_left())) > 0:
+            self.worker.submit("collect", None, "random", missing, state.rounds)
             self._take_round()
         self.take()
         weights = {name: value.detach().cpu().numpy().copy() for name, value in learner.model.state_dict().items()}
@@ -73,12 +74,15 @@ class Experience(lightning.Callback):
             returns = self.worker.result()
             entry = self._asked_evaluation | {mode: float(np.mean(values)) for mode, values in returns.items()}
             self.state.evaluations.append(entry)
+            # Only now: an evaluation that an interruption cuts off is due again.
+            every = self.config.evaluation.every_frames
+            self.state.next_evaluation = (entry["env_frames"] // every + 1) * every
             self._asked_evaluation = None
 
     def _decisions_left(self) -> int:
         frames = self.config.run.frames
         if frames is None:
-            return self.config.collection.round_decisions
+            return sys.maxsize
         return -(-(frames - self.state.env_frames) // self.config.env.action_repeat)
 
     def _ask_evaluation(self, updates: int) -> None:
@@ -87,7 +91,6 @@ class Experience(lightning.Callback):
         self._asked_evaluation["minutes"] = round(state.minutes, 3)
         film = self.videos / f"{state.env_frames:09d}.webm" if settings.video else None
         self.worker.submit("evaluate", settings.episodes, film)
-        state.next_evaluation = (state.env_frames // settings.every_frames + 1) * settings.every_frames
 
     def _take_round(self) -> None:
         collected: Collected = self.worker.result()
@@ -105,6 +108,17 @@ class Record(lightning.Callback):
     def __init__(self, path: Path, state: RunState, experience: Experience, progress: Progress) -> None:
         self.path, self.state, self.experience, self.progress = path, state, experience, progress
         self._shown_evaluations = len(state.evaluations)
+
+    def on_fit_start(self, trainer: lightning.Trainer, learner: Learner) -> None:  # type: ignore[override]
+        """Drop the rows that a killed run wrote after its last save: they are about to be written again."""
+        if not self.path.exists():
+            return
+        with self.path.open(newline="") as file:
+            rows = [row for row in csv.DictReader(file) if None not in row.values()]
+        with self.path.open("w", newline="") as file:
+            writer = csv.DictWriter(file, COLUMNS)
+            writer.writeheader()
+            writer.writerows(row for row in rows if int(row["updates"]) <= learner.updates)
 
     def on_train_batch_end(self, trainer: lightning.Trainer, learner: Learner, *_: Any) -> None:  # type: ignore[override]
         """Move the progress display on."""
@@ -216,5 +230,5 @@ class Stop(lightning.Callback):
 
     def _interrupt(self, number: int, frame: Any) -> None:
         if self.state.interrupted:
-            raise KeyboardInterrupt
+            raise SystemExit(INTERRUPTED)  # Lightning would turn a KeyboardInterrupt into exit code 1
         self.state.interrupted = True

@@ -14,7 +14,7 @@ import numpy as np
 import torch
 
 from latentplan.agent import ActorAgent, ModelAgent, PlanningAgent, RandomAgent
-from latentplan.config import Config, derive_seed
+from latentplan.config import Config, UserError, derive_seed
 from latentplan.envs import make_env, make_from, make_vector_env, render_info
 from latentplan.models import WorldModel
 from latentplan.replay import Rows
@@ -180,6 +180,8 @@ class Collector:
         state = agent.state if isinstance(agent, ModelAgent) else None
         deter = None if state is None else state.deter.float().cpu().numpy()
         self._frames, rewards, terminated, truncated, info = self.envs.step(actions)
+        if not np.isfinite(rewards).all():
+            raise UserError(f"the environment gave rewards that are not finite: {rewards.tolist()}")
         self._ended = terminated | truncated
         self._returns += rewards
         log.append(frames, deter, actions, rewards, ~terminated, first, np.asarray(info["env_frames"]))

@@ -25,14 +25,13 @@ from latentplan.training.collector import Description, EnvFactory
 from latentplan.training.data import ReplayBatches, ReplayData
 from latentplan.training.module import Learner
 from latentplan.training.progress import Progress
-from latentplan.training.state import RunState, load_state
+from latentplan.training.state import INTERRUPTED, RunState, load_state
 from latentplan.training.worker import LocalWorker, RemoteWorker, Worker
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
 UNKNOWN_LENGTH_CAPACITY = 500_000
-INTERRUPTED = 130
 
 
 @dataclass(frozen=True)

@@ -13,6 +13,7 @@ from latentplan.config import UserError
 from latentplan.replay import Replay
 
 STATE_FILE = "state.pt"
+INTERRUPTED = 130  # exit code of a run that the user ended
 
 
 @dataclass

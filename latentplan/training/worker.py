@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import multiprocessing
 import os
+import sys
 import traceback
 from collections import deque
 from collections.abc import Iterator
@@ -18,6 +19,7 @@ from gymnasium.vector.utils import CloudpickleWrapper
 from latentplan.config import Config, UserError
 from latentplan.training.collector import Collector, EnvFactory
 
+CLOSING_SECONDS = 5.0
 THREAD_SETTINGS = ("OMP_NUM_THREADS", "LP_NUM_THREADS")
 
 
@@ -83,7 +85,10 @@ class RemoteWorker:
         """End the process, whatever it is doing."""
         if self._process.is_alive():
             self._process.terminate()
-        self._process.join()
+        self._process.join(CLOSING_SECONDS)
+        if self._process.is_alive():
+            self._process.kill()
+            self._process.join()
         self._caller.shutdown(cancel_futures=True)
         self._connection.close()
 
@@ -99,6 +104,7 @@ Worker = LocalWorker | RemoteWorker
 def _serve(connection: Connection, factory: EnvFactory | None, config: Config) -> None:
     import signal
 
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit())  # as an exit, so that the environments' processes end too
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches the whole group; the learner decides what follows
     torch.set_num_threads(1)
     collector: Collector | None = None

@@ -20,6 +20,11 @@ def rows_of(folder):
         return list(csv.DictReader(file))
 
 
+def epochs_of(folder):
+    """The rows of epochs, without those of evaluations."""
+    return [row for row in rows_of(folder) if row["reconstruction"]]
+
+
 def without_minutes(folder):
     return [{name: value for name, value in row.items() if name != "minutes"} for row in rows_of(folder)]
 
@@ -58,22 +63,26 @@ def test_every_update_was_made(finished):
     # Prefill 45, then rounds of 15 decisions, 6 updates after asking for each, and 6 with the last one in replay.
     updates = saved_state(finished.run_dir)["learner"]["updates"]
     assert updates == 6 * 4
-    assert [int(row["updates"]) for row in rows_of(finished.run_dir)] == [6, 12, 18, 24]
+    assert [int(row["updates"]) for row in epochs_of(finished.run_dir)] == [6, 12, 18, 24]
 
 
 def test_metrics_have_the_promised_columns(finished):
-    rows = rows_of(finished.run_dir)
+    rows, epochs = rows_of(finished.run_dir), epochs_of(finished.run_dir)
     assert tuple(rows[0]) == COLUMNS
-    clocks = [[float(row[name]) for row in rows] for name in ("env_frames", "decisions", "updates", "minutes")]
+    clocks = [[float(row[name]) for row in epochs] for name in ("env_frames", "decisions", "updates", "minutes")]
     assert all(np.all(np.diff(clock) >= 0) for clock in clocks)
     losses = COLUMNS[COLUMNS.index("reconstruction") :]
-    assert all(np.isfinite(float(row[name])) for row in rows for name in losses)
-    assert any(row["episode_return"] for row in rows)
-    judged = [row for row in rows if row["planner_return"]]
-    assert judged
-    for row in judged:
-        difference = float(row["planner_return"]) - float(row["actor_return"])
-        assert float(row["planner_minus_actor"]) == pytest.approx(difference)
+    assert all(np.isfinite(float(row[name])) for row in epochs for name in losses)
+    assert any(row["episode_return"] for row in epochs)
+
+
+def test_evaluations_have_rows_with_the_clocks_of_what_was_judged(finished):
+    judged = [row for row in rows_of(finished.run_dir) if row["planner_return"]]
+    evaluations = saved_state(finished.run_dir)["run"]["evaluations"]
+    assert len(judged) == len(evaluations) > 0
+    for row, entry in zip(judged, evaluations, strict=True):
+        assert (int(row["env_frames"]), int(row["updates"])) == (entry["env_frames"], entry["updates"])
+        assert float(row["planner_minus_actor"]) == pytest.approx(entry["planner"] - entry["actor"])
 
 
 def test_a_finished_run_holds_an_agent_that_acts(finished):
@@ -147,7 +156,7 @@ def test_an_interrupted_run_is_saved_and_goes_on_where_it_was(tiny, dot, tmp_pat
     after = saved_state(stopped.run_dir)
     assert_goes_on(before, after)
     assert after["run"]["env_frames"] == 90
-    updates = [int(row["updates"]) for row in rows_of(stopped.run_dir)]
+    updates = [int(row["updates"]) for row in epochs_of(stopped.run_dir)]
     assert updates == sorted(set(updates))
 
 
@@ -219,7 +228,8 @@ def test_metrics_after_the_last_save_are_written_anew(tiny, dot, tmp_path):
     assert lost != lines[-1]
     (run.run_dir / "metrics.csv").write_text("".join([*lines, lost]))  # as a run that was killed leaves it
     resume(run.run_dir, frames=75, make_env=dot)
-    assert [int(row["updates"]) for row in rows_of(run.run_dir)] == [6, 12, 18]
+    assert [int(row["updates"]) for row in epochs_of(run.run_dir)] == [6, 12, 18, 24]
+    assert lost not in (run.run_dir / "metrics.csv").read_text()
 
 
 def test_a_small_budget_cuts_the_prefill_short(tiny, dot, tmp_path):
