@@ -33,10 +33,10 @@ class PlannerConfig:
     """
 
     horizon: int = 6
-    num_samples: int = 256
-    num_elites: int = 32
+    num_samples: int = 192
+    num_elites: int = 24
     num_iterations: int = 4
-    warm_start_iterations: int = 3
+    warm_start_iterations: int = 2
     smoothing: float = 0.9
     init_std: float = 0.5
     min_std: float = 0.05

@@ -68,12 +68,10 @@ class WorldModel(nn.Module):
 
     def rollout(self, state: State, actions: Tensor) -> tuple[Tensor, State]:
         """Imagine action sequences (rows, horizon, action): rewards (rows, horizon) and the last state."""
-        features = []
         with self.trunk_precision():
-            for action in actions.unbind(1):
-                state = self._advance_mean(state, action)
-                features.append(state.features)
-            return self.reward_head.mean(self.reward_head(torch.stack(features, 1))), state
+            states = self.dynamics.follow(state, actions)
+            rewards = self.reward_head.mean(self.reward_head(states.features))
+        return rewards, State(states.deter[:, -1].float(), states.stoch[:, -1].float())
 
     def value(self, state: State) -> Tensor:
         """Expected discounted return from a state on, (rows,)."""
