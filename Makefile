@@ -5,7 +5,7 @@ ARGS ?=
 BIN := .venv/bin
 STAMP := .venv/.installed
 
-.PHONY: setup train test check doctor soak clean
+.PHONY: setup train test check doctor bench soak clean
 
 setup: $(STAMP)
 
@@ -22,6 +22,9 @@ check: test
 
 doctor: $(STAMP)
 	@$(BIN)/python -m latentplan doctor
+
+bench: $(STAMP)
+	@$(BIN)/python scripts/benchmark.py $(ARGS)
 
 soak: $(STAMP)
 	$(BIN)/python -m pytest -m soak

@@ -1,4 +1,4 @@
-"""Measure the program: `python scripts/benchmark.py train|render|decide|ablate|learn`; --help lists them."""
+"""Measure the program: `python scripts/benchmark.py train|render|decide|plan|ablate|learn`; --help lists them."""
 
 from __future__ import annotations
 
@@ -16,6 +16,7 @@ COMMANDS = {
     "train": "what an update costs, part by part, and how near it comes to what the machine can do",
     "render": "milliseconds per frame and change of the picture in each render quality",
     "decide": "milliseconds per decision of planner and actor",
+    "plan": "milliseconds per search beside other planners, on the same model with the same settings",
     "ablate": "what each part of a trained planner earns, in paired episodes",
     "learn": "learning curves over tasks and seeds: frames and minutes to a return, and the final return",
 }

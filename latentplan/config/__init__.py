@@ -101,6 +101,8 @@ class LearningConfig:
         dynamics_scale: Weight of the KL that pulls the prior to the posterior.
         representation_scale: Weight of the KL that pulls the posterior to the prior.
         free_nats: KL below which neither is pulled.
+        overshooting_scale: Weight of KL and reward loss of open-loop predictions.
+        overshooting_horizon: Decisions that open-loop predictions reach.
         reward_scale: Weight of the reward loss.
         imagination_horizon: Model steps of each imagined rollout.
         imagination_starts: Rollouts imagined per update, drawn from the batch's states.
@@ -120,6 +122,8 @@ class LearningConfig:
     dynamics_scale: float = 1.0
     representation_scale: float = 0.1
     free_nats: float = 1.0
+    overshooting_scale: float = 1.0
+    overshooting_horizon: int = 8
     reward_scale: float = 1.0
     imagination_horizon: int = 10
     imagination_starts: int = 160
@@ -130,9 +134,11 @@ class LearningConfig:
     target_rate: float = 0.02
 
     def __post_init__(self) -> None:
-        at_least(self, batch_size=1, sequence_length=1, imagination_horizon=1, imagination_starts=1)
+        at_least(
+            self, batch_size=1, sequence_length=1, imagination_horizon=1, imagination_starts=1, overshooting_horizon=1
+        )
         at_least(self, reconstruction_scale=0.0, dynamics_scale=0.0, representation_scale=0.0, free_nats=0.0)
-        at_least(self, reward_scale=0.0, replay_value_scale=0.0, entropy_scale=0.0)
+        at_least(self, overshooting_scale=0.0, reward_scale=0.0, replay_value_scale=0.0, entropy_scale=0.0)
         above_zero(self, "model_learning_rate", "behaviour_learning_rate", "max_grad_norm", "target_rate")
         within(self, lambda_=(0.0, 1.0), target_rate=(0.0, 1.0))
         if self.discount is not None and not 0.0 < self.discount <= 1.0:
@@ -144,7 +150,7 @@ class CollectionConfig:
     """How experience is gathered, and how much is learned from it.
 
     Attributes:
-        behaviour: Who acts while collecting: `planner`, `actor`, or `both` in alternate episodes.
+        behaviour: Who acts while collecting: `planner`, `actor`, or `both` in alternate rounds.
         noise_std: Standard deviation of the noise added to the planner's action.
         prefill_decisions: Random decisions before learning starts.
         round_decisions: Decisions per epoch: this many are collected, then learned from.
@@ -170,7 +176,7 @@ class ReplayConfig:
     """Where experience is kept.
 
     Attributes:
-        capacity: Decisions kept; None holds the whole run when its length is known, else 500,000.
+        capacity: Decisions kept; None holds the whole run when its length is known, else 200,000.
         on_device: Whether the frames live on the training device instead of in main memory.
     """
 
@@ -210,7 +216,7 @@ class RunConfig:
         minutes: Minutes of wall clock to train for; None leaves it to `frames`.
         seed: Seed of every random stream of the run.
         device: `auto`, `cpu` or `cuda`.
-        threads: CPU threads for learning; None leaves it to torch.
+        threads: CPU threads for learning; None takes every core but the one that collects.
         run_dir: Folder of the run; None makes `runs/<domain>-<task>-<date>`.
     """
 

@@ -28,8 +28,8 @@ if TYPE_CHECKING:
 COLUMNS = (
     *("env_frames", "decisions", "updates", "minutes", "episode_return"),
     *("planner_return", "actor_return", "planner_minus_actor"),
-    *("reconstruction", "reward", "continue", "dynamics", "representation", "actor", "value"),
-    *("imagined_return", "entropy", "model_grad_norm", "behaviour_grad_norm"),
+    *("reconstruction", "reward", "continue", "dynamics", "representation", "overshooting", "overshot_reward"),
+    *("actor", "value", "imagined_return", "entropy", "model_grad_norm", "behaviour_grad_norm"),
 )
 
 
@@ -125,14 +125,9 @@ class Record(lightning.Callback):
         self.progress.update(self.state, learner.updates)
 
     def on_train_epoch_end(self, trainer: lightning.Trainer, learner: Learner) -> None:  # type: ignore[override]
-        """Append one row for the epoch, after one for each evaluation that came in, with the clocks of its weights."""
+        """Append one row for the epoch, after those of the evaluations that came in."""
+        self.write_evaluations(trainer)
         state = self.state
-        for entry in state.evaluations[self._shown_evaluations :]:
-            clocks = {name: entry[name] for name in ("env_frames", "decisions", "updates", "minutes")}
-            returns = {"planner_return": entry["planner"], "actor_return": entry["actor"]}
-            self._append(trainer, clocks | returns | {"planner_minus_actor": entry["planner"] - entry["actor"]})
-            self.progress.show_evaluation(entry)
-        self._shown_evaluations = len(state.evaluations)
         row: dict[str, float] = {name: float(value) for name, value in learner.metrics.items()}
         clocks = {"env_frames": state.env_frames, "decisions": state.decisions, "updates": learner.updates}
         row |= clocks | {"minutes": round(state.minutes, 3)}
@@ -141,6 +136,15 @@ class Record(lightning.Callback):
             self.progress.episode_return = row["episode_return"]
             self.experience.episode_returns.clear()
         self._append(trainer, row)
+
+    def write_evaluations(self, trainer: lightning.Trainer) -> None:
+        """Append one row for each new evaluation, with the clocks of the weights that were judged."""
+        for entry in self.state.evaluations[self._shown_evaluations :]:
+            clocks = {name: entry[name] for name in ("env_frames", "decisions", "updates", "minutes")}
+            returns = {"planner_return": entry["planner"], "actor_return": entry["actor"]}
+            self._append(trainer, clocks | returns | {"planner_minus_actor": entry["planner"] - entry["actor"]})
+            self.progress.show_evaluation(entry)
+        self._shown_evaluations = len(self.state.evaluations)
 
     def _append(self, trainer: lightning.Trainer, row: dict[str, float]) -> None:
         if trainer.logger is not None:
@@ -179,6 +183,10 @@ class Save(lightning.Callback):
     def save(self, trainer: lightning.Trainer, learner: Learner) -> None:
         """Save the last agent and the state of the run."""
         self.save_agent("last", learner.model, self.clocks(learner))
+        self.save_run(trainer, learner)
+
+    def save_run(self, trainer: lightning.Trainer, learner: Learner) -> None:
+        """Save what it takes to resume."""
         optimizers = [optimizer.state_dict() for optimizer in trainer.optimizers]
         saved = {"weights": learner.state_dict(), "updates": learner.updates}
         save_state(self.folder / "resume", self.state, saved, optimizers, self.experience.replay)

@@ -50,12 +50,15 @@ def world_model_loss(
         patches = model.decoder(features.flatten(0, 1))
         reward_logits = model.reward_head(features[:, 1:])
         continue_logits = model.continue_head(features[:, 1:]).squeeze(-1)
+    overshooting, overshot_reward = _overshooting(model, batch, states, posterior, config)
     parts = {
         "reconstruction": model.decoder.loss(patches, batch.frames.flatten(0, 1)).mean(),
         "reward": model.reward_head.loss(reward_logits, batch.rewards).mean(),
         "continue": torch.nn.functional.binary_cross_entropy_with_logits(continue_logits, batch.continues),
         "dynamics": _free_kl(_detached(posterior), prior, config.free_nats),
         "representation": _free_kl(posterior, _detached(prior), config.free_nats),
+        "overshooting": overshooting,
+        "overshot_reward": overshot_reward,
     }
     scales = {
         "reconstruction": config.reconstruction_scale,
@@ -63,6 +66,8 @@ def world_model_loss(
         "continue": 1.0,
         "dynamics": config.dynamics_scale,
         "representation": config.representation_scale,
+        "overshooting": config.overshooting_scale,
+        "overshot_reward": config.overshooting_scale * config.reward_scale,
     }
     loss = torch.stack([scales[name] * part for name, part in parts.items()]).sum()
     return loss, State(*(part.detach() for part in states)), {name: part.detach() for name, part in parts.items()}
@@ -71,11 +76,13 @@ def world_model_loss(
 def imagine(model: WorldModel, start: State, horizon: int, generator: torch.Generator) -> Imagination:
     """Roll the actor out in the model for `horizon` steps from rows of states, with gradients through the dynamics.
 
-    The actor reads its state without a gradient, so that each action is credited along the dynamics alone
-    (Hafner et al. 2020, section 3).
+    Every other row follows the mean of the prior, as the planner does, instead of a sample: a value that has only seen
+    samples is wrong about the means. The actor reads its state without a gradient, so that each action is credited
+    along the dynamics alone (Hafner et al. 2020, section 3).
     """
     state, features, entropies = start, [start.features], []
     rows, device = len(start.deter), start.deter.device
+    is_sampled = (torch.arange(rows, device=device) % 2).unsqueeze(-1)
     for _ in range(horizon):
         mean, std = model.actor(features[-1].detach())
         action = sample_action(mean, std, torch.randn(mean.shape, generator=generator, device=device))
@@ -83,7 +90,7 @@ def imagine(model: WorldModel, start: State, horizon: int, generator: torch.Gene
         deter = model.dynamics.advance(state, action)
         prior = model.dynamics.prior(deter)
         noise = torch.randn(rows, model.config.latent_dim, generator=generator, device=device)
-        state = State(deter, prior.mean + prior.std * noise)
+        state = State(deter, prior.mean + prior.std * noise * is_sampled)
         features.append(state.features)
     stacked = torch.stack(features)
     rewards = model.reward_head.mean(model.reward_head(stacked[1:]))
@@ -115,6 +122,38 @@ def value_loss(head: ScalarHead, features: Tensor, returns: Tensor, weights: Ten
     """Weighted cross-entropy of a value head on detached features (..., feature) to returns (...)."""
     logits = head(features.detach())
     return (weights * head.loss(logits, returns.detach())).mean()
+
+
+def _overshooting(
+    model: WorldModel, batch: Batch, states: State, posterior: Gaussian, config: LearningConfig
+) -> tuple[Tensor, Tensor]:
+    """KL and reward loss of open-loop predictions, which is what a planner looks at (latent overshooting).
+
+    From every `overshooting_horizon`-th posterior the true actions are followed by the mean of the prior, as a planner
+    does; each prior on the way is pulled to the posterior that saw the frame (Hafner et al. 2019, section 4).
+    """
+    horizon = min(config.overshooting_horizon, batch.actions.shape[1])
+
+    def windows(sequence: Tensor) -> Tensor:  # (batch, time, ...) -> (rows, horizon, ...)
+        return sequence.unfold(1, horizon, horizon).movedim(-1, 2).flatten(0, 1)
+
+    starts = [
+        part[:, :-1].detach()[:, ::horizon][:, : batch.actions.shape[1] // horizon].flatten(0, 1) for part in states
+    ]
+    state, deters, stochs = State(*starts), [], []
+    for action in windows(batch.actions).unbind(1):
+        deter = model.dynamics.advance(state, action)
+        state = State(deter, model.dynamics.prior(deter).mean)
+        deters.append(deter)
+        stochs.append(state.stoch)
+    deter = torch.stack(deters, 1)
+    prior = model.dynamics.prior(deter)
+    seen = Gaussian(*(windows(part[:, 1:].detach()) for part in posterior))
+    features = State(deter, torch.stack(stochs, 1)).features
+    with model.trunk_precision():
+        reward_logits = model.reward_head(features)
+    reward = model.reward_head.loss(reward_logits, windows(batch.rewards)).mean()
+    return _free_kl(seen, prior, config.free_nats), reward
 
 
 def _free_kl(left: Gaussian, right: Gaussian, free_nats: float) -> Tensor:

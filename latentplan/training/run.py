@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import logging
+import os
 import warnings
 from dataclasses import dataclass, replace
 from datetime import datetime
@@ -31,7 +32,8 @@ from latentplan.training.worker import LocalWorker, RemoteWorker, Worker
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-UNKNOWN_LENGTH_CAPACITY = 500_000
+USER_DOMAIN = "user"
+UNKNOWN_LENGTH_CAPACITY = 200_000
 
 
 @dataclass(frozen=True)
@@ -65,8 +67,10 @@ def train(config: Config, make_env: EnvFactory | None = None) -> Result:
     """
     if config.run.frames is None and config.run.minutes is None:
         raise UserError("a run needs an end: give --frames or --minutes")
-    if make_env is None and config.env.task is None:
-        config = replace(config, env=replace(config.env, task=default_task(config.env.domain)))
+    domain, task = config.env.domain, config.env.task
+    if make_env is not None:
+        domain, task = USER_DOMAIN, getattr(make_env, "__name__", type(make_env).__name__)
+    config = replace(config, env=replace(config.env, domain=domain, task=task or default_task(domain)))
     if config.run.run_dir is None:
         stamp = datetime.now().strftime("%Y%m%d-%H%M%S")
         name = f"{_task_name(config)}-seed{config.run.seed}-{stamp}"
@@ -120,10 +124,9 @@ class _Run:
     def __init__(self, config: Config, folder: Path, make_env: EnvFactory | None, *, resume: bool) -> None:
         self.config, self.folder = config, folder
         self.device = _choose_device(config.run)
-        if config.run.threads is not None:
-            torch.set_num_threads(config.run.threads)
         self.console = Progress(config.run)
         overlap = config.collection.overlap and self.device.type == "cpu"
+        torch.set_num_threads(config.run.threads or _choose_threads(overlap))
         self.worker: Worker = (
             RemoteWorker(config, make_env) if overlap else LocalWorker(config, make_env, str(self.device))
         )
@@ -178,12 +181,14 @@ class _Run:
                 trainer.fit(self.learner, datamodule=ReplayData(batches))
             finally:
                 self.console.stop()
+            if not self.state.interrupted:
+                experience.take()
+                record.write_evaluations(trainer)
             save.save(trainer, self.learner)
         if self.state.interrupted:
             self.console.console.print(f"stopped; to go on: python scripts/train.py --resume {self.folder}")
             return Result(self.folder, INTERRUPTED, {})
-        experience.take()
-        return Result(self.folder, 0, self._finish(save, videos / "final.webm"))
+        return Result(self.folder, 0, self._finish(trainer, save, videos / "final.webm"))
 
     def _trainer(self, callbacks: list[lightning.Callback]) -> lightning.Trainer:
         logging.getLogger("lightning.pytorch").setLevel(logging.ERROR)
@@ -192,8 +197,9 @@ class _Run:
 
         class Restore(lightning.Callback):
             def on_fit_start(self, trainer: lightning.Trainer, learner: lightning.LightningModule) -> None:
-                for optimizer, saved in zip(trainer.optimizers, optimizers, strict=False):
-                    optimizer.load_state_dict(saved)
+                if optimizers:
+                    for optimizer, saved in zip(trainer.optimizers, optimizers, strict=True):
+                        optimizer.load_state_dict(saved)
 
         return lightning.Trainer(
             accelerator="gpu" if self.device.type == "cuda" else "cpu",
@@ -207,7 +213,7 @@ class _Run:
             log_every_n_steps=10**9,
         )
 
-    def _finish(self, save: Save, film: Path) -> dict[str, float]:
+    def _finish(self, trainer: lightning.Trainer, save: Save, film: Path) -> dict[str, float]:
         weights = {name: value.detach().cpu().numpy() for name, value in self.learner.model.state_dict().items()}
         episodes = self.config.evaluation.final_episodes
         self.console.console.print(f"final evaluation: {episodes} episodes each of planner and actor")
@@ -219,6 +225,8 @@ class _Run:
         save.save_agent("last", self.learner.model, info)
         if summary["planner"] >= self.state.best_return:
             save.save_agent("best", self.learner.model, info)
+            self.state.best_return = summary["planner"]
+            save.save_run(trainer, self.learner)
         self.console.console.print(
             f"trained {self.state.env_frames:,} frames in {self.state.minutes:.1f} min: planner "
             f"{summary['planner']:.1f}, actor {summary['actor']:.1f} ({episodes} episodes)\nrun folder: {self.folder}"
@@ -268,6 +276,12 @@ def _choose_device(run: RunConfig) -> torch.device:
     if run.device == "auto":
         return torch.device("cuda" if torch.cuda.is_available() else "cpu")
     return torch.device(run.device)
+
+
+def _choose_threads(overlap: bool) -> int:
+    # One core is left to the process that collects: two threads that wait for each other on a shared one crawl.
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    return max(1, cores - 1) if overlap else cores
 
 
 def _capacity(config: Config) -> int:

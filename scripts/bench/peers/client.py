@@ -1,0 +1,65 @@
+"""This side of a peer: its process, and questions to it."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+from pathlib import Path
+
+from bench.peers.install import PEERS, PeerError, install, installed_version, last_line
+from bench.peers.problem import Problem
+
+SCRIPTS = Path(__file__).resolve().parents[2]
+
+
+class PeerProcess:
+    """A peer that waits in a process of its own until it is asked for a search; it knows its `name` and `version`.
+
+    Args:
+        name: One of `PEERS`.
+        problem: What it searches.
+        folder: Where the peers' environment lives.
+
+    Raises:
+        PeerError: It cannot be installed.
+    """
+
+    def __init__(self, name: str, problem: Problem, folder: Path) -> None:
+        python = install(name, folder)
+        paths = [str(SCRIPTS), str(SCRIPTS.parent), os.environ.get("PYTHONPATH", "")]
+        environment = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, paths))}
+        self.name, self.version = name, installed_version(name, folder)
+        self._log = folder / f"{name}.log"
+        with self._log.open("w") as log:
+            self._process = subprocess.Popen(
+                [str(python), "-m", PEERS[name].module, problem.to_json()],
+                stdin=subprocess.PIPE,
+                stdout=subprocess.PIPE,
+                stderr=log,
+                cwd=folder,
+                env=environment,
+                text=True,
+            )
+
+    def search_ms(self, dtype: str) -> float:
+        """Milliseconds of one search, the model's trunk in `float32` or `bfloat16`.
+
+        Raises:
+            PeerError: It failed; the last line of its own error is told.
+        """
+        assert self._process.stdin is not None and self._process.stdout is not None
+        try:
+            print(json.dumps({"dtype": dtype}), file=self._process.stdin, flush=True)
+            answer = self._process.stdout.readline()
+        except BrokenPipeError:
+            answer = ""
+        if not answer:
+            self._process.wait()
+            raise PeerError(last_line(self._log.read_text(errors="replace")) or "it ended without a word")
+        return float(json.loads(answer)["ms"])
+
+    def close(self) -> None:
+        """End the process."""
+        self._process.kill()
+        self._process.communicate()

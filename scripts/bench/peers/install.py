@@ -1,0 +1,107 @@
+"""An environment for the peers, beside the project's own: the same torch, and packages nothing else here should see."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import sysconfig
+from collections.abc import Sequence
+from importlib import metadata
+from pathlib import Path
+from typing import NamedTuple
+
+INSTALL_SECONDS = 600
+FOLDER = Path(__file__).resolve().parents[3] / "runs" / ".peers" / f"python{sysconfig.get_python_version()}"
+
+
+class Peer(NamedTuple):
+    """A library from PyPI.
+
+    Attributes:
+        module: The adapter that serves it.
+        package: Its name on PyPI.
+        requirements: What pip installs besides, and nothing that these ask for themselves: the rest comes from the
+            project's own environment, in the versions found there.
+    """
+
+    module: str
+    package: str
+    requirements: tuple[str, ...]
+
+
+class PeerError(Exception):
+    """A peer cannot take part; the message says why, in one line."""
+
+
+_UTILITIES = ("arm-pytorch-utilities", "pytorch-seed", "scipy", "matplotlib")
+PEERS = {
+    "torchrl": Peer(
+        "bench.peers.torchrl_cem",
+        "torchrl",
+        ("tensordict<0.15", "pyvers<0.3", "hoptorch", "cloudpickle", "importlib-metadata", "orjson"),
+    ),
+    "mbrl": Peer(
+        "bench.peers.mbrl_cem",
+        "mbrl",
+        ("hydra-core", "omegaconf", "antlr4-python3-runtime==4.9.*", "termcolor", "imageio"),
+    ),
+    "pytorch_mppi": Peer("bench.peers.mppi", "pytorch-mppi", _UTILITIES),
+    "pytorch_icem": Peer("bench.peers.icem", "pytorch-icem", ("colorednoise", *_UTILITIES)),
+}
+
+
+def install(name: str, folder: Path) -> Path:
+    """The Python of the peers' environment, with one of them in it; made and filled on first use.
+
+    Args:
+        name: One of `PEERS`.
+        folder: Where the environment lives.
+
+    Raises:
+        PeerError: It could not be installed.
+    """
+    peer, python = PEERS[name], folder / "bin" / "python"
+    requirements = (peer.package, *peer.requirements)
+    receipt, wanted = folder / f"{name}.installed", "\n".join(requirements)
+    if receipt.is_file() and receipt.read_text() == wanted:
+        return python
+    if not python.is_file():
+        print(f"making an environment for other planners in {folder}", flush=True)
+        _call([sys.executable, "-m", "venv", str(folder)])
+        _show_own_packages(folder)
+    print(f"installing {name} there: {' '.join(requirements)}", flush=True)
+    _call([str(python), "-m", "pip", "install", "--quiet", "--no-deps", "--disable-pip-version-check", *requirements])
+    receipt.write_text(wanted)
+    return python
+
+
+def installed_version(name: str, folder: Path) -> str:
+    """The version of a peer in the environment that `install` made."""
+    found = metadata.distributions(name=PEERS[name].package, path=[str(_site_packages(folder))])
+    return next((distribution.version for distribution in found), "unknown")
+
+
+def last_line(text: str) -> str:
+    """The last line of a program's output that speaks of an error, or else its last line."""
+    lines = [line.strip() for line in text.splitlines() if line.strip()]
+    errors = [line for line in lines if "error" in line.lower()]
+    return (errors or lines or [""])[-1]
+
+
+def _show_own_packages(folder: Path) -> None:
+    """Lets another environment import what this one has, after its own packages."""
+    own = {sysconfig.get_path(kind) for kind in ("purelib", "platlib")}
+    (_site_packages(folder) / "own-packages.pth").write_text("\n".join(sorted(own)) + "\n")
+
+
+def _site_packages(folder: Path) -> Path:
+    return Path(sysconfig.get_path("purelib", "venv", {"base": str(folder)}))
+
+
+def _call(command: Sequence[str]) -> None:
+    try:
+        done = subprocess.run(command, capture_output=True, text=True, timeout=INSTALL_SECONDS)
+    except (OSError, subprocess.TimeoutExpired) as error:
+        raise PeerError(str(error)) from None
+    if done.returncode != 0:
+        raise PeerError(last_line(done.stderr or done.stdout) or f"exit code {done.returncode}")

@@ -1,0 +1,41 @@
+"""mbrl-lib's CEMOptimizer, with an objective that steps the model."""
+
+from __future__ import annotations
+
+import torch
+from mbrl.planning.trajectory_opt import CEMOptimizer  # type: ignore[import-not-found]
+from torch import Tensor
+
+from bench.peers.problem import ELITE_SHARE, Problem, start_state
+from bench.peers.serve import Search, serve
+from latentplan.models import State, WorldModel
+
+
+def make_search(problem: Problem, model: WorldModel) -> Search:
+    """A cold search from the problem's start."""
+    shape, device = (problem.horizon, problem.action_dim), torch.device(problem.device)
+    optimizer = CEMOptimizer(
+        num_iterations=problem.iterations,
+        elite_ratio=ELITE_SHARE,
+        population_size=problem.samples,
+        lower_bound=torch.full(shape, -1.0).tolist(),
+        upper_bound=torch.full(shape, 1.0).tolist(),
+        alpha=0.1,
+        device=device,
+        return_mean_elites=True,
+    )
+    start = start_state(problem)
+
+    def objective(population: Tensor) -> Tensor:
+        state = State(*(part.expand(problem.samples, -1) for part in start))
+        total = torch.zeros(problem.samples, device=device)
+        for action in population.unbind(1):
+            state, reward = model.step(state, action)
+            total = total + reward
+        return total
+
+    return lambda: optimizer.optimize(objective, x0=torch.zeros(shape, device=device))[0]
+
+
+if __name__ == "__main__":
+    serve(make_search)

@@ -1,0 +1,114 @@
+"""What every planner is timed on: one search in one untrained RSSM."""
+
+from __future__ import annotations
+
+import json
+from contextlib import AbstractContextManager
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from latentplan.config import ModelConfig, from_dict
+from latentplan.models import State, WorldModel
+
+DTYPES = {"float32": torch.float32, "bfloat16": torch.bfloat16}
+ELITE_SHARE = 0.1
+REWARD_SCALE = 0.1  # an untrained reward head is zero everywhere, which leaves nothing to search for
+
+
+@dataclass(frozen=True)
+class Problem:
+    """One search: the sizes that every planner is given, and the model that it is given.
+
+    Attributes:
+        samples: Candidates per iteration.
+        horizon: Model steps of each candidate.
+        iterations: Refits.
+        action_dim: Numbers in an action, each in [-1, 1].
+        model: Settings of the world model, as plain values.
+        device: `cpu` or `cuda`.
+        threads: CPU threads.
+        seed: Of the weights and of the start.
+    """
+
+    samples: int
+    horizon: int
+    iterations: int
+    action_dim: int
+    model: dict[str, Any]
+    device: str
+    threads: int
+    seed: int = 0
+
+    @property
+    def num_elites(self) -> int:
+        """A tenth of the candidates, at least two."""
+        return max(2, round(ELITE_SHARE * self.samples))
+
+    @property
+    def model_config(self) -> ModelConfig:
+        """The settings of the world model."""
+        return from_dict({"model": self.model}).model
+
+    def to_json(self) -> str:
+        """One line that `from_json` reads."""
+        return json.dumps(asdict(self))
+
+    @staticmethod
+    def from_json(text: str) -> Problem:
+        """The problem that `to_json` wrote."""
+        return Problem(**json.loads(text))
+
+
+class FullPrecisionModel(WorldModel):
+    """The world model with its trunk in float32."""
+
+    def trunk_precision(self) -> AbstractContextManager[None]:
+        """No autocast."""
+        return torch.autocast(self.device.type, enabled=False)
+
+    def rollout(self, state: State, actions: Tensor) -> tuple[Tensor, State]:
+        """Imagine action sequences (rows, horizon, action): rewards (rows, horizon) and the last state."""
+        features, visited = state.features, []
+        for action in actions.unbind(1):
+            features = next_features(self, features, action)
+            visited.append(features)
+        return rewards_at(self, torch.stack(visited, 1)), as_state(self, features)
+
+
+def build_model(problem: Problem, dtype: str) -> WorldModel:
+    """The seeded world model of a problem, its trunk computed in `float32` or `bfloat16`; the weights are the same."""
+    kind = {"float32": FullPrecisionModel, "bfloat16": WorldModel}[dtype]
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(problem.seed)
+        model = kind(problem.model_config, problem.action_dim)
+        nn.init.normal_(model.reward_head.mlp.output.weight, std=REWARD_SCALE)
+    return model.to(problem.device).eval()
+
+
+def start_state(problem: Problem, batch: int = 1) -> State:
+    """Where every search begins, (batch, ...)."""
+    config, generator = problem.model_config, torch.Generator().manual_seed(problem.seed)
+    deter = torch.rand(batch, config.deter_dim, generator=generator) * 2.0 - 1.0  # what a GRU can hold
+    stoch = torch.randn(batch, config.latent_dim, generator=generator)
+    return State(deter.to(problem.device), stoch.to(problem.device))
+
+
+def as_state(model: WorldModel, features: Tensor) -> State:
+    """The state inside one vector per row, features (rows, deter + latent)."""
+    return State(*features.split([model.config.deter_dim, model.config.latent_dim], -1))
+
+
+def next_features(model: WorldModel, features: Tensor, action: Tensor) -> Tensor:
+    """One step for a planner that holds states as vectors: features (rows, deter + latent) to features."""
+    with model.trunk_precision():
+        deter = model.dynamics.advance(as_state(model, features), action)
+        return torch.cat([deter, model.dynamics.prior(deter).mean], -1)
+
+
+def rewards_at(model: WorldModel, features: Tensor) -> Tensor:
+    """Reward (...) that arrives with features (..., deter + latent)."""
+    with model.trunk_precision():
+        return model.reward_head.mean(model.reward_head(features))

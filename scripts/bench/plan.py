@@ -1,0 +1,245 @@
+"""`benchmark.py plan`: our planner beside other libraries, on the same model with the same settings."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+from bench.options import (
+    COMPOSE_FLAGS,
+    DEVICE_FLAGS,
+    Flags,
+    action_size,
+    choose_device,
+    composed_config,
+    output_path,
+    whole_number,
+    words,
+)
+from bench.peers.install import FOLDER, PEERS, PeerError
+from bench.report import format_table, number, write_json
+from latentplan.compose import raise_unknown
+from latentplan.config import to_dict
+
+if TYPE_CHECKING:
+    from bench.peers.client import PeerProcess
+    from bench.peers.problem import Problem
+
+FLAGS = {
+    **COMPOSE_FLAGS,
+    "--samples": ("N", "candidates per iteration (500)"),
+    "--horizon": ("H", "model steps of each candidate (20)"),
+    "--iterations": ("I", "refits of each search (5)"),
+    "--peers": ("P,P", f"any of {','.join(PEERS)} (all), or none; installed on first use, out of the project's way"),
+    "--plans": ("N", "timed searches of each planner, taken in turns (30)"),
+    **DEVICE_FLAGS,
+    "--json": ("FILE", "result as JSON"),
+    "--scaling": ("PNG", "also time our planner against samples, horizon, iterations and environments; plot it here"),
+}
+SETTINGS = ("model",)
+WARM_UP_PLANS = 2
+OURS, PLAIN, PRODUCTS = "latentplan", "plain loop", "matrix products"
+Times = dict[tuple[str, str], list[float]]
+
+
+class Arm(NamedTuple):
+    """What is timed.
+
+    Attributes:
+        planner: Whose search.
+        dtype: Of the model's trunk.
+        search_ms: One search, in milliseconds.
+    """
+
+    planner: str
+    dtype: str
+    search_ms: Callable[[], float]
+
+
+class Comparison(NamedTuple):
+    """What was measured.
+
+    Attributes:
+        times: Milliseconds of each search, by planner and dtype.
+        versions: Of the peers that took part.
+        left_out: Why the others did not.
+    """
+
+    times: Times
+    versions: dict[str, str]
+    left_out: dict[str, str]
+
+
+def run(flags: Flags) -> int:
+    """Time every planner in turns and print how they compare."""
+    plans, names = whole_number(flags, "--plans", 30), _peer_names(flags)
+    sizes = {
+        name: whole_number(flags, f"--{name}", default, least=least)
+        for name, default, least in (("samples", 500, 2), ("horizon", 20, 1), ("iterations", 5, 1))
+    }
+    json_path, plot_path = output_path(flags, "--json"), output_path(flags, "--scaling")
+    config = composed_config(flags)
+    device = choose_device(flags)
+    import torch
+
+    from bench.machine import describe_machine
+    from bench.peers.problem import Problem
+
+    problem = Problem(
+        **sizes,
+        action_dim=action_size(flags, config),
+        model=to_dict(config.model),
+        device=device.type,
+        threads=torch.get_num_threads(),
+    )
+    machine = describe_machine(device)
+    measured = compare(problem, names, plans)
+    result = {
+        **summarise(measured.times, problem.threads),
+        "peers": measured.versions,
+        "left_out": measured.left_out,
+        "settings": {**sizes, "elites": problem.num_elites, "action_dim": problem.action_dim, "plans": plans},
+        "model": problem.model,
+        "machine": machine,
+    }
+    print(f"{machine['name']} ({device.type}, {machine['threads']} threads), {config.env.domain}, {sizes}")
+    print(table(result))
+    if plot_path is not None:
+        from bench.scaling import measure_scaling, plot_scaling, scaling_table
+
+        result["scaling"] = measure_scaling(problem, result["best_dtype"])
+        print(scaling_table(result["scaling"]))
+        plot_scaling(result["scaling"], plot_path)
+    write_json(json_path, result)
+    return 0
+
+
+def compare(problem: Problem, peers: Sequence[str], plans: int, folder: Path = FOLDER) -> Comparison:
+    """Time every planner.
+
+    Args:
+        problem: What is searched.
+        peers: Names of `PEERS`.
+        plans: Searches of each that are timed; every planner has one before any has its next, so that a busy machine
+            slows all alike.
+        folder: Where the peers' environment is, or will be.
+    """
+    from bench.peers.client import PeerProcess
+    from bench.peers.problem import DTYPES
+
+    left_out: dict[str, str] = {}
+    processes: list[PeerProcess] = []
+    try:
+        for name in peers:
+            with _leaving_out(name, left_out):
+                processes.append(PeerProcess(name, problem, folder))
+        peer_arms = [_peer_arm(process, dtype) for process in processes for dtype in DTYPES]
+        times = _take_turns([*own_arms(problem), *peer_arms], plans, left_out)
+    finally:
+        for process in processes:
+            process.close()
+    versions = {process.name: process.version for process in processes if process.name not in left_out}
+    return Comparison(times, versions, left_out)
+
+
+def own_arms(problem: Problem) -> list[Arm]:
+    """Our planner, a plain loop, and the matrix products alone."""
+    from bench.peers.problem import DTYPES
+    from bench.searches import matrix_products, our_search, plain_search, timed
+
+    return [
+        *(Arm(OURS, dtype, timed(our_search(problem, dtype), problem)) for dtype in DTYPES),
+        Arm(PLAIN, "float32", timed(plain_search(problem), problem)),
+        *(Arm(PRODUCTS, dtype, timed(matrix_products(problem, dtype), problem)) for dtype in DTYPES),
+    ]
+
+
+def summarise(times: Times, threads: int) -> dict[str, Any]:
+    """Percentiles of every planner and the ratios between them; a ratio without a peer is None.
+
+    Args:
+        times: Milliseconds of each search by planner and dtype, those of `OURS` and `PRODUCTS` among them.
+        threads: CPU threads that all had.
+    """
+    import numpy as np
+
+    from latentplan.rollout import latency_percentiles
+
+    facts = {key: latency_percentiles(np.asarray(laps)) for key, laps in times.items()}
+    p50 = {key: percentiles["p50"] for key, percentiles in facts.items()}
+    best = min((dtype for planner, dtype in p50 if planner == OURS), key=lambda dtype: p50[OURS, dtype])
+    rivals = {key: value for key, value in p50.items() if key[0] not in (OURS, PLAIN, PRODUCTS)}
+    shipped = [value for (_, dtype), value in rivals.items() if dtype == "float32"]
+    equal = [value for (_, dtype), value in rivals.items() if dtype == best]
+    rows = [
+        {"planner": planner, "dtype": dtype, "threads": threads, **{f"{p}_ms": ms for p, ms in percentiles.items()}}
+        for (planner, dtype), percentiles in facts.items()
+        if planner != PRODUCTS
+    ]
+    return {
+        "ratio_fastest_peer": min(shipped) / p50[OURS, best] if shipped else None,
+        "ratio_fastest_peer_same_dtype": min(equal) / p50[OURS, best] if equal else None,
+        "ratio_matrix_limit": p50[OURS, best] / p50[PRODUCTS, best],
+        "best_dtype": best,
+        "matrix_limit_ms": {dtype: value for (planner, dtype), value in p50.items() if planner == PRODUCTS},
+        "rows": rows,
+    }
+
+
+def table(result: dict[str, Any]) -> str:
+    """The comparison for people."""
+    best, limits = result["best_dtype"], result["matrix_limit_ms"]
+    ours = next(row["p50_ms"] for row in result["rows"] if row["planner"] == OURS and row["dtype"] == best)
+    lines = [
+        [row["planner"], row["dtype"], *(number(row[f"{p}_ms"]) for p in ("p50", "p95", "p99"))]
+        + [number(row["p50_ms"] / ours, 2), number(row["p50_ms"] / limits[row["dtype"]], 2)]
+        for row in result["rows"]
+    ]
+    lines += [[PRODUCTS, dtype, number(ms), "-", "-", number(ms / ours, 2), "1.00"] for dtype, ms in limits.items()]
+    header = ["planner", "dtype", "p50 ms", "p95", "p99", "x ours", "x products"]
+    return "\n".join(
+        [
+            format_table(header, lines),
+            f"{result['settings']['plans']} searches each; fastest peer / ours: "
+            f"{number(result['ratio_fastest_peer'], 2)} as shipped, "
+            f"{number(result['ratio_fastest_peer_same_dtype'], 2)} in {best}; "
+            f"ours / its matrix products: {number(result['ratio_matrix_limit'], 2)}",
+        ]
+    )
+
+
+def _peer_names(flags: Flags) -> list[str]:
+    names = words(flags, "--peers", ",".join(PEERS))
+    if names == ["none"]:
+        return []
+    for name in names:
+        if name not in PEERS:
+            raise_unknown("peer", name, [*PEERS, "none"])
+    return names
+
+
+def _peer_arm(process: PeerProcess, dtype: str) -> Arm:
+    return Arm(process.name, dtype, lambda: process.search_ms(dtype))
+
+
+def _take_turns(arms: Sequence[Arm], plans: int, left_out: dict[str, str]) -> Times:
+    """Milliseconds of each arm's searches; an arm that fails is left out."""
+    times: Times = {(arm.planner, arm.dtype): [] for arm in arms}
+    for _ in range(WARM_UP_PLANS + plans):
+        for arm in arms:
+            if arm.planner not in left_out:
+                with _leaving_out(arm.planner, left_out):
+                    times[arm.planner, arm.dtype].append(arm.search_ms())
+    return {key: laps[WARM_UP_PLANS:] for key, laps in times.items() if key[0] not in left_out}
+
+
+@contextmanager
+def _leaving_out(name: str, left_out: dict[str, str]) -> Iterator[None]:
+    """Notes why a peer cannot take part, and goes on without it."""
+    try:
+        yield
+    except PeerError as error:
+        left_out[name] = str(error)
+        print(f"{name} left out: {error}", flush=True)

@@ -1,0 +1,103 @@
+"""Searches that are compared: ours, the plain loop anyone would write, and the products that none can do without."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from bench.machine import now
+from bench.peers.problem import DTYPES, Problem, build_model, start_state
+from latentplan.models import State
+from latentplan.planning import CEMPlanner
+
+Search = Callable[[], Any]
+
+
+def timed(search: Search, problem: Problem) -> Callable[[], float]:
+    """The search as a function that tells how many milliseconds it took."""
+    device = torch.device(problem.device)
+
+    @torch.no_grad()
+    def search_ms() -> float:
+        started = now(device)
+        search()
+        return 1000.0 * (now(device) - started)
+
+    return search_ms
+
+
+def our_search(problem: Problem, dtype: str, batch: int = 1) -> Search:
+    """A cold search of our planner from `batch` starts at once, by reward alone."""
+    model, start = build_model(problem, dtype), start_state(problem, batch)
+    planner = CEMPlanner(
+        action_dim=problem.action_dim,
+        horizon=problem.horizon,
+        num_samples=problem.samples,
+        num_elites=problem.num_elites,
+        num_iterations=problem.iterations,
+        terminal_value=False,
+    )
+    return lambda: planner.plan(model, start)
+
+
+def plain_search(problem: Problem, dtype: str = "float32") -> Search:
+    """The cross-entropy method in a dozen lines."""
+    model, start = build_model(problem, dtype), start_state(problem)
+    shape = (problem.horizon, problem.action_dim)
+
+    def search() -> Tensor:
+        mean, std = (fill(shape, device=problem.device) for fill in (torch.zeros, torch.ones))
+        for _ in range(problem.iterations):
+            noise = torch.randn(problem.samples, *shape, device=problem.device)
+            actions = (mean + std * noise).clamp(-1.0, 1.0)
+            state = State(*(part.expand(problem.samples, -1) for part in start))
+            total = torch.zeros(problem.samples, device=problem.device)
+            for action in actions.unbind(1):
+                state, reward = model.step(state, action)
+                total = total + reward
+            elites = actions[total.topk(problem.num_elites).indices]
+            mean, std = elites.mean(0), elites.std(0)
+        return mean[0]
+
+    return search
+
+
+def product_shapes(problem: Problem) -> list[tuple[int, int, int]]:
+    """The (rows, in, out) of the products in one iteration: those of each step, then the reward head's for all steps.
+
+    Of the prior only the mean is counted, which is all that a search needs.
+    """
+    model, rows = problem.model_config, problem.samples
+    latent, deter, hidden = model.latent_dim, model.deter_dim, model.hidden_dim
+    step = [
+        (rows, latent + problem.action_dim, hidden),
+        (rows, hidden + deter, 3 * deter),
+        (rows, deter, hidden),
+        (rows, hidden, latent),
+    ]
+    every = rows * problem.horizon
+    head = [(every, deter + latent, hidden), (every, hidden, hidden), (every, hidden, model.num_bins)]
+    return step * problem.horizon + head
+
+
+def matrix_products(problem: Problem, dtype: str) -> Search:
+    """Just the matrix products of a search, into memory that is there already."""
+    shapes = product_shapes(problem)
+    operands = {
+        (rows, inner, outer): [
+            torch.randn(size, device=problem.device).to(DTYPES[dtype])
+            for size in ((rows, inner), (inner, outer), (rows, outer))
+        ]
+        for rows, inner, outer in set(shapes)
+    }
+
+    def search() -> None:
+        for _ in range(problem.iterations):
+            for shape in shapes:
+                left, right, out = operands[shape]
+                torch.mm(left, right, out=out)
+
+    return search
