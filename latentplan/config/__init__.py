@@ -120,7 +120,7 @@ class LearningConfig:
     max_grad_norm: float = 100.0
     reconstruction_scale: float = 1.0
     dynamics_scale: float = 1.0
-    representation_scale: float = 0.1
+    representation_scale: float = 0.5
     free_nats: float = 1.0
     overshooting_scale: float = 1.0
     overshooting_horizon: int = 8

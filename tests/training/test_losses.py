@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from latentplan.models import State, WorldModel
+from latentplan.models import Gaussian, State, WorldModel, kl_divergence
 from latentplan.replay import Batch, Replay
 from latentplan.training.losses import imagine, lambda_return, world_model_loss
 from latentplan.training.module import Learner
@@ -86,13 +86,37 @@ def test_nothing_counts_beyond_an_end(path):
 
 
 def test_the_model_loss_is_the_weighted_sum_of_its_parts(model, batch, tiny):
-    config = tiny("", learning={"reconstruction_scale": 2.0, "reward_scale": 3.0, "representation_scale": 0.5}).learning
+    chosen = {"reconstruction_scale": 2.0, "reward_scale": 3.0, "representation_scale": 0.5, "overshooting_scale": 0.7}
+    config = tiny("", learning=chosen).learning
     loss, states, parts = world_model_loss(model, batch, config, stream())
     scales = {"reconstruction": 2.0, "reward": 3.0, "continue": 1.0, "dynamics": 1.0, "representation": 0.5}
+    scales |= {"overshooting": 0.7, "overshot_reward": 0.7 * 3.0}
     assert parts.keys() == scales.keys()
     assert loss.item() == pytest.approx(sum(scale * parts[name].item() for name, scale in scales.items()), rel=1e-5)
     assert states.deter.shape == (4, 6, 16) and states.stoch.shape == (4, 6, 32)
     assert not any(part.requires_grad for part in states)
+
+
+def test_open_loop_predictions_follow_the_mean_of_the_prior_from_a_detached_start(model, batch, tiny):
+    """The overshooting terms, by hand: every window's first posterior, then the true actions step by step."""
+    horizon = 2
+    config = tiny("", learning={"overshooting_horizon": horizon, "free_nats": 0.0}).learning
+    noise = torch.randn(*batch.frames.shape[:2], 32, generator=stream())
+    with torch.no_grad():
+        with model.trunk_precision():
+            embeddings = model.encoder(batch.frames.flatten(0, 1)).unflatten(0, batch.frames.shape[:2])
+        states, posterior = model.dynamics.observe(embeddings, batch.actions, batch.deter, noise)
+        divergences = []
+        for start in range(0, batch.actions.shape[1] - horizon + 1, horizon):
+            state = State(states.deter[:, start], states.stoch[:, start])
+            for time in range(start, start + horizon):
+                deter = model.dynamics.advance(state, batch.actions[:, time])
+                prior = model.dynamics.prior(deter)
+                state = State(deter, prior.mean)
+                seen = Gaussian(posterior.mean[:, time + 1], posterior.std[:, time + 1])
+                divergences.append(kl_divergence(seen, prior).mean())
+    _, _, parts = world_model_loss(model, batch, config, stream())
+    assert parts["overshooting"].item() == pytest.approx(torch.stack(divergences).mean().item(), rel=1e-4)
 
 
 def test_less_divergence_than_the_free_nats_teaches_nothing(model, batch, tiny):
