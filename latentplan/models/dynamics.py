@@ -70,41 +70,6 @@ class Rssm(nn.Module):
         hidden = functional.silu(self.posterior_norm(self.posterior_deter(deter) + embedding))
         return _gaussian(self.posterior_output(hidden))
 
-    def follow(self, state: State, actions: Tensor) -> State:
-        """The states that action sequences lead to by the prior's mean, all of it in bfloat16: the planner's hot path.
-
-        Equals `advance` and `prior(...).mean` step by step, with the actions' share of the input computed at once and
-        the prior's std left out.
-
-        Args:
-            state: Where every sequence starts, (rows, ...).
-            actions: In [-1, 1], (rows, time, action).
-
-        Returns:
-            The states after each action, bfloat16 (rows, time, ...).
-        """
-        dtype = torch.bfloat16
-        stoch_weight, action_weight = self.input.linear.weight.to(dtype).split([self.latent_dim, actions.shape[-1]], 1)
-        stoch_weight = stoch_weight.contiguous()
-        gates_weight = self.gates.weight.to(dtype)
-        hidden_weight = self.prior_hidden.linear.weight.to(dtype)
-        mean_weight = self.prior_output.weight[: self.latent_dim].to(dtype)
-        mean_bias = self.prior_output.bias[: self.latent_dim].to(dtype)
-        pushes = functional.linear(actions.to(dtype), action_weight.contiguous()).unbind(1)
-        deter, stoch = state.deter.to(dtype), state.stoch.to(dtype)
-        deters, stochs = [], []
-        for push in pushes:
-            hidden = functional.silu(self.input.norm(functional.linear(stoch, stoch_weight).add_(push)))
-            gates = self.gates_norm(functional.linear(torch.cat([hidden, deter], -1), gates_weight))
-            reset, candidate, update = gates.chunk(3, -1)
-            candidate = torch.sigmoid(reset).mul_(candidate).tanh_()
-            deter = torch.lerp(deter, candidate, torch.sigmoid(update - 1.0))
-            hidden = functional.silu(self.prior_hidden.norm(functional.linear(deter, hidden_weight)))
-            stoch = functional.linear(hidden, mean_weight, mean_bias)
-            deters.append(deter)
-            stochs.append(stoch)
-        return State(torch.stack(deters, 1), torch.stack(stochs, 1))
-
     def observe(self, embeddings: Tensor, actions: Tensor, deter: Tensor, noise: Tensor) -> tuple[State, Gaussian]:
         """Follow a sequence of frames.
 

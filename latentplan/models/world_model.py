@@ -12,6 +12,7 @@ from latentplan.models.decoder import Decoder
 from latentplan.models.dynamics import Rssm, State
 from latentplan.models.encoder import Encoder
 from latentplan.models.heads import Actor, Mlp, ScalarHead, sample_action
+from latentplan.models.imagination import imagine, lay_out
 
 
 class WorldModel(nn.Module):
@@ -68,10 +69,10 @@ class WorldModel(nn.Module):
 
     def rollout(self, state: State, actions: Tensor) -> tuple[Tensor, State]:
         """Imagine action sequences (rows, horizon, action): rewards (rows, horizon) and the last state."""
+        kind = actions.device.type
         with self.trunk_precision():
-            states = self.dynamics.follow(state, actions)
-            rewards = self.reward_head.mean(self.reward_head(states.features))
-        return rewards, State(states.deter[:, -1].float(), states.stoch[:, -1].float())
+            dtype = torch.get_autocast_dtype(kind) if torch.is_autocast_enabled(kind) else torch.float32
+        return imagine(lay_out(self.dynamics, self.reward_head, dtype), state, actions)
 
     def value(self, state: State) -> Tensor:
         """Expected discounted return from a state on, (rows,)."""

@@ -15,15 +15,43 @@ def actions(generator):
     return torch.rand(5, 4, 3, generator=generator) * 2 - 1
 
 
-def test_a_rollout_equals_repeated_steps(model, state, actions):
-    rewards, last = model.rollout(state, actions)
+def step_through(model, state, actions):
     stepped = []
     for action in actions.unbind(1):
         state, reward = model.step(state, action)
         stepped.append(reward)
-    assert rewards.shape == (5, 4)
-    assert torch.allclose(rewards, torch.stack(stepped, 1), **LOOSE)
-    assert all(torch.allclose(left, right, **LOOSE) for left, right in zip(last, state, strict=True))
+    return torch.stack(stepped, 1), state
+
+
+def test_a_rollout_equals_repeated_steps(model, state, actions, monkeypatch):
+    monkeypatch.setattr(model, "trunk_precision", lambda: torch.autocast("cpu", enabled=False))
+    rewards, last = model.rollout(state, actions)
+    stepped, final = step_through(model, state, actions)
+    assert torch.allclose(rewards, stepped, rtol=1e-3, atol=1e-3 * float(stepped.detach().std()))
+    assert all(torch.allclose(left, right, atol=1e-5) for left, right in zip(last, final, strict=True))
+
+
+def test_a_rollout_in_bfloat16_strays_no_further_than_its_steps_do(model, state, actions, monkeypatch):
+    (rewards, last), (stepped, final) = model.rollout(state, actions), step_through(model, state, actions)
+    monkeypatch.setattr(model, "trunk_precision", lambda: torch.autocast("cpu", enabled=False))
+    exact_rewards, exact = step_through(model, state, actions)
+    for rounded, by_steps, true in ((rewards, stepped, exact_rewards), *zip(last, final, exact, strict=True)):
+        assert (rounded - true).square().mean() < 4.0 * (by_steps - true).square().mean()
+
+
+def test_a_rollout_passes_gradients_to_its_actions(model, state, actions):
+    rewards, last = model.rollout(state, actions.requires_grad_())
+    (gradient,) = torch.autograd.grad(rewards[:, -1].sum() + last.deter.sum(), actions)
+    assert gradient.abs().sum(-1).min() > 0.0
+
+
+def test_rows_beyond_a_block_are_the_same_rows(model, state, actions, monkeypatch):
+    whole, last = model.rollout(state, actions)
+    monkeypatch.setattr("latentplan.models.imagination.ROWS_PER_THREAD", 1)
+    monkeypatch.setattr(torch, "get_num_threads", lambda: 2)
+    in_blocks, also_last = model.rollout(state, actions)
+    assert torch.allclose(in_blocks, whole, **LOOSE)
+    assert torch.allclose(also_last.deter, last.deter, **LOOSE)
 
 
 def test_rewards_arrive_with_the_state_that_the_action_leads_to(model, state, actions):

@@ -69,14 +69,6 @@ class FullPrecisionModel(WorldModel):
         """No autocast."""
         return torch.autocast(self.device.type, enabled=False)
 
-    def rollout(self, state: State, actions: Tensor) -> tuple[Tensor, State]:
-        """Imagine action sequences (rows, horizon, action): rewards (rows, horizon) and the last state."""
-        features, visited = state.features, []
-        for action in actions.unbind(1):
-            features = next_features(self, features, action)
-            visited.append(features)
-        return rewards_at(self, torch.stack(visited, 1)), as_state(self, features)
-
 
 def build_model(problem: Problem, dtype: str) -> WorldModel:
     """The seeded world model of a problem, its trunk computed in `float32` or `bfloat16`; the weights are the same."""
