@@ -1,6 +1,7 @@
 """What several test files share."""
 
 import os
+import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -26,3 +27,7 @@ def run_python():
         return subprocess.run(command, cwd=cwd, env=environment, capture_output=True, text=True, timeout=timeout)
 
     return run
+
+
+# A shell starts background jobs with Ctrl-C ignored, and their children inherit it: tests of interruption must not.
+signal.signal(signal.SIGINT, signal.default_int_handler)
