@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from matplotlib.ticker import EngFormatter
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -69,4 +70,4 @@ def _draw(axes: Axes, metrics_csv: str | os.PathLike[str], clock: str) -> None:
     axes.margins(x=0.02)
     axes.grid(alpha=0.25)
     axes.spines[["top", "right"]].set_visible(False)
-    axes.ticklabel_format(axis="x", style="plain")
+    axes.xaxis.set_major_formatter(EngFormatter(sep=""))
