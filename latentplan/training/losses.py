@@ -50,7 +50,9 @@ def world_model_loss(
         patches = model.decoder(features.flatten(0, 1))
         reward_logits = model.reward_head(features[:, 1:])
         continue_logits = model.continue_head(features[:, 1:]).squeeze(-1)
-    overshooting, overshot_reward = _overshooting(model, batch, states, posterior, config)
+    overshooting = overshot_reward = batch.rewards.new_zeros(())
+    if config.overshooting_scale > 0.0:
+        overshooting, overshot_reward = _overshooting(model, batch, states, posterior, config)
     parts = {
         "reconstruction": model.decoder.loss(patches, batch.frames.flatten(0, 1)).mean(),
         "reward": model.reward_head.loss(reward_logits, batch.rewards).mean(),

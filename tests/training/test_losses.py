@@ -100,7 +100,7 @@ def test_the_model_loss_is_the_weighted_sum_of_its_parts(model, batch, tiny):
 def test_open_loop_predictions_follow_the_mean_of_the_prior_from_a_detached_start(model, batch, tiny):
     """The overshooting terms, by hand: every window's first posterior, then the true actions step by step."""
     horizon = 2
-    config = tiny("", learning={"overshooting_horizon": horizon, "free_nats": 0.0}).learning
+    config = tiny("", learning={"overshooting_scale": 1.0, "overshooting_horizon": horizon, "free_nats": 0.0}).learning
     noise = torch.randn(*batch.frames.shape[:2], 32, generator=stream())
     with torch.no_grad():
         with model.trunk_precision():
