@@ -214,13 +214,14 @@ class _Run:
         )
 
     def _finish(self, trainer: lightning.Trainer, save: Save, film: Path) -> dict[str, float]:
+        clocks = save.clocks(self.learner)
         weights = {name: value.detach().cpu().numpy() for name, value in self.learner.model.state_dict().items()}
         episodes = self.config.evaluation.final_episodes
         self.console.console.print(f"final evaluation: {episodes} episodes each of planner and actor")
         self.worker.submit("evaluate", episodes, film if self.config.evaluation.video else None, weights)
         returns = self.worker.result()
         summary = {mode: float(np.mean(values)) for mode, values in returns.items()}
-        info = save.clocks(self.learner) | {"final_evaluation": returns}
+        info = clocks | {"final_evaluation": returns}
         (self.folder / "final.json").write_text(json.dumps(info | summary, indent=1))
         save.save_agent("last", self.learner.model, info)
         if summary["planner"] >= self.state.best_return:
@@ -228,7 +229,7 @@ class _Run:
             self.state.best_return = summary["planner"]
             save.save_run(trainer, self.learner)
         self.console.console.print(
-            f"trained {self.state.env_frames:,} frames in {self.state.minutes:.1f} min: planner "
+            f"trained {clocks['env_frames']:,} frames in {clocks['minutes']:.1f} min: planner "
             f"{summary['planner']:.1f}, actor {summary['actor']:.1f} ({episodes} episodes)\nrun folder: {self.folder}"
         )
         return summary
