@@ -5,7 +5,7 @@ from __future__ import annotations
 from latentplan.envs.gl import choose_backend, render_info
 from latentplan.envs.suite import SuiteEnv, default_task
 from latentplan.envs.user import PixelEnv, make_from, wrap_user_env
-from latentplan.envs.vector import make_env, make_vector_env
+from latentplan.envs.vector import make_env, make_vector_env, single_threaded_children
 
 __all__ = [
     "PixelEnv",
@@ -15,6 +15,7 @@ __all__ = [
     "make_from",
     "make_vector_env",
     "render_info",
+    "single_threaded_children",
     "wrap_user_env",
 ]
 

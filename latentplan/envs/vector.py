@@ -63,7 +63,7 @@ def make_vector_env(
     builders = [_Builder(config, _derived_seed(seed, index), make_env) for index in range(num_envs)]
     if num_envs == 1:
         return SyncVectorEnv(builders, autoreset_mode=AutoresetMode.DISABLED)
-    with _single_threaded_children():
+    with single_threaded_children():
         return AsyncVectorEnv(builders, shared_memory=True, context="spawn", autoreset_mode=AutoresetMode.DISABLED)
 
 
@@ -85,7 +85,7 @@ def _derived_seed(seed: int | None, index: int) -> int | None:
 
 
 @contextmanager
-def _single_threaded_children() -> Iterator[None]:
+def single_threaded_children() -> Iterator[None]:
     """Thread limits in the environment while processes start: their libraries read them at import."""
     before = {name: os.environ.get(name) for name in _THREAD_SETTINGS}
     os.environ.update(dict.fromkeys(_THREAD_SETTINGS, "1"))

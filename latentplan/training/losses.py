@@ -78,9 +78,9 @@ def world_model_loss(
 def imagine(model: WorldModel, start: State, horizon: int, generator: torch.Generator) -> Imagination:
     """Roll the actor out in the model for `horizon` steps from rows of states, with gradients through the dynamics.
 
-    Every other row follows the mean of the prior, as the planner does, instead of a sample: a value that has only seen
-    samples is wrong about the means. The actor reads its state without a gradient, so that each action is credited
-    along the dynamics alone (Hafner et al. 2020, section 3).
+    Every other row follows the mean of the prior instead of a sample, so that the value learns on the states a planner
+    asks about. The actor reads its state without a gradient, so that each action is credited along the dynamics alone
+    (Hafner et al. 2020, section 3).
     """
     state, features, entropies = start, [start.features], []
     rows, device = len(start.deter), start.deter.device

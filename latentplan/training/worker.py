@@ -3,13 +3,10 @@
 from __future__ import annotations
 
 import multiprocessing
-import os
 import sys
 import traceback
 from collections import deque
-from collections.abc import Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import contextmanager
 from multiprocessing.connection import Connection
 from typing import Any
 
@@ -17,10 +14,10 @@ import torch
 from gymnasium.vector.utils import CloudpickleWrapper
 
 from latentplan.config import Config, UserError
+from latentplan.envs import single_threaded_children
 from latentplan.training.collector import Collector, EnvFactory
 
 CLOSING_SECONDS = 5.0
-THREAD_SETTINGS = ("OMP_NUM_THREADS", "LP_NUM_THREADS")
 
 
 class LocalWorker:
@@ -51,7 +48,7 @@ class RemoteWorker:
         self._connection, theirs = context.Pipe()
         arguments = (theirs, make_user_env and CloudpickleWrapper(make_user_env), config)
         self._process = context.Process(target=_serve, args=arguments, daemon=config.env.num_envs == 1)
-        with _single_threaded():
+        with single_threaded_children():
             self._process.start()
         theirs.close()
         # A thread waits on the pipe, so that neither side ever blocks on the other's full buffer.
@@ -121,17 +118,3 @@ def _serve(connection: Connection, factory: EnvFactory | None, config: Config) -
             connection.send(("user_error", str(error)))
         except Exception:
             connection.send(("error", traceback.format_exc()))
-
-
-@contextmanager
-def _single_threaded() -> Iterator[None]:
-    before = {name: os.environ.get(name) for name in THREAD_SETTINGS}
-    os.environ.update(dict.fromkeys(THREAD_SETTINGS, "1"))
-    try:
-        yield
-    finally:
-        for name, value in before.items():
-            if value is None:
-                del os.environ[name]
-            else:
-                os.environ[name] = value

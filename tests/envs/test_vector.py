@@ -14,6 +14,7 @@ ACTIONS = np.random.default_rng(0).uniform(-1.0, 1.0, (6, 2, 1)).astype(np.float
 
 @pytest.fixture(scope="module")
 def pair():
+    make_env(CONFIG).close()  # loads MuJoCo, which leaves a variable of its own behind the first time
     before = dict(os.environ)
     pair = make_vector_env(CONFIG, 2, seed=0)
     assert dict(os.environ) == before
