@@ -14,6 +14,7 @@ from gymnasium.error import ResetNeeded
 
 from latentplan.config import EnvConfig, UserError
 from latentplan.envs.gl import explain_gl_errors, require_backend
+from latentplan.envs.quantities import measure, scales
 from latentplan.envs.render import FrameRenderer
 
 if TYPE_CHECKING:
@@ -63,11 +64,13 @@ class SuiteEnv(gymnasium.Env[np.ndarray, np.ndarray]):
     An observation is a uint8 frame (64, 64, 3), always a fresh array. An action is float32 (action,) in
     [-1, 1], scaled to the actuators' range. `reset(seed=s)` depends on s alone; `reset()` continues the
     random stream. The time limit truncates; only the task itself terminates. `info["env_frames"]` counts
-    the control steps that a step took, which is fewer than the action repeat where an episode ends early.
+    the control steps that a step took, which is fewer than the action repeat where an episode ends early;
+    `info["labels"]` holds the true quantities at the frame, float32 (label,).
 
     Attributes:
         action_repeat: Control steps per decision; rewards are summed over them.
         decisions_per_episode: Decisions until the time limit.
+        labels: Names of the quantities in `info["labels"]`, and the typical size of each.
     """
 
     metadata = {"render_modes": ["rgb_array"]}
@@ -86,7 +89,8 @@ class SuiteEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         task = default_task(config.domain) if config.task is None else config.task
         self._task_env = _load(config.domain, task)
         self._camera = _checked_camera(self.physics, config)
-        self._quality = config.render_quality
+        self._domain, self._quality = config.domain, config.render_quality
+        self.labels = scales(config.domain)
         self._renderers: dict[int, FrameRenderer] = {}
         self._needs_reset = True
         self._steps_left = 0
@@ -124,7 +128,7 @@ class SuiteEnv(gymnasium.Env[np.ndarray, np.ndarray]):
             options: Not used.
 
         Returns:
-            The first frame (64, 64, 3), and an info with no `env_frames` taken.
+            The first frame (64, 64, 3), and an info with no `env_frames` taken and the first labels.
         """
         super().reset(seed=seed)
         if seed is not None:
@@ -134,7 +138,7 @@ class SuiteEnv(gymnasium.Env[np.ndarray, np.ndarray]):
             renderer.refresh_terrain()
         self._steps_left = self._steps_per_episode
         self._needs_reset = False
-        return self.render(), {"env_frames": 0}
+        return self.render(), self._info(0)
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
         """Hold an action for `action_repeat` control steps.
@@ -161,7 +165,7 @@ class SuiteEnv(gymnasium.Env[np.ndarray, np.ndarray]):
             # The suite marks an end of its own with discount 0, and the time limit with discount 1.
             terminated = outcome.last() and outcome.discount == 0.0
             self._needs_reset = outcome.last() or self._steps_left <= 0
-        return self.render(), reward, terminated, self._needs_reset and not terminated, {"env_frames": env_frames}
+        return self.render(), reward, terminated, self._needs_reset and not terminated, self._info(env_frames)
 
     def render(self) -> np.ndarray:  # type: ignore[override]
         """The present state as the agent sees it, a fresh uint8 array (64, 64, 3)."""
@@ -180,6 +184,9 @@ class SuiteEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         self._renderers.clear()
         self.physics.free()
         self._needs_reset = True
+
+    def _info(self, env_frames: int) -> dict[str, Any]:
+        return {"env_frames": env_frames, "labels": measure(self._domain, self.physics)}
 
     def _seed_task(self, seed: int | None) -> None:
         self._task_env.task.random.seed(seed)
