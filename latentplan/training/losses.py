@@ -90,9 +90,7 @@ def imagine(model: WorldModel, start: State, horizon: int, generator: torch.Gene
     """
     state, features, stds = start, [start.features], []
     rows, device = len(start.deter), start.deter.device
-    draws = torch.randn(
-        horizon, rows, model.action_dim + model.config.latent_dim, generator=generator, device=device
-    )
+    draws = torch.randn(horizon, rows, model.action_dim + model.config.latent_dim, generator=generator, device=device)
     action_noise, noise = draws.split([model.action_dim, model.config.latent_dim], -1)
     noise = noise * (torch.arange(rows, device=device) % 2).unsqueeze(-1)
     for step in range(horizon):
@@ -169,7 +167,7 @@ def _overshooting(
 
 
 def _probe_loss(model: WorldModel, features: Tensor, labels: Tensor) -> Tensor:
-    """Squared error of the quantities read off the latent, in their typical sizes; the latent learns nothing from it."""
+    """Squared error of the quantities read off the latent, in typical sizes; the latent learns nothing from it."""
     with model.trunk_precision():
         predicted = model.probe(features.detach())
     return ((predicted - labels) / model.label_scales).square().mean()

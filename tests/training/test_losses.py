@@ -91,7 +91,7 @@ def test_the_model_loss_is_the_weighted_sum_of_its_parts(model, batch, tiny):
     config = tiny("", learning=chosen).learning
     loss, states, parts = world_model_loss(model, batch, config, stream())
     scales = {"reconstruction": 2.0, "reward": 3.0, "continue": 1.0, "dynamics": 1.0, "representation": 0.5}
-    scales |= {"overshooting": 0.7, "overshot_reward": 0.7 * 3.0}
+    scales |= {"overshooting": 0.7, "overshot_reward": 0.7 * 3.0, "probe": 1.0}
     assert parts.keys() == scales.keys()
     assert loss.item() == pytest.approx(sum(scale * parts[name].item() for name, scale in scales.items()), rel=1e-5)
     assert states.deter.shape == (4, 6, 16) and states.stoch.shape == (4, 6, 32)
@@ -150,10 +150,9 @@ def test_the_model_loss_leaves_actor_and_value_alone(model, batch, tiny):
 def test_the_behaviour_loss_leaves_the_world_model_alone(learner, batch):
     _, states, _ = world_model_loss(learner.model, batch, learner.config, stream())
     loss, _ = learner._behaviour_loss(states, batch, stream())
-    loss.backward()
+    learner._descend(learner.configure_optimizers()[1], loss)
     assert names_with_gradient(learner.model) == {"actor", "value_head"}
     assert all(parameter.grad is None for parameter in learner.target_value.parameters())
-    assert all(parameter.requires_grad for parameter in learner.model.parameters())
 
 
 def test_the_actor_learns_through_the_dynamics(model):
@@ -189,3 +188,36 @@ def test_every_parameter_has_one_optimizer(learner):
     groups = [group["params"] for optimizer in learner.configure_optimizers() for group in optimizer.param_groups]
     owned = [id(parameter) for group in groups for parameter in group]
     assert sorted(owned) == sorted(id(parameter) for parameter in learner.model.parameters())
+
+
+def test_probes_read_the_latent_without_shaping_it(batch, tiny):
+    torch.manual_seed(0)
+    model = WorldModel(tiny("").model, action_dim=1, labels={"height": 2.0, "speed": 0.5})
+    labelled = batch._replace(labels=torch.randn(4, 6, 2, generator=stream()))
+    _, states, parts = world_model_loss(model, labelled, tiny("").learning, stream())
+    error = (model.probe(states.features) - labelled.labels) / torch.tensor([2.0, 0.5])
+    assert parts["probe"].item() == pytest.approx(error.square().mean().item(), rel=0.02)
+    with_probe, without = (
+        world_model_loss(model, labels, tiny("").learning, stream())[0]
+        for labels in (labelled, batch._replace(labels=model.probe(states.features).detach()))
+    )
+    gradients = [torch.autograd.grad(loss, model.encoder.linear.weight)[0] for loss in (with_probe, without)]
+    assert torch.equal(*gradients)
+
+
+def test_a_probe_learns_the_quantity_of_its_name(batch, tiny):
+    torch.manual_seed(0)
+    model = WorldModel(tiny("").model, action_dim=1, labels={"height": 2.0})
+    features = torch.randn(4, 6, 48, generator=stream())
+    labels = 3.0 * features[..., :1]
+    optimizer = torch.optim.Adam(model.probe_head.parameters(), lr=1e-2)
+    for _ in range(150):
+        optimizer.zero_grad()
+        ((model.probe(features) - labels) / model.label_scales).square().mean().backward()
+        optimizer.step()
+    assert (model.probe(features) - labels).abs().mean() < 0.5
+
+
+def test_a_model_without_labels_refuses_to_be_probed(model):
+    with pytest.raises(ValueError, match="without labels"):
+        model.probe(torch.zeros(2, 48))
