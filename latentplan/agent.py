@@ -141,8 +141,7 @@ class PlanningAgent(ModelAgent):
         return self._picture(self.state, self.controller.plan.actions)
 
     def _choose(self, state: State) -> Tensor:
-        # One autocast around the whole search converts each weight once, not once per model call.
-        with self.model.trunk_precision():
+        with self.model.planning():
             return self.controller.act(state)
 
 

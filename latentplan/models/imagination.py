@@ -15,7 +15,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from latentplan.models.dynamics import Rssm, State
-from latentplan.models.heads import NormedLinear, ScalarHead
+from latentplan.models.heads import Actor, Mlp, NormedLinear, ScalarHead, action_distribution
 
 ROWS_PER_THREAD = 1024  # what one step makes of more rows no longer fits a core's cache
 BIN_MULTIPLE = 16  # float32 products with another number of columns take half as long again
@@ -24,7 +24,7 @@ Norm = tuple[Tensor, Tensor]  # scale and shift
 
 
 class Weights(NamedTuple):
-    """Recurrence and reward head, laid out for products from the left: (in, out).
+    """Recurrence, reward head and actor, laid out for products from the left: (in, out).
 
     Into the gates' norm go the 1 that the update gate subtracts, and the factor 2 of tanh(x) = 2 sigmoid(2 x) - 1.
     """
@@ -42,11 +42,14 @@ class Weights(NamedTuple):
     logits: Tensor
     logits_shift: Tensor
     values: Tensor
+    actor: tuple[tuple[Tensor, Norm], ...]
+    actor_output: Tensor
+    actor_shift: Tensor
 
 
 @torch.no_grad()
-def lay_out(dynamics: Rssm, head: ScalarHead, dtype: torch.dtype) -> Weights:
-    """The weights of a recurrence and a reward head, products in `dtype`; gates' norm and head's output in float32."""
+def lay_out(dynamics: Rssm, head: ScalarHead, actor: Actor, dtype: torch.dtype) -> Weights:
+    """The weights of what imagines, products in `dtype`; gates' norm and the heads' outputs in float32."""
 
     def turn(weight: Tensor) -> Tensor:
         return weight.to(dtype).t().contiguous()
@@ -60,7 +63,11 @@ def lay_out(dynamics: Rssm, head: ScalarHead, dtype: torch.dtype) -> Weights:
     scale[deter : 2 * deter] *= 2.0
     shift[deter : 2 * deter] *= 2.0
     shift[2 * deter :] -= 1.0
-    hidden_layers = [layer for layer in head.mlp.trunk if isinstance(layer, NormedLinear)]
+
+    def trunk(mlp: Mlp) -> tuple[tuple[Tensor, Norm], ...]:
+        layers = [layer for layer in mlp.trunk if isinstance(layer, NormedLinear)]
+        return tuple((turn(layer.linear.weight), norm(layer.norm)) for layer in layers)
+
     padding = -output.out_features % BIN_MULTIPLE
     return Weights(
         action=turn(input_weight[:, latent:]),
@@ -72,10 +79,13 @@ def lay_out(dynamics: Rssm, head: ScalarHead, dtype: torch.dtype) -> Weights:
         prior_norm=norm(dynamics.prior_hidden.norm),
         mean=turn(dynamics.prior_output.weight[:latent]),
         mean_shift=dynamics.prior_output.bias[:latent].to(dtype),
-        head=tuple((turn(layer.linear.weight), norm(layer.norm)) for layer in hidden_layers),
+        head=trunk(head.mlp),
         logits=functional.pad(output.weight.t(), (0, padding)),
         logits_shift=functional.pad(output.bias, (0, padding), value=float("-inf")),
         values=functional.pad(head.values, (0, padding)),
+        actor=trunk(actor.mlp),
+        actor_output=actor.mlp.output.weight.t().contiguous(),
+        actor_shift=actor.mlp.output.bias.clone(),
     )
 
 
@@ -95,6 +105,28 @@ def imagine(weights: Weights, state: State, actions: Tensor) -> tuple[Tensor, St
     return rewards, State(deters, stochs)
 
 
+def follow_actor(weights: Weights, state: State, noise: Tensor) -> Tensor:
+    """The actions that the actor takes along the mean of the prior, float32 (rows, time, action).
+
+    Args:
+        weights: What `lay_out` gave.
+        state: Where every sequence starts, (rows, ...).
+        noise: Standard normal draws for its samples, zeros for its mode, (rows, time, action).
+    """
+    deter, stoch = state.deter.float(), state.stoch.to(weights.gates.dtype)
+    rounded, actions = deter.to(stoch.dtype), []
+    with torch.autocast(noise.device.type, enabled=False):
+        for draw in noise.unbind(1):
+            hidden = torch.cat([rounded, stoch], -1)
+            for weight, norm in weights.actor:
+                hidden = _layer(hidden, weight, norm)
+            mean, std = action_distribution(torch.addmm(weights.actor_shift, hidden.float(), weights.actor_output))
+            actions.append(torch.addcmul(mean, std, draw).clamp(-1.0, 1.0))
+            push = actions[-1].to(stoch.dtype) @ weights.action
+            deter, rounded, stoch = _step(weights, deter, rounded, stoch, push)
+    return torch.stack(actions, 1)
+
+
 def _imagine_block(weights: Weights, deter: Tensor, stoch: Tensor, actions: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     dtype = weights.gates.dtype
     # Few rows take the reward head many steps at a time: one product of a thousand rows costs two of a hundred.
@@ -103,9 +135,7 @@ def _imagine_block(weights: Weights, deter: Tensor, stoch: Tensor, actions: Tens
     deter, rounded, stoch = deter.float(), deter.to(dtype), stoch.to(dtype)
     seen, rewards = [], []
     for push in pushes:
-        deter = _advance(weights, deter, rounded, stoch, push)
-        rounded = deter.to(dtype)
-        stoch = torch.addmm(weights.mean_shift, _layer(rounded, weights.prior, weights.prior_norm), weights.mean)
+        deter, rounded, stoch = _step(weights, deter, rounded, stoch, push)
         seen.append(torch.cat([rounded, stoch], -1))
         if len(seen) == steps_at_once:
             rewards.append(_rewards(weights, seen))
@@ -113,6 +143,16 @@ def _imagine_block(weights: Weights, deter: Tensor, stoch: Tensor, actions: Tens
     if seen:
         rewards.append(_rewards(weights, seen))
     return torch.cat(rewards, 1), deter, stoch.float()
+
+
+def _step(
+    weights: Weights, deter: Tensor, rounded: Tensor, stoch: Tensor, push: Tensor
+) -> tuple[Tensor, Tensor, Tensor]:
+    """The next deter, the same rounded to the products' dtype, and the mean of the prior there."""
+    deter = _advance(weights, deter, rounded, stoch, push)
+    rounded = deter.to(stoch.dtype)
+    hidden = _layer(rounded, weights.prior, weights.prior_norm)
+    return deter, rounded, torch.addmm(weights.mean_shift, hidden, weights.mean)
 
 
 def _advance(weights: Weights, deter: Tensor, rounded: Tensor, stoch: Tensor, push: Tensor) -> Tensor:

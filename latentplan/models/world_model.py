@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from contextlib import AbstractContextManager
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager, contextmanager
 
 import torch
 from torch import Tensor, nn
@@ -13,7 +13,7 @@ from latentplan.models.decoder import Decoder
 from latentplan.models.dynamics import Rssm, State
 from latentplan.models.encoder import Encoder
 from latentplan.models.heads import Actor, Mlp, ScalarHead, sample_action
-from latentplan.models.imagination import imagine, lay_out
+from latentplan.models.imagination import Weights, follow_actor, imagine, lay_out
 
 
 class WorldModel(nn.Module):
@@ -41,6 +41,7 @@ class WorldModel(nn.Module):
         self.continue_head = Mlp(features, config.hidden_dim, 1)
         self.value_head = ScalarHead(features, config.hidden_dim, config.num_bins)
         self.actor = Actor(features, config.hidden_dim, action_dim)
+        self._laid_out: Weights | None = None
         self.register_buffer("label_scales", torch.tensor(list(self.labels.values())), persistent=False)
         if self.labels:
             self.probe_head = Mlp(features, config.hidden_dim, len(self.labels))
@@ -48,6 +49,16 @@ class WorldModel(nn.Module):
     def trunk_precision(self) -> AbstractContextManager[None]:
         """Autocast to bfloat16 for the products in the trunk; heads leave it by themselves."""
         return torch.autocast(self.device.type, dtype=torch.bfloat16)
+
+    @contextmanager
+    def planning(self) -> Iterator[None]:
+        """For one search: the trunk's precision, every weight converted once; none may change meanwhile."""
+        with self.trunk_precision():
+            self._laid_out = self._weights()
+            try:
+                yield
+            finally:
+                self._laid_out = None
 
     @property
     def device(self) -> torch.device:
@@ -91,10 +102,25 @@ class WorldModel(nn.Module):
 
     def rollout(self, state: State, actions: Tensor) -> tuple[Tensor, State]:
         """Imagine action sequences (rows, horizon, action): rewards (rows, horizon) and the last state."""
-        kind = actions.device.type
-        with self.trunk_precision():
-            dtype = torch.get_autocast_dtype(kind) if torch.is_autocast_enabled(kind) else torch.float32
-        return imagine(lay_out(self.dynamics, self.reward_head, dtype), state, actions)
+        return imagine(self._weights(), state, actions)
+
+    def propose(self, state: State, num: int, horizon: int, generators: Sequence[torch.Generator]) -> Tensor:
+        """What the actor does from each state, its mode first and then samples, (batch num, horizon, action).
+
+        Args:
+            state: Rows (batch,).
+            num: Sequences from each.
+            horizon: Model steps.
+            generators: One stream per row, so that samples do not depend on who shares the call.
+        """
+        draws = [
+            torch.randn(num, horizon, self.action_dim, generator=generator, device=self.device)
+            for generator in generators
+        ]
+        noise = torch.stack(draws)
+        noise[:, 0] = 0.0
+        repeated = State(*(part.repeat_interleave(num, 0) for part in state))
+        return follow_actor(self._weights(), repeated, noise.flatten(0, 1))
 
     def value(self, state: State) -> Tensor:
         """Expected discounted return from a state on, (rows,)."""
@@ -113,6 +139,15 @@ class WorldModel(nn.Module):
         """Probability (rows,) that the episode goes on at a state."""
         with self.trunk_precision():
             return torch.sigmoid(self.continue_head(state.features)).squeeze(-1)
+
+    def _weights(self) -> Weights:
+        """Weights laid out for imagination; gradients do not pass through them."""
+        if self._laid_out is not None:
+            return self._laid_out
+        kind = self.device.type
+        with self.trunk_precision():
+            dtype = torch.get_autocast_dtype(kind) if torch.is_autocast_enabled(kind) else torch.float32
+        return lay_out(self.dynamics, self.reward_head, self.actor, dtype)
 
     def _advance_mean(self, state: State, action: Tensor) -> State:
         deter = self.dynamics.advance(state, action)

@@ -25,8 +25,15 @@ class Scores(NamedTuple):
 
     def first(self, num: int) -> Scores:
         """The scores of the first candidates."""
-        violations = None if self.violations is None else self.violations[:, :num]
-        return Scores(self.returns[:, :num], violations, self.is_ranked)
+        return self._part(slice(num))
+
+    def rest(self, num: int) -> Scores:
+        """The scores of all but the first candidates."""
+        return self._part(slice(num, None))
+
+    def _part(self, samples: slice) -> Scores:
+        violations = None if self.violations is None else self.violations[:, samples]
+        return Scores(self.returns[:, samples], violations, self.is_ranked)
 
     @staticmethod
     def join(parts: Sequence[Scores]) -> Scores:

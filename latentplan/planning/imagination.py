@@ -84,12 +84,15 @@ class Scorer:
         rows = rearrange(actions, "batch sample horizon action -> (batch sample) horizon action")
         if particles > 1:
             rows = repeat_rows(rows, particles)
-        return self._judge(self._imagine(start, rows, batch, particles))
+        scores = self._judge(self._imagine(start, rows, batch, particles))
+        # A policy that answers NaN must not become an elite through a model that ignores its action.
+        is_finite = torch.isfinite(actions).all(dim=-1).all(dim=-1)
+        return scores._replace(returns=scores.returns.masked_fill(~is_finite, float("nan")))
 
     def propose(
         self, state: State, num: int, generators: Sequence[torch.Generator], bounds: tuple[Tensor, Tensor]
-    ) -> tuple[Tensor, Scores]:
-        """Sequences that the model's policy takes in imagination, its own mode first, and their scores.
+    ) -> Tensor:
+        """Sequences that the model's policy takes in imagination, its own mode first, (batch, num, horizon, action).
 
         Args:
             state: Where the plan starts, rows (batch,).
@@ -98,10 +101,15 @@ class Scorer:
             bounds: Lowest and highest action, each (action,).
 
         Returns:
-            Sequences (batch, num, horizon, action) within the bounds, and their scores.
+            The sequences, within the bounds; not finite where the policy is not.
         """
         require(self.model, "policy", "num_policy_samples above 0")
         batch, horizon, (low, high) = len(generators), len(self.discounts) - 1, bounds
+        if supports(self.model, "propose"):
+            rows = self.model.propose(state, num, horizon, generators)  # type: ignore[attr-defined]
+            check_shape("propose()", rows, (batch * num, horizon, len(low)))
+            rows = torch.clamp(rows.to(low.dtype), low, high)
+            return rearrange(rows, "(batch num) horizon action -> batch num horizon action", batch=batch)
         chosen: list[Tensor] = []
 
         def choose(_: int, rows: State) -> Tensor:
@@ -110,17 +118,9 @@ class Scorer:
             chosen.append(torch.clamp(action.to(low.dtype), low, high))
             return chosen[-1]
 
-        start = repeat_rows(state, num)
-        rewards, states, weights = self._step_through(start, horizon, choose)
+        self._step_through(repeat_rows(state, num), horizon, choose)
         rows = torch.stack(chosen, dim=1)
-        actions = rearrange(rows, "(batch num) horizon action -> batch num horizon action", batch=batch)
-        if self.objective.num_particles == 1:
-            scores = self._judge(Rollout(self.model, batch, 1, rows, rewards, weights, start, states[-1], states))
-        else:
-            scores = self.score(self.start_rows(state, num), actions)
-        is_finite = torch.isfinite(actions).all(dim=-1).all(dim=-1)
-        # A policy that answers NaN must not become an elite through a model that ignores its action.
-        return actions, scores._replace(returns=scores.returns.masked_fill(~is_finite, float("nan")))
+        return rearrange(rows, "(batch num) horizon action -> batch num horizon action", batch=batch)
 
     def continue_by_policy(
         self, state: State, actions: Tensor, is_tail: Tensor, bounds: tuple[Tensor, Tensor]

@@ -82,10 +82,10 @@ class Search:
         if not self.budget.allows("propose", "iteration", "choose"):
             return self._fall_back(last)
         self.budget.lap()
-        proposals: list[Candidates] = []
+        proposals: Tensor | None = None
         if options.num_policy_samples:
             generators, bounds = self.streams.policy_generators(), (self.low, self.high)
-            proposals = [self.scorer.propose(self.state, options.num_policy_samples, generators, bounds)]
+            proposals = self.scorer.propose(self.state, options.num_policy_samples, generators, bounds)
             self.budget.lap("propose")
         progress, history, stopped = self._iterate(start, proposals)
         # Where nothing finite was found: the last plan's tail, or zeros clamped into the bounds.
@@ -115,25 +115,23 @@ class Search:
 
     def _fall_back(self, last: WarmStart) -> Plan:
         """The shifted last plan, or zeros, where there is no time to search; what is cold stays cold."""
-        progress, _, _ = self._begin(last, [], 1)
+        progress, _, _ = self._begin(last, None, 1)
         info = progress.describe([], "deadline")
         if self.scorer.constraints:
             info["violation"] = torch.full_like(progress.expected_return, float("nan"))
         ones = torch.ones(self.batch, dtype=torch.long)
         return Plan(last.mean, last.mean, last.var, progress.expected_return, info, None, last.is_warm, ones)
 
-    def _iterate(
-        self, start: WarmStart, proposals: list[Candidates]
-    ) -> tuple[Progress, list[tuple[Tensor, Tensor]], str]:
+    def _iterate(self, start: WarmStart, proposals: Tensor | None) -> tuple[Progress, list[tuple[Tensor, Tensor]], str]:
         """The refits; after each, the elites' mean return and the mean sampling std, both (batch,); what ended them."""
         options, num_fresh = self.options, self.options.num_samples - self.options.num_policy_samples
-        rows = self.scorer.start_rows(self.state, num_fresh)
         progress, centre, spread = self._begin(start, proposals, num_fresh)
         warm_iterations = options.warm_start_iterations or options.num_iterations
         budget = torch.where(start.is_warm, warm_iterations, options.num_iterations)
         num_common = int(budget.min())
         is_active = torch.ones(self.batch, dtype=torch.bool, device=self.device)
-        known, history, stopped = proposals, [], "iterations"
+        known: list[Candidates] = []
+        history, stopped = [], "iterations"
         for iteration in range(int(budget.max())):
             if iteration and not self.budget.allows("iteration", "choose"):
                 stopped = "deadline"
@@ -142,10 +140,13 @@ class Search:
             fresh[:, 0] = progress.mean if iteration else start.mean
             if iteration == 0:
                 self._place_elites(fresh, start)
+                fresh = fresh if proposals is None else torch.cat([fresh, proposals], dim=1)
+            if iteration <= 1:  # the proposals are scored once
+                rows = self.scorer.start_rows(self.state, fresh.shape[1])
             scores = self.scorer.score(rows, fresh)
             updated = self._refit(progress, [(fresh, scores), *known, *self._kept(progress)], scores.returns)
-            if iteration == 0:  # the shifted last plan stays among the candidates
-                known = [*proposals, (fresh[:, :1], scores.first(1))]
+            if iteration == 0:  # the policy's proposals and the shifted last plan stay among the candidates
+                known = [(fresh[:, num_fresh:], scores.rest(num_fresh)), (fresh[:, :1], scores.first(1))]
             elif iteration >= num_common or options.stop_std > 0:
                 updated = progress.updated(is_active & (budget > iteration).to(self.device), updated)
             progress = updated
@@ -160,12 +161,12 @@ class Search:
                     break
         return progress, history, stopped
 
-    def _begin(self, start: WarmStart, proposals: list[Candidates], num_fresh: int) -> tuple[Progress, Tensor, Tensor]:
+    def _begin(self, start: WarmStart, proposals: Tensor | None, num_fresh: int) -> tuple[Progress, Tensor, Tensor]:
         """The first distribution, and the centre and std of its samples, (batch, 1 or sample, horizon, action)."""
         mean, var = start.mean, start.var
         centre, spread = mean[:, None], self._sampling_std(var)[:, None]
-        if proposals and self.options.start != "shifted":
-            mode = proposals[0][0][:, 0]
+        if proposals is not None and self.options.start != "shifted":
+            mode = proposals[:, 0]
             mode = torch.where(torch.isfinite(mode), mode, mean)  # a policy that fails leaves the last plan
             mode_std = self.init_std.clamp_min(self.options.min_std).expand_as(mode)
             if self.options.start == "policy":

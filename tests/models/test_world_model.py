@@ -117,3 +117,32 @@ def test_the_planner_uses_all_of_it(model, state):
     )
     plan = planner.plan(model, state, generator=torch.Generator().manual_seed(0))
     assert plan.action.shape == (5, 3) and plan.expected_return.isfinite().all()
+
+
+def test_proposals_are_what_the_actor_does_step_by_step(model, state):
+    torch.manual_seed(0)
+    with torch.no_grad():
+        model.actor.mlp.output.weight.normal_(std=0.5)
+    generators = [torch.Generator().manual_seed(row) for row in range(5)]
+    proposed = model.propose(state, 3, 4, generators).unflatten(0, (5, 3))
+    assert proposed.abs().max() <= 1.0
+    believed, expected = state, []
+    for _ in range(4):
+        expected.append(model.policy(believed))
+        believed, _ = model.step(believed, expected[-1])
+    assert torch.allclose(proposed[:, 0], torch.stack(expected, 1), atol=0.03)  # both round to bfloat16, elsewhere
+    assert not torch.allclose(proposed[:, 1], proposed[:, 2], atol=0.05)
+    alone = model.propose(State(*(part[2:3] for part in state)), 3, 4, [torch.Generator().manual_seed(2)])
+    assert torch.allclose(alone, proposed[2], atol=0.03)
+
+
+def test_weights_laid_out_for_a_search_are_laid_out_anew_for_the_next(model, state, actions):
+    with model.planning():
+        before, _ = model.rollout(state, actions)
+        assert torch.equal(model.rollout(state, actions)[0], before)
+    with torch.no_grad():
+        model.reward_head.mlp.output.weight.mul_(1.5)
+    with model.planning():
+        after, _ = model.rollout(state, actions)
+    assert not torch.allclose(before, after, atol=0.05)
+    assert torch.equal(after, model.rollout(state, actions)[0])
