@@ -11,16 +11,18 @@ ROOT = Path(__file__).resolve().parent.parent
 PACKAGE = ROOT / "latentplan"
 
 # layer: (layers of latentplan it may import, libraries it may import); None allows anything.
-ALL = ("config", "planning", "models", "envs", "replay", "reporting", "agent", "rollout", "checkpoint")
+ALL = ("config", "planning", "models", "envs", "replay", "reporting", "goals", "agent", "rollout", "checkpoint")
 SIMULATION = {"dm_control", "dm_env", "mujoco", "gymnasium", "OpenGL"}
 LAYERS = {
     "config": ((), set()),
     "planning": (("config",), {"torch", "einops"}),
+    "goals": (("config", "planning"), {"torch", "einops", "numpy", "cv2"}),
     "models": (("config",), {"torch", "einops"}),
     "envs": (("config",), {*SIMULATION, "numpy", "cv2"}),
     "replay": (("config",), {"numpy", "torch", "einops"}),
     "reporting": (("config",), {"numpy", "cv2", "matplotlib", "rich"}),
-    "agent": (("config", "models", "planning"), {"torch", "numpy", "einops"}),
+    "agent": (("config", "models", "planning", "goals"), {"torch", "numpy", "einops"}),
+    "scoring": (("config", "envs", "goals"), {"numpy", "gymnasium"}),
     "rollout": (("config", "envs", "replay", "agent"), {"numpy"}),
     "checkpoint": (("config", "models", "planning", "agent"), {"torch", "numpy", "safetensors"}),
     "training": (

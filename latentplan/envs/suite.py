@@ -14,6 +14,7 @@ from gymnasium.error import ResetNeeded
 
 from latentplan.config import EnvConfig, UserError
 from latentplan.envs.gl import explain_gl_errors, require_backend
+from latentplan.envs.quantities import true_values
 from latentplan.envs.render import FrameRenderer
 
 if TYPE_CHECKING:
@@ -68,6 +69,8 @@ class SuiteEnv(gymnasium.Env[np.ndarray, np.ndarray]):
     Attributes:
         action_repeat: Control steps per decision; rewards are summed over them.
         decisions_per_episode: Decisions until the time limit.
+        record_quantities: Whether `info` of a step tells what was true after each of its control steps: `quantities`,
+            float64 (control step, quantity) in the order of `quantity_names`, and `rewards`, float64 (control step,).
     """
 
     metadata = {"render_modes": ["rgb_array"]}
@@ -93,6 +96,9 @@ class SuiteEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         # An episode lasts for the first whole number of steps that reaches dm_control's limit.
         limit = self._task_env._step_limit
         self._steps_per_episode = _UNLIMITED_EPISODE_STEPS if math.isinf(limit) else math.ceil(limit)
+        self._domain = config.domain
+        self.record_quantities = False
+        self._recorded: list[tuple[np.ndarray, float]] = []
         self.action_repeat = config.action_repeat
         frames_per_second = 1.0 / (self._task_env.control_timestep() * config.action_repeat)
         self.metadata = {**SuiteEnv.metadata, "render_fps": frames_per_second}
@@ -157,11 +163,13 @@ class SuiteEnv(gymnasium.Env[np.ndarray, np.ndarray]):
             outcome = self._task_env.step(control)
             reward += float(outcome.reward)
             env_frames += 1
+            self._record(outcome.reward)
             self._steps_left -= 1
             # The suite marks an end of its own with discount 0, and the time limit with discount 1.
             terminated = outcome.last() and outcome.discount == 0.0
             self._needs_reset = outcome.last() or self._steps_left <= 0
-        return self.render(), reward, terminated, self._needs_reset and not terminated, {"env_frames": env_frames}
+        info = {"env_frames": env_frames, **self._take_record()}
+        return self.render(), reward, terminated, self._needs_reset and not terminated, info
 
     def render(self) -> np.ndarray:  # type: ignore[override]
         """The present state as the agent sees it, a fresh uint8 array (64, 64, 3)."""
@@ -180,6 +188,17 @@ class SuiteEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         self._renderers.clear()
         self.physics.free()
         self._needs_reset = True
+
+    def _record(self, reward: float) -> None:
+        if self.record_quantities:
+            self._recorded.append((true_values(self._domain, self.physics), float(reward)))
+
+    def _take_record(self) -> dict[str, np.ndarray]:
+        if not self._recorded:
+            return {}
+        quantities, rewards = zip(*self._recorded, strict=True)
+        self._recorded = []
+        return {"quantities": np.stack(quantities), "rewards": np.array(rewards)}
 
     def _seed_task(self, seed: int | None) -> None:
         self._task_env.task.random.seed(seed)
