@@ -73,7 +73,7 @@ class ModelAgent:
         return latent[0] if single else latent
 
     def imagine(self) -> np.ndarray | None:
-        """The picture an agent looks forward to, uint8 (64, 64, 3); None without a plan."""
+        """The picture an agent looks forward to, uint8 (32, 32, 3); None without a plan."""
         return None
 
     def _choose(self, state: State) -> Tensor:
@@ -129,7 +129,7 @@ class PlanningAgent(ModelAgent):
 
     @torch.no_grad()
     def imagine(self) -> np.ndarray | None:
-        """The decoded last state of the present plan, uint8 (64, 64, 3), of the first environment."""
+        """The decoded last state of the present plan, uint8 (32, 32, 3), of the first environment."""
         if self.controller.plan is None or self.state is None:
             return None
         first = State(*(part[:1] for part in self.state))

@@ -33,7 +33,7 @@ def save_checkpoint(folder: Path, model: WorldModel, config: Config, info: dict[
     part = folder / f"{WEIGHTS}.part"
     save_file({name: value.detach().cpu().half().contiguous() for name, value in model.state_dict().items()}, part)
     digest = hashlib.sha256(part.read_bytes()).hexdigest()
-    facts = info | {"action_dim": model.action_dim, "config": to_dict(config), "sha256": digest}
+    facts = info | {"action_dim": model.action_dim, "labels": model.labels, "config": to_dict(config), "sha256": digest}
     part.replace(folder / WEIGHTS)
     (folder / f"{INFO}.part").write_text(json.dumps(facts, indent=1))
     (folder / f"{INFO}.part").replace(folder / INFO)
@@ -73,7 +73,7 @@ def load_model(path: str | Path, device: str = "cpu") -> tuple[WorldModel, Confi
         config = from_dict(info["config"])
     except (AttributeError, TypeError, ValueError) as error:
         raise UserError(f"the settings in {folder / INFO} cannot be used: {error}") from None
-    model = WorldModel(config.model, info["action_dim"])
+    model = WorldModel(config.model, info["action_dim"], info.get("labels"))
     state = {name: value.float() for name, value in load_file(weights).items()}
     try:
         model.load_state_dict(state)

@@ -23,7 +23,7 @@ FRAME_SHAPE = (64, 64, 3)
 FRAME_BYTES = 64 * 64 * 3
 MEMORY_SHARE = 0.9
 SAMPLING_ROUNDS = 1000
-COLUMNS = ("deter", "actions", "rewards", "continues")
+COLUMNS = ("deter", "actions", "rewards", "continues", "labels")
 LOADED_AT_ONCE = 1024
 MEMORY_FACTS = Path("/proc/meminfo")
 
@@ -39,6 +39,7 @@ class Rows:
         rewards: Arriving with the next frame, float32 (n,).
         continues: 1 unless the episode ended in a terminal state with the next frame, float32 (n,).
         is_first: Whether an episode starts at this row, bool (n,).
+        labels: True quantities at each frame, float32 (n, label); none of them without a simulator that tells.
     """
 
     frames: np.ndarray
@@ -47,6 +48,7 @@ class Rows:
     rewards: np.ndarray
     continues: np.ndarray
     is_first: np.ndarray
+    labels: np.ndarray
 
 
 class Batch(NamedTuple):
@@ -58,6 +60,7 @@ class Batch(NamedTuple):
         actions: actions[t] was taken at frames[t], (batch, time, action).
         rewards: rewards[t] arrived with frames[t + 1], (batch, time).
         continues: Whether the episode went on at frames[t + 1], (batch, time).
+        labels: True quantities at each frame, (batch, time + 1, label).
         rows: Where each frame lives in replay, (batch, time + 1), for `Replay.refresh`.
     """
 
@@ -66,6 +69,7 @@ class Batch(NamedTuple):
     actions: Tensor
     rewards: Tensor
     continues: Tensor
+    labels: Tensor
     rows: Tensor
 
 
@@ -78,22 +82,32 @@ class Replay:
         deter_dim: Size of the stored belief.
         num_lanes: Environments that write.
         device: Where the rows live and batches are gathered.
+        num_labels: Quantities that the simulator tells with each frame.
 
     Raises:
         UserError: The rows do not fit into nine tenths of the memory that is free.
     """
 
-    def __init__(self, capacity: int, action_dim: int, deter_dim: int, num_lanes: int, device: torch.device) -> None:
+    def __init__(
+        self,
+        capacity: int,
+        action_dim: int,
+        deter_dim: int,
+        num_lanes: int,
+        device: torch.device,
+        num_labels: int = 0,
+    ) -> None:
         self.lane_size = -(-capacity // num_lanes)
         self.num_lanes, self.device = num_lanes, device
         total = self.lane_size * num_lanes
-        self.num_bytes = replay_bytes(total, action_dim, deter_dim)
+        self.num_bytes = replay_bytes(total, action_dim, deter_dim, num_labels)
         _check_memory(self.num_bytes, device)
         self.frames = torch.zeros(total, *FRAME_SHAPE, dtype=torch.uint8, device=device)
         self.deter = torch.zeros(total, deter_dim, dtype=torch.float16, device=device)
         self.actions = torch.zeros(total, action_dim, device=device)
         self.rewards = torch.zeros(total, device=device)
         self.continues = torch.ones(total, device=device)
+        self.labels = torch.zeros(total, num_labels, device=device)
         self.episode = np.full((num_lanes, self.lane_size), -1, dtype=np.int64)
         self.written = np.zeros(num_lanes, dtype=np.int64)
         self._saved = np.zeros(num_lanes, dtype=np.int64)
@@ -132,6 +146,7 @@ class Replay:
             actions=self.actions[acted],
             rewards=self.rewards[acted],
             continues=self.continues[acted],
+            labels=self.labels[rows],
             rows=rows,
         )
 
@@ -173,10 +188,11 @@ class Replay:
         if not (folder / "rows.pt").exists():
             raise UserError(f"no replay found in {folder}")
         state = torch.load(folder / "rows.pt", weights_only=True)
-        saved = (len(state["episode"]), state["actions"].shape[1], state["deter"].shape[1])
-        own = (self.num_lanes, self.actions.shape[1], self.deter.shape[1])
+        columns = ("actions", "deter", "labels")
+        saved = (len(state["episode"]), *(state[name].shape[1] for name in columns))
+        own = (self.num_lanes, *(getattr(self, name).shape[1] for name in columns))
         if saved != own:
-            raise UserError(f"the replay in {folder} has (environments, action, deter) {saved}, this run {own}")
+            raise UserError(f"the replay in {folder} has (environments, action, deter, labels) {saved}, this run {own}")
         saved_size = state["episode"].shape[1]
         for lane, written in enumerate(state["written"].numpy()):
             held = min(written, saved_size, self.lane_size)
@@ -222,9 +238,9 @@ class Replay:
         raise UserError(too_short)
 
 
-def replay_bytes(num_rows: int, action_dim: int, deter_dim: int) -> int:
+def replay_bytes(num_rows: int, action_dim: int, deter_dim: int, num_labels: int = 0) -> int:
     """Memory that a replay of `num_rows` rows takes, in bytes."""
-    return num_rows * (FRAME_BYTES + 2 * deter_dim + 4 * action_dim + 4 + 4 + 8)
+    return num_rows * (FRAME_BYTES + 2 * deter_dim + 4 * (action_dim + num_labels) + 4 + 4 + 8)
 
 
 def _check_memory(num_bytes: int, device: torch.device) -> None:

@@ -41,11 +41,12 @@ class Clock:
             rewards=np.where(last, 0.0, time + 1.0).astype(np.float32),
             continues=np.ones(len(entries), np.float32),
             is_first=time == 0.0,
+            labels=np.stack([time + 0.25, -time], -1),
         )
 
 
 def make_replay(capacity=60, lanes=1):
-    return Replay(capacity, action_dim=1, deter_dim=2, num_lanes=lanes, device=CPU)
+    return Replay(capacity, action_dim=1, deter_dim=2, num_lanes=lanes, device=CPU, num_labels=2)
 
 
 def filled(capacity=60, lanes=1, lengths=(7, 4, 9), chunk=5):
@@ -225,7 +226,7 @@ def test_what_is_no_replay_of_this_run_is_refused(tmp_path):
     with pytest.raises(UserError, match="no replay found"):
         make_replay().load(tmp_path)
     filled().save(tmp_path)
-    for other in (make_replay(lanes=2), Replay(60, 2, 2, 1, CPU), Replay(60, 1, 3, 1, CPU)):
+    for other in (make_replay(lanes=2), Replay(60, 2, 2, 1, CPU, 2), Replay(60, 1, 3, 1, CPU, 2), Replay(60, 1, 2, 1, CPU)):
         with pytest.raises(UserError, match="this run"):
             other.load(tmp_path)
 

@@ -14,7 +14,7 @@ from gymnasium.error import ResetNeeded
 
 from latentplan.config import EnvConfig, UserError
 from latentplan.envs.gl import explain_gl_errors, require_backend
-from latentplan.envs.quantities import true_values
+from latentplan.envs.quantities import measure, scales, true_values
 from latentplan.envs.render import FrameRenderer
 
 if TYPE_CHECKING:
@@ -64,13 +64,15 @@ class SuiteEnv(gymnasium.Env[np.ndarray, np.ndarray]):
     An observation is a uint8 frame (64, 64, 3), always a fresh array. An action is float32 (action,) in
     [-1, 1], scaled to the actuators' range. `reset(seed=s)` depends on s alone; `reset()` continues the
     random stream. The time limit truncates; only the task itself terminates. `info["env_frames"]` counts
-    the control steps that a step took, which is fewer than the action repeat where an episode ends early.
+    the control steps that a step took, which is fewer than the action repeat where an episode ends early;
+    `info["labels"]` holds the true quantities at the frame, float32 (label,).
 
     Attributes:
         action_repeat: Control steps per decision; rewards are summed over them.
         decisions_per_episode: Decisions until the time limit.
         record_quantities: Whether `info` of a step tells what was true after each of its control steps: `quantities`,
             float64 (control step, quantity) in the order of `quantity_names`, and `rewards`, float64 (control step,).
+        labels: Names of the quantities in `info["labels"]`, and the typical size of each.
     """
 
     metadata = {"render_modes": ["rgb_array"]}
@@ -89,14 +91,14 @@ class SuiteEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         task = default_task(config.domain) if config.task is None else config.task
         self._task_env = _load(config.domain, task)
         self._camera = _checked_camera(self.physics, config)
-        self._quality = config.render_quality
+        self._domain, self._quality = config.domain, config.render_quality
+        self.labels = scales(config.domain)
         self._renderers: dict[int, FrameRenderer] = {}
         self._needs_reset = True
         self._steps_left = 0
         # An episode lasts for the first whole number of steps that reaches dm_control's limit.
         limit = self._task_env._step_limit
         self._steps_per_episode = _UNLIMITED_EPISODE_STEPS if math.isinf(limit) else math.ceil(limit)
-        self._domain = config.domain
         self.record_quantities = False
         self._recorded: list[tuple[np.ndarray, float]] = []
         self.action_repeat = config.action_repeat
@@ -130,7 +132,7 @@ class SuiteEnv(gymnasium.Env[np.ndarray, np.ndarray]):
             options: Not used.
 
         Returns:
-            The first frame (64, 64, 3), and an info with no `env_frames` taken.
+            The first frame (64, 64, 3), and an info with no `env_frames` taken and the first labels.
         """
         super().reset(seed=seed)
         if seed is not None:
@@ -140,7 +142,7 @@ class SuiteEnv(gymnasium.Env[np.ndarray, np.ndarray]):
             renderer.refresh_terrain()
         self._steps_left = self._steps_per_episode
         self._needs_reset = False
-        return self.render(), {"env_frames": 0}
+        return self.render(), self._info(0)
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
         """Hold an action for `action_repeat` control steps.
@@ -168,8 +170,7 @@ class SuiteEnv(gymnasium.Env[np.ndarray, np.ndarray]):
             # The suite marks an end of its own with discount 0, and the time limit with discount 1.
             terminated = outcome.last() and outcome.discount == 0.0
             self._needs_reset = outcome.last() or self._steps_left <= 0
-        info = {"env_frames": env_frames, **self._take_record()}
-        return self.render(), reward, terminated, self._needs_reset and not terminated, info
+        return self.render(), reward, terminated, self._needs_reset and not terminated, self._info(env_frames)
 
     def render(self) -> np.ndarray:  # type: ignore[override]
         """The present state as the agent sees it, a fresh uint8 array (64, 64, 3)."""
@@ -189,16 +190,17 @@ class SuiteEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         self.physics.free()
         self._needs_reset = True
 
+    def _info(self, env_frames: int) -> dict[str, Any]:
+        info = {"env_frames": env_frames, "labels": measure(self._domain, self.physics)}
+        if self._recorded:
+            quantities, rewards = zip(*self._recorded, strict=True)
+            info |= {"quantities": np.stack(quantities), "rewards": np.array(rewards)}
+            self._recorded.clear()
+        return info
+
     def _record(self, reward: float) -> None:
         if self.record_quantities:
             self._recorded.append((true_values(self._domain, self.physics), float(reward)))
-
-    def _take_record(self) -> dict[str, np.ndarray]:
-        if not self._recorded:
-            return {}
-        quantities, rewards = zip(*self._recorded, strict=True)
-        self._recorded = []
-        return {"quantities": np.stack(quantities), "rewards": np.array(rewards)}
 
     def _seed_task(self, seed: int | None) -> None:
         self._task_env.task.random.seed(seed)

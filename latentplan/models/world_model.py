@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from contextlib import AbstractContextManager
 
 import torch
@@ -21,14 +22,17 @@ class WorldModel(nn.Module):
     Args:
         config: Sizes.
         action_dim: Size of the action, taken from the environment.
+        labels: Quantities to read off the latent, and the typical size of each.
 
     The methods `step`, `rollout`, `value`, `policy` and `continues` are the planner's protocol. They follow the
     mean of the prior, so that a plan's return is a function of its actions alone.
     """
 
-    def __init__(self, config: ModelConfig, action_dim: int) -> None:
+    label_scales: Tensor
+
+    def __init__(self, config: ModelConfig, action_dim: int, labels: Mapping[str, float] | None = None) -> None:
         super().__init__()
-        self.config, self.action_dim = config, action_dim
+        self.config, self.action_dim, self.labels = config, action_dim, dict(labels or {})
         embedding_dim, features = config.hidden_dim, config.deter_dim + config.latent_dim
         self.encoder = Encoder(config.encoder_channels, embedding_dim)
         self.dynamics = Rssm(config.latent_dim, config.deter_dim, config.hidden_dim, action_dim, embedding_dim)
@@ -37,6 +41,9 @@ class WorldModel(nn.Module):
         self.continue_head = Mlp(features, config.hidden_dim, 1)
         self.value_head = ScalarHead(features, config.hidden_dim, config.num_bins)
         self.actor = Actor(features, config.hidden_dim, action_dim)
+        self.register_buffer("label_scales", torch.tensor(list(self.labels.values())), persistent=False)
+        if self.labels:
+            self.probe_head = Mlp(features, config.hidden_dim, len(self.labels))
 
     def trunk_precision(self) -> AbstractContextManager[None]:
         """Autocast to bfloat16 for the products in the trunk; heads leave it by themselves."""
@@ -46,6 +53,21 @@ class WorldModel(nn.Module):
     def device(self) -> torch.device:
         """Where the parameters live."""
         return self.dynamics.prior_output.weight.device
+
+    @property
+    def label_names(self) -> tuple[str, ...]:
+        """What `probe` reads, in order; empty where the environment told no quantities."""
+        return tuple(self.labels)
+
+    def probe(self, features: Tensor) -> Tensor:
+        """The quantities `label_names` at states with features (..., feature), in their own units, (..., label).
+
+        Raises:
+            ValueError: The model was trained without labels.
+        """
+        if not self.labels:
+            raise ValueError("this model was trained without labels, so no quantity can be read off its latent")
+        return self.probe_head(features) * self.label_scales
 
     def infer(self, state: State, action: Tensor, frames: Tensor) -> State:
         """The belief after acting and seeing: posterior mean after `action` (rows, action) led to `frames`.

@@ -53,12 +53,14 @@ class Description:
         discount: Per decision.
         render_ms: Milliseconds per rendered frame.
         renderer: What draws it.
+        labels: Quantities that it tells with each frame, and the typical size of each.
     """
 
     action_dim: int
     discount: float
     render_ms: float
     renderer: dict[str, str]
+    labels: dict[str, float]
 
 
 class Collector:
@@ -79,7 +81,8 @@ class Collector:
         action_dim = int(np.prod(self.envs.single_action_space.shape or ()))
         self._decisions: int | None = getattr(self._eval_env.unwrapped, "decisions_per_episode", None)
         self.discount = discount = config.learning.discount or _discount_for(self._decisions)
-        self.model = WorldModel(config.model, action_dim).to(device)
+        self.labels: dict[str, float] = getattr(self._eval_env.unwrapped, "labels", {})
+        self.model = WorldModel(config.model, action_dim, self.labels).to(device)
         noise = config.collection.noise_std
         self._agents: dict[str, ModelAgent] = {
             "planner": PlanningAgent(self.model, config, discount, noise_std=noise),
@@ -91,6 +94,7 @@ class Collector:
         }
         self._random = RandomAgent(action_dim)
         self._frames: np.ndarray | None = None
+        self._labels = np.zeros((config.env.num_envs, len(self.labels)), np.float32)
         self._ended = np.ones(config.env.num_envs, dtype=bool)
         self._returns = np.zeros(config.env.num_envs)
         self._acting: object = None
@@ -103,7 +107,8 @@ class Collector:
             self._eval_env.render()
         render_ms = 1000.0 * (time.perf_counter() - started) / TIMED_FRAMES
         facts = render_info() if self._make_user_env is None else {"renderer": "the user's environment"}
-        return Description(self.model.action_dim, self.discount, render_ms, {k: str(v) for k, v in facts.items()})
+        renderer = {name: str(value) for name, value in facts.items()}
+        return Description(self.model.action_dim, self.discount, render_ms, renderer, self.labels)
 
     def collect(self, weights: dict[str, np.ndarray] | None, behaviour: str, decisions: int, counter: int) -> Collected:
         """Take `decisions` decisions in all, with new weights; continues the episodes of the last round.
@@ -167,15 +172,17 @@ class Collector:
         if not self._ended.any():
             return
         if self._frames is None:
-            self._frames, _ = self.envs.reset(seed=derive_seed(self.config.run.seed, "episodes", counter))
+            self._frames, info = self.envs.reset(seed=derive_seed(self.config.run.seed, "episodes", counter))
         else:
-            self._frames, _ = self.envs.reset(options={"reset_mask": self._ended})
+            self._frames, info = self.envs.reset(options={"reset_mask": self._ended})
             agent.reset(self._ended)
+        if self.labels:
+            self._labels[self._ended] = np.asarray(info["labels"])[self._ended]
         self._returns[self._ended] = 0.0
 
     def _step(self, agent: ModelAgent | RandomAgent, log: _Log) -> None:
         assert self._frames is not None
-        frames, first = self._frames.copy(), self._ended.copy()
+        frames, labels, first = self._frames.copy(), self._labels.copy(), self._ended.copy()
         actions = agent.act(frames)
         state = agent.state if isinstance(agent, ModelAgent) else None
         deter = None if state is None else state.deter.float().cpu().numpy()
@@ -184,9 +191,11 @@ class Collector:
             raise UserError(f"the environment gave rewards that are not finite: {rewards.tolist()}")
         self._ended = terminated | truncated
         self._returns += rewards
-        log.append(frames, deter, actions, rewards, ~terminated, first, np.asarray(info["env_frames"]))
+        if self.labels:
+            self._labels = np.array(info["labels"], np.float32)
+        log.append(frames, deter, actions, rewards, ~terminated, first, labels, np.asarray(info["env_frames"]))
         for lane in np.flatnonzero(self._ended):
-            log.finish(int(lane), self._frames[lane].copy(), float(self._returns[lane]))
+            log.finish(int(lane), self._frames[lane].copy(), self._labels[lane], float(self._returns[lane]))
 
 
 def _discount_for(decisions: int | None) -> float:
@@ -212,17 +221,17 @@ class _Log:
         rewards: np.ndarray,
         continues: np.ndarray,
         first: np.ndarray,
+        labels: np.ndarray,
         env_frames: np.ndarray,
     ) -> None:
         beliefs = self._no_deter if deter is None else deter
         for lane, entries in enumerate(self._lanes):
-            entries.append(
-                (frames[lane], beliefs[lane], actions[lane], rewards[lane], float(continues[lane]), first[lane])
-            )
+            row = (frames, beliefs, actions, rewards, continues.astype(np.float32), first, labels)
+            entries.append(tuple(part[lane] for part in row))
         self.env_frames += int(env_frames.sum())
 
-    def finish(self, lane: int, frame: np.ndarray, total_return: float) -> None:
-        self._lanes[lane].append((frame, self._no_deter[lane], self._no_action, 0.0, 1.0, False))
+    def finish(self, lane: int, frame: np.ndarray, labels: np.ndarray, total_return: float) -> None:
+        self._lanes[lane].append((frame, self._no_deter[lane], self._no_action, 0.0, 1.0, False, labels))
         self.returns.append(total_return)
 
     def rows(self) -> list[Rows]:
@@ -230,7 +239,7 @@ class _Log:
 
 
 def _stack(entries: list[tuple[Any, ...]]) -> Rows:
-    frames, deter, actions, rewards, continues, is_first = zip(*entries, strict=True)
+    frames, deter, actions, rewards, continues, is_first, labels = zip(*entries, strict=True)
     return Rows(
         frames=np.stack(frames),
         deter=np.stack(deter),
@@ -238,4 +247,5 @@ def _stack(entries: list[tuple[Any, ...]]) -> Rows:
         rewards=np.asarray(rewards, np.float32),
         continues=np.asarray(continues, np.float32),
         is_first=np.asarray(is_first, bool),
+        labels=np.stack(labels),
     )

@@ -12,6 +12,8 @@ from latentplan.models import Gaussian, State, WorldModel, kl_divergence
 from latentplan.models.heads import ScalarHead, sample_action
 from latentplan.replay import Batch
 
+HALF_LOG_2_PI_E = 1.4189385  # entropy of a Gaussian is log std + this, in nats
+
 
 class Imagination(NamedTuple):
     """Imagined rollouts under the actor.
@@ -50,7 +52,9 @@ def world_model_loss(
         patches = model.decoder(features.flatten(0, 1))
         reward_logits = model.reward_head(features[:, 1:])
         continue_logits = model.continue_head(features[:, 1:]).squeeze(-1)
-    overshooting = overshot_reward = batch.rewards.new_zeros(())
+    overshooting = overshot_reward = probe = batch.rewards.new_zeros(())
+    if model.labels:
+        probe = _probe_loss(model, features, batch.labels)
     if config.overshooting_scale > 0.0:
         overshooting, overshot_reward = _overshooting(model, batch, states, posterior, config)
     parts = {
@@ -61,6 +65,7 @@ def world_model_loss(
         "representation": _free_kl(posterior, _detached(prior), config.free_nats),
         "overshooting": overshooting,
         "overshot_reward": overshot_reward,
+        "probe": probe,
     }
     scales = {
         "reconstruction": config.reconstruction_scale,
@@ -70,6 +75,7 @@ def world_model_loss(
         "representation": config.representation_scale,
         "overshooting": config.overshooting_scale,
         "overshot_reward": config.overshooting_scale * config.reward_scale,
+        "probe": 1.0,
     }
     loss = torch.stack([scales[name] * part for name, part in parts.items()]).sum()
     return loss, State(*(part.detach() for part in states)), {name: part.detach() for name, part in parts.items()}
@@ -82,22 +88,26 @@ def imagine(model: WorldModel, start: State, horizon: int, generator: torch.Gene
     asks about. The actor reads its state without a gradient, so that each action is credited along the dynamics alone
     (Hafner et al. 2020, section 3).
     """
-    state, features, entropies = start, [start.features], []
+    state, features, stds = start, [start.features], []
     rows, device = len(start.deter), start.deter.device
-    is_sampled = (torch.arange(rows, device=device) % 2).unsqueeze(-1)
-    for _ in range(horizon):
+    draws = torch.randn(
+        horizon, rows, model.action_dim + model.config.latent_dim, generator=generator, device=device
+    )
+    action_noise, noise = draws.split([model.action_dim, model.config.latent_dim], -1)
+    noise = noise * (torch.arange(rows, device=device) % 2).unsqueeze(-1)
+    for step in range(horizon):
         mean, std = model.actor(features[-1].detach())
-        action = sample_action(mean, std, torch.randn(mean.shape, generator=generator, device=device))
-        entropies.append((std.log() + 1.4189385).sum(-1))
+        action = sample_action(mean, std, action_noise[step])
+        stds.append(std)
         deter = model.dynamics.advance(state, action)
         prior = model.dynamics.prior(deter)
-        noise = torch.randn(rows, model.config.latent_dim, generator=generator, device=device)
-        state = State(deter, prior.mean + prior.std * noise * is_sampled)
+        state = State(deter, torch.addcmul(prior.mean, prior.std, noise[step]))
         features.append(state.features)
     stacked = torch.stack(features)
+    entropies = (torch.stack(stds).log() + HALF_LOG_2_PI_E).sum(-1)
     rewards = model.reward_head.mean(model.reward_head(stacked[1:]))
     continues = torch.sigmoid(model.continue_head(stacked[1:])).squeeze(-1)
-    return Imagination(stacked, rewards, continues, torch.stack(entropies))
+    return Imagination(stacked, rewards, continues, entropies)
 
 
 def lambda_return(rewards: Tensor, discounts: Tensor, values: Tensor, lambda_: float) -> Tensor:
@@ -156,6 +166,13 @@ def _overshooting(
         reward_logits = model.reward_head(features)
     reward = model.reward_head.loss(reward_logits, windows(batch.rewards)).mean()
     return _free_kl(seen, prior, config.free_nats), reward
+
+
+def _probe_loss(model: WorldModel, features: Tensor, labels: Tensor) -> Tensor:
+    """Squared error of the quantities read off the latent, in their typical sizes; the latent learns nothing from it."""
+    with model.trunk_precision():
+        predicted = model.probe(features.detach())
+    return ((predicted - labels) / model.label_scales).square().mean()
 
 
 def _free_kl(left: Gaussian, right: Gaussian, free_nats: float) -> Tensor:

@@ -73,16 +73,11 @@ class Learner(lightning.LightningModule):
         config = self.config
         flat = State(states.deter.flatten(0, 1), states.stoch.flatten(0, 1))
         chosen = torch.randperm(len(flat.deter), generator=generator, device=self.device)[: config.imagination_starts]
-        world = [self.model.dynamics, self.model.reward_head, self.model.continue_head]
-        for part in world:
-            part.requires_grad_(False)
         with self.model.trunk_precision():
             dream = imagine(
                 self.model, State(flat.deter[chosen], flat.stoch[chosen]), config.imagination_horizon, generator
             )
             values = self.target_value.mean(self.target_value(dream.features[1:]))
-        for part in world:
-            part.requires_grad_(True)
         discounts = self.discount * dream.continues
         returns = lambda_return(dream.rewards, discounts, values, config.lambda_)
         reach = torch.cat([torch.ones_like(discounts[:1]), discounts[:-1]]).cumprod(0).detach()
@@ -117,8 +112,8 @@ class Learner(lightning.LightningModule):
 
     def _descend(self, optimizer: torch.optim.Optimizer, loss: Tensor) -> Tensor:
         optimizer.zero_grad(set_to_none=True)
-        loss.backward()
         parameters = [parameter for group in optimizer.param_groups for parameter in group["params"]]
+        loss.backward(inputs=parameters)  # behaviour's loss runs through the world model, which must not learn from it
         norm = torch.nn.utils.clip_grad_norm_(parameters, self.config.max_grad_norm)
         if not torch.isfinite(norm):
             raise FloatingPointError(f"the gradient is not finite at update {self.updates} (loss {loss.item()})")

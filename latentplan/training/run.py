@@ -142,10 +142,11 @@ class _Run:
         config, seed = self.config, self.config.run.seed
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(derive_seed(seed, "weights"))
-            model = WorldModel(config.model, self.description.action_dim).to(self.device)
+            model = WorldModel(config.model, self.description.action_dim, self.description.labels).to(self.device)
         on = self.device if config.replay.on_device else torch.device("cpu")
         capacity = _capacity(config)
-        self.replay = Replay(capacity, model.action_dim, config.model.deter_dim, config.env.num_envs, on)
+        num_labels = len(model.labels)
+        self.replay = Replay(capacity, model.action_dim, config.model.deter_dim, config.env.num_envs, on, num_labels)
         discount = self.description.discount
         self.learner = Learner(model, config.learning, discount, self.replay, derive_seed(seed, "learner"))
         self.state = RunState()

@@ -121,6 +121,7 @@ def synthetic_replay(config: Config, action_dim: int, device: torch.device) -> R
         rewards=rng.uniform(0.0, 1.0, num_rows).astype(np.float32),
         continues=np.ones(num_rows, np.float32),
         is_first=np.arange(num_rows) % (4 * length) == 0,
+        labels=np.zeros((num_rows, 0), np.float32),
     )
     replay.add(0, rows)
     return replay

@@ -2,10 +2,14 @@
 
 import pytest
 import torch
-from einops import rearrange
+from einops import rearrange, reduce
 
 from latentplan.models.decoder import Decoder
 from latentplan.models.encoder import Encoder
+
+
+def shrunk(frames):
+    return reduce(frames.float(), "rows (h y) (w x) c -> rows h w c", "mean", y=2, x=2)
 
 
 @pytest.mark.parametrize("channels", [(4,), (4, 8), (32, 48, 64), (4, 4, 4, 4, 4)])
@@ -32,23 +36,36 @@ def test_every_pixel_is_read():
         assert not torch.equal(encoder(grey), encoder(spotted))
 
 
-def test_pictures_are_uint8_frames(model, state):
+@pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16])
+def test_the_first_layer_reads_pixels_centred_and_scaled(dtype, frames):
+    torch.manual_seed(0)
+    encoder = Encoder((8, 8), 10)
+    patches = rearrange(frames, "rows (h y) (w x) c -> rows h w (y x c)", y=4, x=4)
+    expected = encoder.patches(patches / 255.0 - 0.5)
+    with torch.autocast("cpu", dtype=dtype, enabled=dtype != torch.float32):
+        projected = encoder._project(patches)
+    assert projected.dtype == dtype
+    tolerance = 1e-5 if dtype == torch.float32 else 0.02  # the weights are rounded to 8 bits
+    assert torch.allclose(projected.float(), expected, atol=tolerance)
+
+
+def test_pictures_are_uint8_at_half_resolution(model, state):
     picture = model.decoder.picture(state.features)
-    assert picture.shape == (5, 64, 64, 3) and picture.dtype == torch.uint8
+    assert picture.shape == (5, 32, 32, 3) and picture.dtype == torch.uint8
 
 
 def test_the_loss_of_a_picture_is_its_summed_squared_error(frames):
     torch.manual_seed(0)
     decoder = Decoder(7, channels=4)
     patches = decoder(torch.randn(5, 7))
-    pixels = rearrange(patches, "rows h w (y x c) -> rows (h y) (w x) c", y=8, x=8)
-    expected = (pixels - (frames / 255.0 - 0.5)).square().sum((1, 2, 3))
+    pixels = rearrange(patches, "rows h w (y x c) -> rows (h y) (w x) c", y=4, x=4)
+    expected = (pixels - (shrunk(frames) / 255.0 - 0.5)).square().sum((1, 2, 3))
     assert torch.allclose(decoder.loss(patches, frames), expected, rtol=1e-4)
 
 
 def test_a_perfect_reconstruction_costs_nothing_and_is_the_frame(frames):
     decoder = Decoder(7, channels=4)
-    perfect = rearrange(frames / 255.0 - 0.5, "rows (h y) (w x) c -> rows h w (y x c)", y=8, x=8)
+    perfect = rearrange(shrunk(frames) / 255.0 - 0.5, "rows (h y) (w x) c -> rows h w (y x c)", y=4, x=4)
     decoder.forward = lambda features: perfect
     assert decoder.loss(perfect, frames).max() < 1e-6
-    assert torch.equal(decoder.picture(torch.zeros(5, 7)), frames)
+    assert torch.equal(decoder.picture(torch.zeros(5, 7)), shrunk(frames).round().to(torch.uint8))

@@ -30,6 +30,7 @@ def batch():
         actions=torch.as_tensor(rng.uniform(-1, 1, (4, 5, 1)).astype(np.float32)),
         rewards=torch.as_tensor(rng.uniform(-1, 1, (4, 5)).astype(np.float32)),
         continues=torch.ones(4, 5),
+        labels=torch.zeros(4, 6, 0),
         rows=torch.arange(24).reshape(4, 6),
     )
 
