@@ -70,6 +70,7 @@ class SuiteEnv(gymnasium.Env[np.ndarray, np.ndarray]):
     Attributes:
         action_repeat: Control steps per decision; rewards are summed over them.
         decisions_per_episode: Decisions until the time limit.
+        domain: Domain of the suite.
         record_quantities: Whether `info` of a step tells what was true after each of its control steps: `quantities`,
             float64 (control step, quantity) in the order of `quantity_names`, and `rewards`, float64 (control step,).
         labels: Names of the quantities in `info["labels"]`, and the typical size of each.
@@ -91,7 +92,7 @@ class SuiteEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         task = default_task(config.domain) if config.task is None else config.task
         self._task_env = _load(config.domain, task)
         self._camera = _checked_camera(self.physics, config)
-        self._domain, self._quality = config.domain, config.render_quality
+        self.domain, self._quality = config.domain, config.render_quality
         self.labels = scales(config.domain)
         self._renderers: dict[int, FrameRenderer] = {}
         self._needs_reset = True
@@ -191,7 +192,7 @@ class SuiteEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         self._needs_reset = True
 
     def _info(self, env_frames: int) -> dict[str, Any]:
-        info = {"env_frames": env_frames, "labels": measure(self._domain, self.physics)}
+        info = {"env_frames": env_frames, "labels": measure(self.domain, self.physics)}
         if self._recorded:
             quantities, rewards = zip(*self._recorded, strict=True)
             info |= {"quantities": np.stack(quantities), "rewards": np.array(rewards)}
@@ -200,7 +201,7 @@ class SuiteEnv(gymnasium.Env[np.ndarray, np.ndarray]):
 
     def _record(self, reward: float) -> None:
         if self.record_quantities:
-            self._recorded.append((true_values(self._domain, self.physics), float(reward)))
+            self._recorded.append((true_values(self.domain, self.physics), float(reward)))
 
     def _seed_task(self, seed: int | None) -> None:
         self._task_env.task.random.seed(seed)
