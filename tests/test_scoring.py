@@ -204,7 +204,9 @@ def test_bad_goals_are_one_line(capsys, checkpoint, flags, reason):
 def test_an_agent_without_quantities_cannot_plan_for_them_but_is_scored(capsys, tmp_path, old_checkpoint):
     error = error_of(capsys, "--checkpoint", old_checkpoint, "--objective", "cart > 1", "--device", "cpu")
     assert "trained without named quantities" in error
-    assert evaluate_agent(old_checkpoint, tmp_path, "--objective", "cart > 1", "--mode", "actor")["objective_return"] > 0
+    assert (
+        evaluate_agent(old_checkpoint, tmp_path, "--objective", "cart > 1", "--mode", "actor")["objective_return"] > 0
+    )
 
 
 def test_later_objectives_are_refused_before_anything_is_played(env):

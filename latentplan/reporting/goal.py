@@ -8,7 +8,7 @@ from typing import Protocol
 import cv2
 import numpy as np
 
-from latentplan.reporting.video import FAINT, GAP, LINE_HEIGHT, PANEL, Frame, write_text
+from latentplan.reporting.video import FAINT, GAP, LINE_HEIGHT, PANEL, Frame, text_width, write_text
 
 STRIP_HEIGHT = 4 * LINE_HEIGHT
 _NUM_CLAUSES = STRIP_HEIGHT // LINE_HEIGHT
@@ -31,7 +31,7 @@ class Judge(Protocol):
 
 
 def draw_goal(width: int, worth: Sequence[float], clauses: Sequence[tuple[str, bool]]) -> Frame:
-    """The strip: a trace on the left, the clauses on the right.
+    """The strip: a trace on the left where there is an objective, the clauses beside it.
 
     Args:
         width: Pixels, even.
@@ -43,30 +43,33 @@ def draw_goal(width: int, worth: Sequence[float], clauses: Sequence[tuple[str, b
     """
     strip: Frame = np.full((STRIP_HEIGHT, width, 3), PANEL, np.uint8)
     half = width // 2
-    _draw_trace(strip, list(worth)[-_WINDOW:], half - 2 * GAP)
-    rows = list(clauses)
-    num_hidden = max(0, len(rows) - _NUM_CLAUSES + 1) if len(rows) > _NUM_CLAUSES else 0
-    for row, (text, is_met) in enumerate(rows[: len(rows) - num_hidden]):
-        middle = row * LINE_HEIGHT + LINE_HEIGHT // 2
-        cv2.circle(strip, (half + GAP, middle), 5, _MET if is_met else _UNMET, -1, cv2.LINE_AA)
-        write_text(strip, text, half + 3 * GAP, row * LINE_HEIGHT, half - 4 * GAP)
-    if num_hidden:
-        num_met = sum(is_met for _, is_met in rows[-num_hidden:])
-        text = f"{num_met} of {num_hidden} more are met"
-        write_text(strip, text, half + 3 * GAP, STRIP_HEIGHT - LINE_HEIGHT, half - 4 * GAP, FAINT)
+    if worth:
+        _draw_trace(strip, list(worth)[-_WINDOW:], half - 2 * GAP)
+    _draw_clauses(strip, clauses, half if worth else 0)
     return strip
 
 
+def _draw_clauses(strip: Frame, clauses: Sequence[tuple[str, bool]], left: int) -> None:
+    width = strip.shape[1] - left - 4 * GAP
+    num_shown = len(clauses) if len(clauses) <= _NUM_CLAUSES else _NUM_CLAUSES - 1
+    for row, (text, is_met) in enumerate(clauses[:num_shown]):
+        middle = row * LINE_HEIGHT + LINE_HEIGHT // 2
+        cv2.circle(strip, (left + 2 * GAP, middle), 5, _MET if is_met else _UNMET, -1, cv2.LINE_AA)
+        write_text(strip, text, left + 4 * GAP, row * LINE_HEIGHT, width - GAP)
+    hidden = clauses[num_shown:]
+    if hidden:
+        text = f"{sum(is_met for _, is_met in hidden)} of {len(hidden)} more are met"
+        write_text(strip, text, left + 4 * GAP, STRIP_HEIGHT - LINE_HEIGHT, width - GAP, FAINT)
+
+
 def _draw_trace(strip: Frame, worth: Sequence[float], width: int) -> None:
-    if not worth:
-        return
-    write_text(strip, "objective", GAP, 0, width, FAINT)
     label = f"{worth[-1]:.2f}"
-    write_text(strip, label, GAP + width - 12 * len(label), 0, 12 * len(label))
+    write_text(strip, "objective", GAP, 0, width - text_width(label), FAINT)
+    write_text(strip, label, GAP + width - text_width(label), 0, width)
     low, high = min(0.0, *worth), max(1.0, *worth)
     top, bottom = LINE_HEIGHT + 2, STRIP_HEIGHT - GAP
     cv2.line(strip, (GAP, bottom), (GAP + width, bottom), FAINT, 1)
-    finite = np.nan_to_num(np.asarray(worth), nan=low)  # a number that is none is written above, and drawn as nothing
+    finite = np.nan_to_num(np.asarray(worth), nan=low)  # NaN is written above, and drawn as the lowest
     across = GAP + np.arange(len(worth)) * width / (_WINDOW - 1)
     heights = bottom - (finite - low) / (high - low) * (bottom - top)
     points = np.stack([across, heights], axis=1).round().astype(np.int32)

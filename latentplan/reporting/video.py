@@ -171,17 +171,18 @@ def _enlarge(picture: Frame, side: int) -> Frame:
 
 def write_text(canvas: Frame, text: str, left: int, top: int, width: int, color: tuple[int, int, int] = _TEXT) -> None:
     """Writes one row, cut to `width` pixels, into the band of one line height below `top`."""
-    while text and _text_width(text) > width:
+    while text and text_width(text) > width:
         text = text[:-4] + "..." if len(text) > 4 else ""
     cv2.putText(canvas, text, (left, top + LINE_HEIGHT - 8), _FONT, 0.5, color, 1, cv2.LINE_AA)
 
 
 def _write_centred(canvas: Frame, text: str, left: int, middle: int, width: int) -> None:
-    indent = max(0, (width - _text_width(text)) // 2)
+    indent = max(0, (width - text_width(text)) // 2)
     write_text(canvas, text, left + indent, middle - LINE_HEIGHT // 2, width, FAINT)
 
 
-def _text_width(text: str) -> int:
+def text_width(text: str) -> int:
+    """Pixels that a row takes."""
     return int(cv2.getTextSize(text, _FONT, 0.5, 1)[0][0])
 
 
