@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -17,6 +16,8 @@ def read_goal(path: str, size: int = 64) -> NDArray[np.uint8]:
     Raises:
         UserError: The file is missing, is no picture, or is not square.
     """
+    import cv2  # when there is a picture to read: agents act without it
+
     if not Path(path).is_file():
         raise UserError(f"goal image {path!r} does not exist; give a square picture such as a frame of the camera")
     picture = cv2.imread(path, cv2.IMREAD_COLOR)

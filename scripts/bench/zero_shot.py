@@ -104,8 +104,8 @@ def play_job(
         `return_ci95`, and `decision_ms`.
     """
     import torch
-    from bench.statistics import mean_estimate
 
+    from bench.statistics import mean_estimate
     from latentplan.checkpoint import load_agent, load_model
     from latentplan.envs import make_env
     from latentplan.rollout import run_episodes, summarize

@@ -128,3 +128,13 @@ def test_a_step_tells_what_was_true_after_each_of_its_control_steps():
     env.record_quantities = False
     assert "quantities" not in env.step(action)[-1]
     env.close()
+
+
+def test_the_documentation_lists_every_quantity_with_its_margin(root):
+    text = (root / "docs" / "zero-shot.md").read_text()
+    rows = [
+        f"`{quantity.name}` | {quantity.unit.replace('1', '')} | {quantity.scale:g} | {quantity.meaning} |"
+        for quantities in QUANTITIES.values()
+        for quantity in quantities
+    ]
+    assert [row for row in rows if row not in text] == []
