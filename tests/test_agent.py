@@ -195,7 +195,7 @@ def test_a_planner_pictures_where_its_plan_ends(model, film):
     assert agent.imagine() is None
     agent.act(film[0])
     picture = agent.imagine()
-    assert picture.shape == (64, 64, 3) and picture.dtype == np.uint8
+    assert picture.shape == (32, 32, 3) and picture.dtype == np.uint8
     agent.reset()
     assert agent.imagine() is None
 

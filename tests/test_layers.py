@@ -11,7 +11,21 @@ ROOT = Path(__file__).resolve().parent.parent
 PACKAGE = ROOT / "latentplan"
 
 # layer: (layers of latentplan it may import, libraries it may import); None allows anything.
-ALL = ("config", "planning", "models", "envs", "replay", "reporting", "goals", "agent", "rollout", "checkpoint")
+ALL = (
+    "config",
+    "planning",
+    "models",
+    "envs",
+    "replay",
+    "reporting",
+    "goals",
+    "scoring",
+    "agent",
+    "background",
+    "gate",
+    "rollout",
+    "checkpoint",
+)
 SIMULATION = {"dm_control", "dm_env", "mujoco", "gymnasium", "OpenGL"}
 LAYERS = {
     "config": ((), set()),
@@ -23,8 +37,13 @@ LAYERS = {
     "reporting": (("config",), {"numpy", "cv2", "matplotlib", "rich"}),
     "agent": (("config", "models", "planning", "goals"), {"torch", "numpy", "einops"}),
     "scoring": (("config", "envs", "goals"), {"numpy", "gymnasium"}),
+    "background": (("config", "models", "planning", "agent"), {"torch", "numpy"}),
+    "gate": (("config", "models", "planning", "agent"), {"torch", "numpy"}),
     "rollout": (("config", "envs", "replay", "agent"), {"numpy"}),
-    "checkpoint": (("config", "models", "planning", "agent"), {"torch", "numpy", "safetensors"}),
+    "checkpoint": (
+        ("config", "models", "planning", "agent", "background", "gate"),
+        {"torch", "numpy", "safetensors"},
+    ),
     "training": (
         (*ALL, "compose"),
         {"lightning", "torch", "numpy", "einops", "rich", "tensorboard", "gymnasium", "yaml"},

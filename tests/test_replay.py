@@ -226,7 +226,12 @@ def test_what_is_no_replay_of_this_run_is_refused(tmp_path):
     with pytest.raises(UserError, match="no replay found"):
         make_replay().load(tmp_path)
     filled().save(tmp_path)
-    for other in (make_replay(lanes=2), Replay(60, 2, 2, 1, CPU, 2), Replay(60, 1, 3, 1, CPU, 2), Replay(60, 1, 2, 1, CPU)):
+    for other in (
+        make_replay(lanes=2),
+        Replay(60, 2, 2, 1, CPU, 2),
+        Replay(60, 1, 3, 1, CPU, 2),
+        Replay(60, 1, 2, 1, CPU),
+    ):
         with pytest.raises(UserError, match="this run"):
             other.load(tmp_path)
 
@@ -251,7 +256,7 @@ def test_an_episode_of_the_sequence_length_is_long_enough():
 
 
 def test_a_replay_beyond_the_free_memory_is_refused(monkeypatch):
-    monkeypatch.setattr(replay_module, "_free_memory", lambda: replay_bytes(100, 1, 2))
+    monkeypatch.setattr(replay_module, "_free_memory", lambda: replay_bytes(100, 1, 2, 2))
     make_replay(capacity=90)
     with pytest.raises(UserError, match=r"lower --replay\.capacity"):
         make_replay(capacity=91)
@@ -259,7 +264,7 @@ def test_a_replay_beyond_the_free_memory_is_refused(monkeypatch):
 
 def test_the_memory_a_replay_takes_is_what_its_arrays_hold():
     replay = make_replay(capacity=10, lanes=3)
-    arrays = [replay.frames, replay.deter, replay.actions, replay.rewards, replay.continues]
+    arrays = [replay.frames, replay.deter, replay.actions, replay.rewards, replay.continues, replay.labels]
     held = sum(array.numel() * array.element_size() for array in arrays) + replay.episode.nbytes
     assert held == replay.num_bytes
 

@@ -101,7 +101,7 @@ class LearningConfig:
         dynamics_scale: Weight of the KL that pulls the prior to the posterior.
         representation_scale: Weight of the KL that pulls the posterior to the prior.
         free_nats: KL below which neither is pulled.
-        overshooting_scale: Weight of KL and reward loss of open-loop predictions; 0 leaves them out.
+        overshooting_scale: Weight of the KL that pulls open-loop predictions to what was seen.
         overshooting_horizon: Decisions that open-loop predictions reach.
         reward_scale: Weight of the reward loss.
         imagination_horizon: Model steps of each imagined rollout.
@@ -122,7 +122,7 @@ class LearningConfig:
     dynamics_scale: float = 1.0
     representation_scale: float = 0.1
     free_nats: float = 1.0
-    overshooting_scale: float = 0.0
+    overshooting_scale: float = 0.1
     overshooting_horizon: int = 8
     reward_scale: float = 1.0
     imagination_horizon: int = 10

@@ -21,7 +21,7 @@ class Plan:
         var: Variance of the search distribution, (batch, horizon, action).
         expected_return: Predicted return of what the choice rests on, (batch,): of the last elites on average, or of
             the best candidate when that is executed. NaN where nothing finite was found.
-        info: Diagnostics, each (batch,) or (batch, iteration); see `CEMPlanner.plan`.
+        info: Diagnostics, (batch,) or (batch, iteration), and what stopped the search; see `CEMPlanner.plan`.
         elites: Kept elites, (batch, kept, horizon, action), when the planner keeps some.
         is_warm: Whether the next search may start here, (batch,) bool on the CPU.
         elapsed: Actions executed since this plan was made, (batch,) on the CPU; the next search shifts by as many.
@@ -31,7 +31,7 @@ class Plan:
     mean: Tensor
     var: Tensor
     expected_return: Tensor
-    info: dict[str, Tensor]
+    info: dict[str, Any]
     elites: Tensor | None
     is_warm: Tensor
     elapsed: Tensor

@@ -28,7 +28,16 @@ if TYPE_CHECKING:
 COLUMNS = (
     *("env_frames", "decisions", "updates", "minutes", "episode_return"),
     *("planner_return", "actor_return", "planner_minus_actor"),
-    *("reconstruction", "reward", "continue", "dynamics", "representation", "overshooting", "overshot_reward", "probe"),
+    *(
+        "reconstruction",
+        "reward",
+        "open_loop_reward",
+        "continue",
+        "dynamics",
+        "representation",
+        "overshooting",
+        "probe",
+    ),
     *("actor", "value", "imagined_return", "entropy", "model_grad_norm", "behaviour_grad_norm"),
 )
 

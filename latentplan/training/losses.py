@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import torch
+from einops import rearrange
 from torch import Tensor
 
 from latentplan.config import LearningConfig
@@ -31,14 +32,24 @@ class Imagination(NamedTuple):
     entropies: Tensor
 
 
-def world_model_loss(
-    model: WorldModel, batch: Batch, config: LearningConfig, generator: torch.Generator
-) -> tuple[Tensor, State, dict[str, Tensor]]:
-    """Reconstruction, reward, continuation and balanced KL over a batch of sequences.
+class Learned(NamedTuple):
+    """What a pass over a batch came to.
 
-    Returns:
-        The loss (a scalar), the posterior states (batch, time + 1, ...), and its parts by name, detached.
+    Attributes:
+        loss: Of the world model, a scalar.
+        states: Posterior states, (batch, time + 1, ...), detached.
+        open_loop: Features predicted without looking for the frames 1 to n, (batch, n, feature), detached.
+        parts: The parts of the loss by name, detached.
     """
+
+    loss: Tensor
+    states: State
+    open_loop: Tensor
+    parts: dict[str, Tensor]
+
+
+def world_model_loss(model: WorldModel, batch: Batch, config: LearningConfig, generator: torch.Generator) -> Learned:
+    """Reconstruction, reward, continuation and balanced KL over a batch of sequences, and open-loop predictions."""
     size, frames_per_sequence = batch.frames.shape[:2]
     with model.trunk_precision():
         embeddings = model.encoder(batch.frames.flatten(0, 1)).unflatten(0, (size, frames_per_sequence))
@@ -47,38 +58,42 @@ def world_model_loss(
     )
     states, posterior = model.dynamics.observe(embeddings, batch.actions, batch.deter, noise)
     features = states.features
+    overshooting, open_loop = _predict_open_loop(model, batch, states, posterior, config)
+    reached = open_loop.shape[1]
     with model.trunk_precision():
         prior = model.dynamics.prior(states.deter)
         patches = model.decoder(features.flatten(0, 1))
         reward_logits = model.reward_head(features[:, 1:])
+        open_loop_logits = model.reward_head(open_loop)
         continue_logits = model.continue_head(features[:, 1:]).squeeze(-1)
-    overshooting = overshot_reward = probe = batch.rewards.new_zeros(())
+    probe = batch.rewards.new_zeros(())
     if model.labels:
-        probe = _probe_loss(model, features, batch.labels)
-    if config.overshooting_scale > 0.0:
-        overshooting, overshot_reward = _overshooting(model, batch, states, posterior, config)
+        probe = _probe_loss(model, features, batch.labels) + _probe_loss(
+            model, open_loop, batch.labels[:, 1 : reached + 1]
+        )
     parts = {
         "reconstruction": model.decoder.loss(patches, batch.frames.flatten(0, 1)).mean(),
         "reward": model.reward_head.loss(reward_logits, batch.rewards).mean(),
+        "open_loop_reward": model.reward_head.loss(open_loop_logits, batch.rewards[:, :reached]).mean(),
         "continue": torch.nn.functional.binary_cross_entropy_with_logits(continue_logits, batch.continues),
         "dynamics": _free_kl(_detached(posterior), prior, config.free_nats),
         "representation": _free_kl(posterior, _detached(prior), config.free_nats),
         "overshooting": overshooting,
-        "overshot_reward": overshot_reward,
         "probe": probe,
     }
     scales = {
         "reconstruction": config.reconstruction_scale,
         "reward": config.reward_scale,
+        "open_loop_reward": config.reward_scale,
         "continue": 1.0,
         "dynamics": config.dynamics_scale,
         "representation": config.representation_scale,
         "overshooting": config.overshooting_scale,
-        "overshot_reward": config.overshooting_scale * config.reward_scale,
         "probe": 1.0,
     }
     loss = torch.stack([scales[name] * part for name, part in parts.items()]).sum()
-    return loss, State(*(part.detach() for part in states)), {name: part.detach() for name, part in parts.items()}
+    detached = {name: part.detach() for name, part in parts.items()}
+    return Learned(loss, State(*(part.detach() for part in states)), open_loop.detach(), detached)
 
 
 def imagine(model: WorldModel, start: State, horizon: int, generator: torch.Generator) -> Imagination:
@@ -90,9 +105,7 @@ def imagine(model: WorldModel, start: State, horizon: int, generator: torch.Gene
     """
     state, features, stds = start, [start.features], []
     rows, device = len(start.deter), start.deter.device
-    draws = torch.randn(
-        horizon, rows, model.action_dim + model.config.latent_dim, generator=generator, device=device
-    )
+    draws = torch.randn(horizon, rows, model.action_dim + model.config.latent_dim, generator=generator, device=device)
     action_noise, noise = draws.split([model.action_dim, model.config.latent_dim], -1)
     noise = noise * (torch.arange(rows, device=device) % 2).unsqueeze(-1)
     for step in range(horizon):
@@ -136,22 +149,21 @@ def value_loss(head: ScalarHead, features: Tensor, returns: Tensor, weights: Ten
     return (weights * head.loss(logits, returns.detach())).mean()
 
 
-def _overshooting(
+def _predict_open_loop(
     model: WorldModel, batch: Batch, states: State, posterior: Gaussian, config: LearningConfig
 ) -> tuple[Tensor, Tensor]:
-    """KL and reward loss of open-loop predictions, which is what a planner looks at (latent overshooting).
+    """KL and features of open-loop predictions, which are what a planner looks at (latent overshooting).
 
     From every `overshooting_horizon`-th posterior the true actions are followed by the mean of the prior, as a planner
     does; each prior on the way is pulled to the posterior that saw the frame (Hafner et al. 2019, section 4).
     """
-    horizon = min(config.overshooting_horizon, batch.actions.shape[1])
+    length = batch.actions.shape[1]
+    horizon = min(config.overshooting_horizon, length)
 
     def windows(sequence: Tensor) -> Tensor:  # (batch, time, ...) -> (rows, horizon, ...)
         return sequence.unfold(1, horizon, horizon).movedim(-1, 2).flatten(0, 1)
 
-    starts = [
-        part[:, :-1].detach()[:, ::horizon][:, : batch.actions.shape[1] // horizon].flatten(0, 1) for part in states
-    ]
+    starts = [part[:, :-1].detach()[:, ::horizon][:, : length // horizon].flatten(0, 1) for part in states]
     state, deters, stochs = State(*starts), [], []
     for action in windows(batch.actions).unbind(1):
         deter = model.dynamics.advance(state, action)
@@ -159,17 +171,16 @@ def _overshooting(
         deters.append(deter)
         stochs.append(state.stoch)
     deter = torch.stack(deters, 1)
-    prior = model.dynamics.prior(deter)
     seen = Gaussian(*(windows(part[:, 1:].detach()) for part in posterior))
+    divergence = _free_kl(seen, model.dynamics.prior(deter), config.free_nats)
     features = State(deter, torch.stack(stochs, 1)).features
-    with model.trunk_precision():
-        reward_logits = model.reward_head(features)
-    reward = model.reward_head.loss(reward_logits, windows(batch.rewards)).mean()
-    return _free_kl(seen, prior, config.free_nats), reward
+    return divergence, rearrange(
+        features, "(batch window) time ... -> batch (window time) ...", batch=len(batch.actions)
+    )
 
 
 def _probe_loss(model: WorldModel, features: Tensor, labels: Tensor) -> Tensor:
-    """Squared error of the quantities read off the latent, in their typical sizes; the latent learns nothing from it."""
+    """Squared error of the quantities read off the latent, in typical sizes; the latent learns nothing from it."""
     with model.trunk_precision():
         predicted = model.probe(features.detach())
     return ((predicted - labels) / model.label_scales).square().mean()

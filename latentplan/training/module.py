@@ -11,7 +11,7 @@ from torch import Tensor
 from latentplan.config import LearningConfig, derive_seed
 from latentplan.models import State, WorldModel
 from latentplan.replay import Batch, Replay
-from latentplan.training.losses import imagine, lambda_return, value_loss, world_model_loss
+from latentplan.training.losses import Learned, imagine, lambda_return, value_loss, world_model_loss
 
 RETURN_RANGE_RATE = 0.01
 
@@ -54,10 +54,11 @@ class Learner(lightning.LightningModule):
         assert isinstance(optimizers, list)
         world_optimizer, behaviour_optimizer = optimizers
         generator = torch.Generator(self.device).manual_seed(derive_seed(self.seed, "update", self.updates))
-        loss, states, parts = world_model_loss(self.model, batch, self.config, generator)
-        parts["model_grad_norm"] = self._descend(world_optimizer, loss)
-        self.replay.refresh(batch.rows, states.deter)
-        loss, behaviour_parts = self._behaviour_loss(states, batch, generator)
+        learned = world_model_loss(self.model, batch, self.config, generator)
+        parts = learned.parts
+        parts["model_grad_norm"] = self._descend(world_optimizer, learned.loss)
+        self.replay.refresh(batch.rows, learned.states.deter)
+        loss, behaviour_parts = self._behaviour_loss(learned, batch, generator)
         parts |= behaviour_parts
         parts["behaviour_grad_norm"] = self._descend(behaviour_optimizer, loss)
         with torch.no_grad():
@@ -68,9 +69,9 @@ class Learner(lightning.LightningModule):
         self.metrics = parts
 
     def _behaviour_loss(
-        self, states: State, batch: Batch, generator: torch.Generator
+        self, learned: Learned, batch: Batch, generator: torch.Generator
     ) -> tuple[Tensor, dict[str, Tensor]]:
-        config = self.config
+        config, states = self.config, learned.states
         flat = State(states.deter.flatten(0, 1), states.stoch.flatten(0, 1))
         chosen = torch.randperm(len(flat.deter), generator=generator, device=self.device)[: config.imagination_starts]
         with self.model.trunk_precision():
@@ -85,7 +86,7 @@ class Learner(lightning.LightningModule):
         actor = -(reach * (returns / scale + config.entropy_scale * dream.entropies)).mean()
         with self.model.trunk_precision():
             imagined = value_loss(self.model.value_head, dream.features[:-1], returns, reach)
-            replayed = self._replayed_value_loss(states, batch)
+            replayed = self._replayed_value_loss(learned, batch)
         parts = {
             "actor": actor.detach(),
             "value": imagined.detach(),
@@ -94,13 +95,20 @@ class Learner(lightning.LightningModule):
         }
         return actor + imagined + config.replay_value_scale * replayed, parts
 
-    def _replayed_value_loss(self, states: State, batch: Batch) -> Tensor:
-        features = states.features.transpose(0, 1)
+    def _replayed_value_loss(self, learned: Learned, batch: Batch) -> Tensor:
+        """The value against replayed rewards, at what was seen and at what had been predicted of it without looking.
+
+        A planner asks for the value of predicted states: there it must not mistake the prediction's drift for a gain.
+        """
+        features = learned.states.features.transpose(0, 1)
+        predicted = learned.open_loop.transpose(0, 1)
         with torch.no_grad():
             values = self.target_value.mean(self.target_value(features[1:]))
             discounts = self.discount * batch.continues.T
             returns = lambda_return(batch.rewards.T, discounts, values, self.config.lambda_)
-        return value_loss(self.model.value_head, features[:-1], returns, torch.ones_like(returns))
+        seen = torch.cat([features[:-1], predicted])
+        targets = torch.cat([returns, torch.cat([returns, values[-1:]])[1 : len(predicted) + 1]])
+        return value_loss(self.model.value_head, seen, targets, torch.ones_like(targets))
 
     def _return_scale(self, returns: Tensor) -> Tensor:
         """Spread of returns between their 5th and 95th percentile, smoothed, at least 1 (Hafner et al. 2023, eq. 7)."""

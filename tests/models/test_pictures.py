@@ -68,4 +68,5 @@ def test_a_perfect_reconstruction_costs_nothing_and_is_the_frame(frames):
     perfect = rearrange(shrunk(frames) / 255.0 - 0.5, "rows (h y) (w x) c -> rows h w (y x c)", y=4, x=4)
     decoder.forward = lambda features: perfect
     assert decoder.loss(perfect, frames).max() < 1e-6
-    assert torch.equal(decoder.picture(torch.zeros(5, 7)), shrunk(frames).round().to(torch.uint8))
+    picture = decoder.picture(torch.zeros(5, 7))
+    assert (picture.float() - shrunk(frames)).abs().max() <= 0.501  # rounded to whole numbers

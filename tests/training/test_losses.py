@@ -89,9 +89,9 @@ def test_nothing_counts_beyond_an_end(path):
 def test_the_model_loss_is_the_weighted_sum_of_its_parts(model, batch, tiny):
     chosen = {"reconstruction_scale": 2.0, "reward_scale": 3.0, "representation_scale": 0.5, "overshooting_scale": 0.7}
     config = tiny("", learning=chosen).learning
-    loss, states, parts = world_model_loss(model, batch, config, stream())
+    loss, states, _, parts = world_model_loss(model, batch, config, stream())
     scales = {"reconstruction": 2.0, "reward": 3.0, "continue": 1.0, "dynamics": 1.0, "representation": 0.5}
-    scales |= {"overshooting": 0.7, "overshot_reward": 0.7 * 3.0}
+    scales |= {"overshooting": 0.7, "open_loop_reward": 3.0, "probe": 1.0}
     assert parts.keys() == scales.keys()
     assert loss.item() == pytest.approx(sum(scale * parts[name].item() for name, scale in scales.items()), rel=1e-5)
     assert states.deter.shape == (4, 6, 16) and states.stoch.shape == (4, 6, 32)
@@ -116,18 +116,18 @@ def test_open_loop_predictions_follow_the_mean_of_the_prior_from_a_detached_star
                 state = State(deter, prior.mean)
                 seen = Gaussian(posterior.mean[:, time + 1], posterior.std[:, time + 1])
                 divergences.append(kl_divergence(seen, prior).mean())
-    _, _, parts = world_model_loss(model, batch, config, stream())
+    parts = world_model_loss(model, batch, config, stream()).parts
     assert parts["overshooting"].item() == pytest.approx(torch.stack(divergences).mean().item(), rel=1e-4)
 
 
 def test_less_divergence_than_the_free_nats_teaches_nothing(model, batch, tiny):
     config = tiny("", learning={"free_nats": 1e6}).learning
-    _, _, parts = world_model_loss(model, batch, config, stream())
+    parts = world_model_loss(model, batch, config, stream()).parts
     assert parts["dynamics"] == parts["representation"] == 1e6
 
 
 def test_both_divergences_are_one_number_with_two_gradients(model, batch, tiny):
-    _, _, parts = world_model_loss(model, batch, tiny("", learning={"free_nats": 0.0}).learning, stream())
+    parts = world_model_loss(model, batch, tiny("", learning={"free_nats": 0.0}).learning, stream()).parts
     assert parts["dynamics"] == pytest.approx(parts["representation"].item(), rel=1e-6)
     assert parts["dynamics"] > 0.0
 
@@ -141,19 +141,17 @@ def names_with_gradient(model):
 
 
 def test_the_model_loss_leaves_actor_and_value_alone(model, batch, tiny):
-    loss, _, _ = world_model_loss(model, batch, tiny("").learning, stream())
-    loss.backward()
+    world_model_loss(model, batch, tiny("").learning, stream()).loss.backward()
     expected = {"encoder", "dynamics", "decoder", "reward_head", "continue_head"}
     assert names_with_gradient(model) == expected
 
 
 def test_the_behaviour_loss_leaves_the_world_model_alone(learner, batch):
-    _, states, _ = world_model_loss(learner.model, batch, learner.config, stream())
-    loss, _ = learner._behaviour_loss(states, batch, stream())
-    loss.backward()
+    learned = world_model_loss(learner.model, batch, learner.config, stream())
+    loss, _ = learner._behaviour_loss(learned, batch, stream())
+    learner._descend(learner.configure_optimizers()[1], loss)
     assert names_with_gradient(learner.model) == {"actor", "value_head"}
     assert all(parameter.grad is None for parameter in learner.target_value.parameters())
-    assert all(parameter.requires_grad for parameter in learner.model.parameters())
 
 
 def test_the_actor_learns_through_the_dynamics(model):
@@ -189,3 +187,37 @@ def test_every_parameter_has_one_optimizer(learner):
     groups = [group["params"] for optimizer in learner.configure_optimizers() for group in optimizer.param_groups]
     owned = [id(parameter) for group in groups for parameter in group]
     assert sorted(owned) == sorted(id(parameter) for parameter in learner.model.parameters())
+
+
+def test_probes_read_the_latent_without_shaping_it(batch, tiny):
+    torch.manual_seed(0)
+    model = WorldModel(tiny("").model, action_dim=1, labels={"height": 2.0, "speed": 0.5})
+    labelled = batch._replace(labels=torch.randn(4, 6, 2, generator=stream()))
+    _, states, open_loop, parts = world_model_loss(model, labelled, tiny("").learning, stream())
+    pairs = ((states.features, labelled.labels), (open_loop, labelled.labels[:, 1 : open_loop.shape[1] + 1]))
+    errors = [(model.probe(features) - labels) / torch.tensor([2.0, 0.5]) for features, labels in pairs]
+    assert parts["probe"].item() == pytest.approx(sum(error.square().mean().item() for error in errors), rel=0.02)
+    with_probe, without = (
+        world_model_loss(model, labels, tiny("").learning, stream())[0]
+        for labels in (labelled, batch._replace(labels=model.probe(states.features).detach()))
+    )
+    gradients = [torch.autograd.grad(loss, model.encoder.linear.weight)[0] for loss in (with_probe, without)]
+    assert torch.equal(*gradients)
+
+
+def test_a_probe_learns_the_quantity_of_its_name(batch, tiny):
+    torch.manual_seed(0)
+    model = WorldModel(tiny("").model, action_dim=1, labels={"height": 2.0})
+    features = torch.randn(4, 6, 48, generator=stream())
+    labels = 3.0 * features[..., :1]
+    optimizer = torch.optim.Adam(model.probe_head.parameters(), lr=1e-2)
+    for _ in range(150):
+        optimizer.zero_grad()
+        ((model.probe(features) - labels) / model.label_scales).square().mean().backward()
+        optimizer.step()
+    assert (model.probe(features) - labels).abs().mean() < 0.5
+
+
+def test_a_model_without_labels_refuses_to_be_probed(model):
+    with pytest.raises(ValueError, match="without labels"):
+        model.probe(torch.zeros(2, 48))
