@@ -2,14 +2,22 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 import torch
 from torch import Tensor
 
 from latentplan.config import Config, PlannerConfig
+from latentplan.config.quantities import scales
+from latentplan.goals.expression import Expression
+from latentplan.goals.image import read_goal
+from latentplan.goals.objective import plan_constraint, plan_objective, require_labels
+from latentplan.goals.parser import parse_constraints, parse_objective
 from latentplan.models import State, WorldModel
 from latentplan.models.heads import sample_action
 from latentplan.planning import CEMPlanner, ModelPredictiveController
+from latentplan.planning.objectives import Constraint, Term, predicted_return
 
 
 class ModelAgent:
@@ -133,12 +141,41 @@ class PlanningAgent(ModelAgent):
         super().reset(mask)
         self.controller.reset(None if self.state is None else self._forget)
 
+    def set_objective(
+        self, objective: str | Expression | Term | None = None, constraints: str | Sequence[Constraint] = ()
+    ) -> None:
+        """Changes what is planned for, from the next action on; the last plan stays where the search starts.
+
+        Args:
+            objective: An expression such as `"speed -> 2.0 and height > 1.1"`, or a term of
+                `latentplan.planning.objectives`; None is what the agent was trained for.
+            constraints: Inequalities such as `"cart < 0.5"`, separated by `;`, or functions of imagined rollouts.
+
+        Raises:
+            UserError: The text is no expression, or is about what this agent does not predict.
+        """
+        known = self.model.labels or scales(self.config.env.domain)
+        if isinstance(objective, str):
+            objective = parse_objective(objective, known)
+        if isinstance(objective, Expression):
+            require_labels([node for _, node in objective.terms], self.model.label_names)
+            learned = predicted_return(self.model, self.controller.planner.terminal_value)
+            objective = plan_objective(objective, self.config.env.action_repeat, learned, self._encode_goal)
+        if isinstance(constraints, str):
+            clauses = parse_constraints(constraints, known)
+            require_labels(clauses, self.model.label_names)
+            constraints = [plan_constraint(clauses)]
+        self.controller.set_objective(objective, constraints)
+
     @torch.no_grad()
     def imagine(self) -> np.ndarray | None:
         """The decoded last state of the present plan, uint8 (32, 32, 3), of the first environment."""
         if self.controller.plan is None or self.state is None:
             return None
         return self._picture(self.state, self.controller.plan.actions)
+
+    def _encode_goal(self, path: str) -> Tensor:
+        return torch.as_tensor(self.encode(read_goal(path)), device=self.model.device)
 
     def _choose(self, state: State) -> Tensor:
         with self.model.planning():

@@ -8,7 +8,7 @@ from __future__ import annotations
 import os
 import sys
 from argparse import SUPPRESS
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -110,8 +110,13 @@ def parse_train(argv: Sequence[str]) -> TrainCommand:
     return TrainCommand(compose(config_file, _flag_layer(flags), preset), None, {})
 
 
-def read_flags(argv: Sequence[str], known: Iterable[str]) -> dict[str, str]:
+def read_flags(argv: Sequence[str], known: Iterable[str], joined: Mapping[str, str] | None = None) -> dict[str, str]:
     """Split `--name value` and `--name=value` into a dictionary; the last of a repeated flag wins.
+
+    Args:
+        argv: The words of the command line.
+        known: Every flag there is.
+        joined: Flags whose values add up when they are repeated, and what stands between them.
 
     Raises:
         UserError: A flag is unknown (the nearest known one is named) or has no value.
@@ -128,6 +133,8 @@ def read_flags(argv: Sequence[str], known: Iterable[str]) -> dict[str, str]:
         value = value if equals else next(words, "--")
         if not equals and value.startswith("--"):
             raise UserError(f"flag {name} needs a value")
+        if name in flags and name in (joined or {}):
+            value = f"{flags[name]}{(joined or {})[name]}{value}"
         flags.pop(name, None)
         flags[name] = value
     return flags

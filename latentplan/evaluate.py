@@ -29,6 +29,11 @@ MODES = ("planner", "actor", "random")
 FLAGS = {
     "--checkpoint": ("DIR", "folder of a trained agent, or of a run (its best checkpoint)"),
     "--episodes": ("N", "episodes to play (10)"),
+    "--objective": (
+        "TEXT",
+        "what counts instead of the task, such as 'speed -> 2.0 and height > 1.1' (docs/zero-shot.md)",
+    ),
+    "--constraint": ("TEXT", "what must hold at every moment, such as 'cart < 0.5'; may be repeated"),
     "--mode": ("|".join(MODES), "who acts (planner)"),
     "--video": ("FILE", "film of the first episode, .mp4 or .webm"),
     "--json": ("FILE", "result as JSON"),
@@ -45,6 +50,8 @@ class EvaluationRequest:
     Attributes:
         checkpoint: Folder of the agent.
         episodes: Episodes to play.
+        objective: What counts instead of the task, or None.
+        constraint: What must hold at every moment, or None.
         mode: `planner`, `actor` or `random`.
         planner: Planner settings that replace the agent's, as they were typed.
         video: Where the film goes, or None.
@@ -56,6 +63,8 @@ class EvaluationRequest:
 
     checkpoint: Path
     episodes: int
+    objective: str | None
+    constraint: str | None
     mode: str
     planner: dict[str, str]
     video: Path | None
@@ -94,7 +103,7 @@ def parse_arguments(argv: Sequence[str]) -> EvaluationRequest:
         UserError: A flag or value is wrong, or an output path cannot be written; the message says what to give.
     """
     settings = [f"--planner.{name}" for name in field_names("planner")]
-    flags = read_flags(argv, [*FLAGS, *settings])
+    flags = read_flags(argv, [*FLAGS, *settings], {"--constraint": "; "})
     if "--checkpoint" not in flags:
         raise UserError("flag --checkpoint is missing; give the folder of a trained agent or of a run")
     mode, device = flags.get("--mode", "planner"), flags.get("--device", "auto")
@@ -108,6 +117,8 @@ def parse_arguments(argv: Sequence[str]) -> EvaluationRequest:
     return EvaluationRequest(
         checkpoint=Path(flags["--checkpoint"]),
         episodes=_whole_number(flags, "--episodes", 10, 1),
+        objective=flags.get("--objective"),
+        constraint=flags.get("--constraint"),
         mode=mode,
         planner=planner,
         video=_output_path(flags, "--video"),
@@ -134,7 +145,9 @@ def _evaluate(argv: Sequence[str]) -> int:
     overrides = {name: getattr(planner, name) for name in request.planner}
     device = _choose_device(request)
     from latentplan.envs import make_env
+    from latentplan.scoring import read_goals, score_env
 
+    goals = read_goals(request.objective, request.constraint, config.env.domain)
     env = make_env(config.env)
     try:
         agent = load_agent(request.checkpoint, mode=request.mode, device=device, **overrides)
@@ -143,7 +156,8 @@ def _evaluate(argv: Sequence[str]) -> int:
             f"{about['domain']}-{about['task']}, {request.mode} on {device}, pictures by {about['renderer']}",
             flush=True,
         )
-        return _play_and_report(request, env, agent, about, planner.horizon)
+        played = env if goals is None else score_env(env, goals, agent if request.mode == "planner" else None)
+        return _play_and_report(request, played, agent, about, planner.horizon)
     except OSError as error:
         raise UserError(f"an output could not be written: {error}") from error
     finally:
@@ -155,7 +169,9 @@ def _play_and_report(
 ) -> int:
     """Plays, prints, writes; an interrupt reports the episodes that were finished."""
     from latentplan.rollout import episode_seed, iterate_episodes, summarize
+    from latentplan.scoring import ScoredEnv
 
+    scored = env if isinstance(env, ScoredEnv) else None
     seeds = [episode_seed(request.seed, index) for index in range(request.episodes)]
     episodes: list[Episode] = []
     interrupted = False
@@ -165,7 +181,7 @@ def _play_and_report(
             from latentplan.reporting.film import filming
 
             planner = agent if request.mode == "planner" else None
-            on_step = stack.enter_context(filming(request.video, env, planner, horizon))
+            on_step = stack.enter_context(filming(request.video, env, planner, horizon, judge=scored))
         try:
             for episode in iterate_episodes(env, agent, seeds, on_step=on_step):
                 episodes.append(episode)
@@ -174,7 +190,8 @@ def _play_and_report(
             interrupted = True
             print(f"\ninterrupted after {len(episodes)} of {len(seeds)} episodes", flush=True)
         if episodes:
-            _report(request, {**about, **summarize(episodes)})
+            scores = {} if scored is None else scored.summarize(len(episodes))
+            _report(request, {**about, **summarize(episodes), **scores})
     return 130 if interrupted else 0
 
 
@@ -200,6 +217,10 @@ def _report(request: EvaluationRequest, result: dict[str, Any]) -> None:
     interval = "no interval from one episode" if low is None else f"95 % interval {low:.1f} to {high:.1f}"
     latency = "   ".join(f"{name} {value:.2f}" for name, value in result["decision_ms"].items())
     print(f"mean return {result['mean_return']:.1f}  ({interval}; episodes: {result['episodes']})")
+    if "objective_return" in result:
+        print(f"objective return {result['objective_return']:.1f}  ({result['objective']})")
+    if "violation_rate" in result:
+        print(f"violation rate {result['violation_rate']:.4f}  ({result['constraint']})")
     print(f"decision ms  {latency}", flush=True)
     if request.json is not None:
         partial = request.json.with_name(f".{request.json.name}.{os.getpid()}")

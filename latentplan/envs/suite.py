@@ -14,7 +14,7 @@ from gymnasium.error import ResetNeeded
 
 from latentplan.config import EnvConfig, UserError
 from latentplan.envs.gl import explain_gl_errors, require_backend
-from latentplan.envs.quantities import measure, scales
+from latentplan.envs.quantities import measure, scales, true_values
 from latentplan.envs.render import FrameRenderer
 
 if TYPE_CHECKING:
@@ -70,6 +70,9 @@ class SuiteEnv(gymnasium.Env[np.ndarray, np.ndarray]):
     Attributes:
         action_repeat: Control steps per decision; rewards are summed over them.
         decisions_per_episode: Decisions until the time limit.
+        domain: Domain of the suite.
+        record_quantities: Whether `info` of a step tells what was true after each of its control steps: `quantities`,
+            float64 (control step, quantity) in the order of `quantity_names`, and `rewards`, float64 (control step,).
         labels: Names of the quantities in `info["labels"]`, and the typical size of each.
     """
 
@@ -89,7 +92,7 @@ class SuiteEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         task = default_task(config.domain) if config.task is None else config.task
         self._task_env = _load(config.domain, task)
         self._camera = _checked_camera(self.physics, config)
-        self._domain, self._quality = config.domain, config.render_quality
+        self.domain, self._quality = config.domain, config.render_quality
         self.labels = scales(config.domain)
         self._renderers: dict[int, FrameRenderer] = {}
         self._needs_reset = True
@@ -97,6 +100,8 @@ class SuiteEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         # An episode lasts for the first whole number of steps that reaches dm_control's limit.
         limit = self._task_env._step_limit
         self._steps_per_episode = _UNLIMITED_EPISODE_STEPS if math.isinf(limit) else math.ceil(limit)
+        self.record_quantities = False
+        self._recorded: list[tuple[np.ndarray, float]] = []
         self.action_repeat = config.action_repeat
         frames_per_second = 1.0 / (self._task_env.control_timestep() * config.action_repeat)
         self.metadata = {**SuiteEnv.metadata, "render_fps": frames_per_second}
@@ -161,6 +166,7 @@ class SuiteEnv(gymnasium.Env[np.ndarray, np.ndarray]):
             outcome = self._task_env.step(control)
             reward += float(outcome.reward)
             env_frames += 1
+            self._record(outcome.reward)
             self._steps_left -= 1
             # The suite marks an end of its own with discount 0, and the time limit with discount 1.
             terminated = outcome.last() and outcome.discount == 0.0
@@ -186,7 +192,16 @@ class SuiteEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         self._needs_reset = True
 
     def _info(self, env_frames: int) -> dict[str, Any]:
-        return {"env_frames": env_frames, "labels": measure(self._domain, self.physics)}
+        info = {"env_frames": env_frames, "labels": measure(self.domain, self.physics)}
+        if self._recorded:
+            quantities, rewards = zip(*self._recorded, strict=True)
+            info |= {"quantities": np.stack(quantities), "rewards": np.array(rewards)}
+            self._recorded.clear()
+        return info
+
+    def _record(self, reward: float) -> None:
+        if self.record_quantities:
+            self._recorded.append((true_values(self.domain, self.physics), float(reward)))
 
     def _seed_task(self, seed: int | None) -> None:
         self._task_env.task.random.seed(seed)

@@ -98,9 +98,16 @@ class ModelPredictiveController:
         elif self.plan is not None:
             self.plan = self.plan.forget(mask)
 
-    def set_objective(self, objective: Term | None) -> None:
-        """Changes what is maximised, from the next action on; the last plan stays where the search starts."""
+    def set_objective(self, objective: Term | None, constraints: Sequence[Constraint] | None = None) -> None:
+        """Changes what is maximised, from the next action on; the last plan stays where the search starts.
+
+        Args:
+            objective: What is maximised; None is predicted reward and value.
+            constraints: What plans must keep; None leaves them as they are.
+        """
         self.objective = objective
+        if constraints is not None:
+            self.constraints = constraints
         self._is_stale = True  # what was planned for the old objective is not executed further
 
     @property

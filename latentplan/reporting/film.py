@@ -7,7 +7,8 @@ import os
 from collections.abc import Callable, Iterator
 from typing import TYPE_CHECKING, Any, Protocol
 
-from latentplan.reporting.video import PANEL_SIZE, Frame, VideoWriter, compose_frame
+from latentplan.reporting.goal import Judge, draw_goal
+from latentplan.reporting.video import GAP, PANEL_SIZE, Frame, VideoWriter, compose_frame
 
 if TYPE_CHECKING:
     import gymnasium
@@ -55,6 +56,7 @@ def filming(
     horizon: int | None = None,
     *,
     every: int = 1,
+    judge: Judge | None = None,
 ) -> Iterator[Callable[[Moment], None]]:
     """Films the first episode that is played inside the block, in real time where the environment tells its rate.
 
@@ -64,6 +66,7 @@ def filming(
         planner: The agent, where it plans; None leaves the plan's side empty.
         horizon: Model steps that its plans look ahead.
         every: Decisions per picture; the film keeps the time of the episode.
+        judge: Who scores an objective or constraints; the film then shows how they are met.
 
     Yields:
         The callback to hand to the rollouts.
@@ -74,7 +77,7 @@ def filming(
         def film(moment: Moment) -> None:
             if moment.episode > 0 or moment.decision % every:
                 return
-            picture = _compose(moment, env, planner, horizon)
+            picture = _compose(moment, env, planner, horizon, judge)
             if not films:
                 fps = float(env.unwrapped.metadata.get("render_fps") or DEFAULT_FPS)
                 films.append(stack.enter_context(VideoWriter(path, fps / every, (picture.shape[1], picture.shape[0]))))
@@ -83,7 +86,9 @@ def filming(
         yield film
 
 
-def _compose(moment: Moment, env: gymnasium.Env[Any, Any], planner: Imagining | None, horizon: int | None) -> Frame:
+def _compose(
+    moment: Moment, env: gymnasium.Env[Any, Any], planner: Imagining | None, horizon: int | None, judge: Judge | None
+) -> Frame:
     over = moment.action is None
     render = getattr(env.unwrapped, "render_large", None)
     return compose_frame(
@@ -92,4 +97,5 @@ def _compose(moment: Moment, env: gymnasium.Env[Any, Any], planner: Imagining | 
         [f"return {moment.total_return:.1f}    step {moment.decision}"],
         horizon=horizon,
         absence="episode over" if over else "no plan",
+        strip=None if judge is None else draw_goal(2 * PANEL_SIZE + GAP, judge.worth, judge.clauses),
     )

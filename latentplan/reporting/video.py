@@ -23,12 +23,12 @@ Frame = NDArray[np.uint8]
 CODECS = {".mp4": "vp09", ".webm": "VP90"}
 PANEL_SIZE = 256
 
-_GAP = 8
-_LINE_HEIGHT = 24
+GAP = 8
+LINE_HEIGHT = 24
 _BACKGROUND = (24, 24, 28)
-_PANEL = (44, 44, 50)
+PANEL = (44, 44, 50)
 _TEXT = (235, 235, 235)
-_FAINT = (165, 165, 172)
+FAINT = (165, 165, 172)
 _FONT = cv2.FONT_HERSHEY_SIMPLEX
 
 
@@ -117,6 +117,7 @@ def compose_frame(
     *,
     horizon: int | None = None,
     absence: str = "no plan",
+    strip: Frame | None = None,
 ) -> Frame:
     """One picture of a film: the real frame, the end of the plan beside it, text below.
 
@@ -126,25 +127,32 @@ def compose_frame(
         lines: Rows of ASCII text below the pictures; what is too long is cut.
         horizon: Model steps from the real frame to the imagined one.
         absence: What the right side says where there is no plan.
+        strip: What goes below everything, RGB uint8 (height, width, 3), its height even and its width that of the
+            two pictures and the gap between them.
 
     Returns:
-        RGB uint8 (height, width, 3), both sides even; the size depends on that of `real` and the number of lines.
+        RGB uint8 (height, width, 3), both sides even; the size depends on that of `real` and `strip` and the number
+        of lines.
     """
     side = max(PANEL_SIZE, real.shape[0], real.shape[1])
     side += side % 2
-    height = 2 * _GAP + _LINE_HEIGHT + side + _LINE_HEIGHT * len(lines)
-    canvas: Frame = np.full((height, 2 * side + 3 * _GAP, 3), _BACKGROUND, np.uint8)
-    top, left, right = _GAP + _LINE_HEIGHT, _GAP, 2 * _GAP + side
+    height = 2 * GAP + LINE_HEIGHT + side + LINE_HEIGHT * len(lines)
+    if strip is not None:
+        height += len(strip) + GAP
+    canvas: Frame = np.full((height, 2 * side + 3 * GAP, 3), _BACKGROUND, np.uint8)
+    top, left, right = GAP + LINE_HEIGHT, GAP, 2 * GAP + side
     canvas[top : top + side, left : left + side] = _enlarge(real, side)
-    _write_text(canvas, "camera", left, _GAP, side)
+    write_text(canvas, "camera", left, GAP, side)
     if imagined is None:
-        canvas[top : top + side, right : right + side] = _PANEL
+        canvas[top : top + side, right : right + side] = PANEL
         _write_centred(canvas, absence, right, top + side // 2, side)
     else:
         canvas[top : top + side, right : right + side] = _enlarge(imagined, side)
-        _write_text(canvas, _horizon_label(horizon), right, _GAP, side)
+        write_text(canvas, _horizon_label(horizon), right, GAP, side)
     for row, line in enumerate(lines):
-        _write_text(canvas, line, left, top + side + row * _LINE_HEIGHT + _GAP // 2, 2 * side + _GAP)
+        write_text(canvas, line, left, top + side + row * LINE_HEIGHT + GAP // 2, 2 * side + GAP)
+    if strip is not None:
+        canvas[-GAP - len(strip) : -GAP, left : left + strip.shape[1]] = strip
     return canvas
 
 
@@ -161,19 +169,20 @@ def _enlarge(picture: Frame, side: int) -> Frame:
     return np.asarray(cv2.resize(picture, (side, side), interpolation=interpolation), np.uint8)
 
 
-def _write_text(canvas: Frame, text: str, left: int, top: int, width: int, color: tuple[int, int, int] = _TEXT) -> None:
+def write_text(canvas: Frame, text: str, left: int, top: int, width: int, color: tuple[int, int, int] = _TEXT) -> None:
     """Writes one row, cut to `width` pixels, into the band of one line height below `top`."""
-    while text and _text_width(text) > width:
+    while text and text_width(text) > width:
         text = text[:-4] + "..." if len(text) > 4 else ""
-    cv2.putText(canvas, text, (left, top + _LINE_HEIGHT - 8), _FONT, 0.5, color, 1, cv2.LINE_AA)
+    cv2.putText(canvas, text, (left, top + LINE_HEIGHT - 8), _FONT, 0.5, color, 1, cv2.LINE_AA)
 
 
 def _write_centred(canvas: Frame, text: str, left: int, middle: int, width: int) -> None:
-    indent = max(0, (width - _text_width(text)) // 2)
-    _write_text(canvas, text, left + indent, middle - _LINE_HEIGHT // 2, width, _FAINT)
+    indent = max(0, (width - text_width(text)) // 2)
+    write_text(canvas, text, left + indent, middle - LINE_HEIGHT // 2, width, FAINT)
 
 
-def _text_width(text: str) -> int:
+def text_width(text: str) -> int:
+    """Pixels that a row takes."""
     return int(cv2.getTextSize(text, _FONT, 0.5, 1)[0][0])
 
 

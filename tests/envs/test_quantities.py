@@ -3,7 +3,9 @@
 import numpy as np
 import pytest
 
+from latentplan.config import EnvConfig
 from latentplan.config.quantities import QUANTITIES, TASK_PREFIX
+from latentplan.envs import make_env
 from latentplan.envs.quantities import clause_degree, measure, quantity_names, scales, true_values
 
 NOT_IN_THE_SUITE = {("walker", "backward"), ("cheetah", "backward")}
@@ -105,3 +107,34 @@ def test_a_clause_is_worth_a_tenth_one_margin_short_of_it():
     degrees = clause_degree(np.array([-3.0, 0.0, 0.5, 1.0, np.nan]))
     assert degrees[:4] == pytest.approx([1.0, 1.0, 0.1**0.25, 0.1])
     assert np.isnan(degrees[4])
+
+
+def test_a_step_tells_what_was_true_after_each_of_its_control_steps():
+    config = EnvConfig("walker", "walk", action_repeat=3, render_quality="fastest")
+    env, twin = make_env(config, seed=1), load("walker", "walk")
+    env.record_quantities = True
+    _, start = env.reset(seed=1)
+    twin.reset()
+    with twin.physics.reset_context():
+        twin.physics.set_state(env.true_state())
+    action = np.full(env.action_space.shape, 0.3)
+    for _ in range(2):
+        *_, reward, _, _, info = env.step(action)
+        steps = [(twin.step(action).reward, true_values("walker", twin.physics)) for _ in range(3)]
+        assert info["rewards"] == pytest.approx([pay for pay, _ in steps], abs=1e-9)
+        assert info["quantities"] == pytest.approx(np.stack([values for _, values in steps]), abs=1e-9)
+        assert reward == pytest.approx(info["rewards"].sum())
+    assert "quantities" not in start
+    env.record_quantities = False
+    assert "quantities" not in env.step(action)[-1]
+    env.close()
+
+
+def test_the_documentation_lists_every_quantity_with_its_margin(root):
+    text = (root / "docs" / "zero-shot.md").read_text()
+    rows = [
+        f"`{quantity.name}` | {quantity.unit.replace('1', '')} | {quantity.scale:g} | {quantity.meaning} |"
+        for quantities in QUANTITIES.values()
+        for quantity in quantities
+    ]
+    assert [row for row in rows if row not in text] == []

@@ -1,0 +1,1 @@
+"""Goals named after training: a small language, and what a search maximises for it."""

@@ -1,0 +1,135 @@
+"""What a search maximises for an expression, and keeps for a constraint, by the quantities that a model predicts.
+
+The model has `label_names`, states with `features` (rows, feature), and `probe(features)`, the predicted quantities.
+What is planned for differs from what is scored in two points, both because a prediction is not the truth: degrees
+fall off more slowly, so that a clause far from holding still tells the search where to go, and inequalities that must
+hold are kept with some distance.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import torch
+from einops import rearrange, reduce
+from torch import Tensor
+
+from latentplan.config import UserError
+from latentplan.goals.expression import (
+    Clause,
+    Expression,
+    GoalImage,
+    LearnedReturn,
+    Lookup,
+    Name,
+    Node,
+    evaluate,
+    shortfall,
+    walk,
+)
+from latentplan.planning.objectives import Objective, Rollout
+
+CAUTION = 0.1  # margins that a plan stays away from where a constraint would break
+GOAL_DISTANCE = 1.0  # root mean square distance of latents that counts as one margin
+
+
+def plan_objective(
+    expression: Expression, frames_per_step: int, learned: Objective, encode_goal: Callable[[str], Tensor]
+) -> Objective:
+    """The predicted worth of an expression, summed over the env frames of each imagined rollout with its weights.
+
+    Only the learned return looks beyond the rollout: the learned value belongs to the task of the training.
+
+    Args:
+        expression: What to maximise.
+        frames_per_step: Env frames that one imagined step stands for.
+        learned: What `return` stands for.
+        encode_goal: Gives the latent (latent,) of a picture's path; called once per goal.
+    """
+    objectives: list[Objective] = []
+    quantities: list[tuple[float, Node]] = []
+    for weight, term in expression.terms:
+        if isinstance(term, LearnedReturn):
+            objectives.append(weight * learned)
+        elif isinstance(term, GoalImage):
+            objectives.append(weight * frames_per_step * _goal_objective(encode_goal(term.path)))
+        else:
+            quantities.append((weight * frames_per_step, term))
+    if quantities:
+        objectives.append(_quantity_objective(quantities))
+    return sum(objectives[1:], objectives[0])
+
+
+def plan_constraint(clauses: Sequence[Clause]) -> Objective:
+    """By how many margins predicted quantities break the clauses, summed over steps; 0 where all hold with distance."""
+
+    def violation(rollout: Rollout) -> Tensor:
+        values = predicted_quantities(rollout)
+        excesses = [torch.as_tensor(shortfall(clause, values)) + CAUTION for clause in clauses]
+        return reduce(torch.stack(excesses).clamp_min(0.0), "clause step rows -> rows", "sum")
+
+    return Objective(violation, needs_states=True, needs=("probe",))
+
+
+def require_labels(nodes: Sequence[Node], labels: Sequence[str]) -> None:
+    """Refuses expressions about quantities that a model does not predict.
+
+    Raises:
+        UserError: Names the first such quantity.
+    """
+    for name in [part.name for node in nodes for part in walk(node) if isinstance(part, Name)]:
+        if name not in labels:
+            known = f"it predicts {', '.join(labels)}" if labels else "it was trained without named quantities"
+            raise UserError(f"this agent cannot plan for {name!r}: {known}")
+
+
+def predicted_quantities(rollout: Rollout) -> Lookup:
+    """The quantities predicted after every imagined step; each is (step, rows), float32.
+
+    Returns:
+        A function from a quantity's name to its values.
+    """
+    features = torch.stack([state.features for state in rollout.states])
+    flat = rollout.model.probe(rearrange(features, "step rows feature -> (step rows) feature")).float()
+    labels = rearrange(flat, "(step rows) label -> label step rows", step=len(features))
+    places = {name: index for index, name in enumerate(rollout.model.label_names)}
+    return lambda name: labels[places[name]]
+
+
+def plan_degree(shortfalls: Tensor) -> Tensor:
+    """How far a clause is met, in (0, 1], with a slope wherever it is not.
+
+    The mean of the Gaussian that scores and of 1 / (1 + x), which falls slowly.
+
+    Args:
+        shortfalls: In margins, any shape; 0 and below is met.
+    """
+    missing = shortfalls.clamp_min(0.0)
+    gaussian = torch.exp(math.log(0.1) * missing.square())
+    return 0.5 * (gaussian + 1.0 / (1.0 + missing))
+
+
+def _quantity_objective(terms: Sequence[tuple[float, Node]]) -> Objective:
+    def evaluate_terms(rollout: Rollout) -> Tensor:
+        values = predicted_quantities(rollout)
+        worth: Any = sum(weight * evaluate(node, values, plan_degree) for weight, node in terms)
+        return _discounted(torch.as_tensor(worth).expand(len(rollout.states), len(rollout.actions)), rollout)
+
+    return Objective(evaluate_terms, needs_states=True, needs=("probe",))
+
+
+def _goal_objective(goal: Tensor) -> Objective:
+    def closeness(rollout: Rollout) -> Tensor:
+        latents = torch.stack([state.stoch for state in rollout.states])
+        distances = (latents.float() - goal.float()).square().mean(dim=-1).sqrt()
+        return _discounted(plan_degree(distances / GOAL_DISTANCE), rollout)
+
+    return Objective(closeness, needs_states=True)
+
+
+def _discounted(worth: Tensor, rollout: Rollout) -> Tensor:
+    """The worth of states (step, rows) weighted and summed, (rows,)."""
+    by_row = rearrange(worth, "step rows -> rows step").to(rollout.rewards.dtype)
+    return (by_row * rollout.weights[..., :-1]).sum(dim=1)

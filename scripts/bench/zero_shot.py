@@ -1,0 +1,188 @@
+"""`benchmark.py zero-shot`: goals that an agent was not trained for, pursued by planner, actor and chance."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from bench.arms import check_checkpoint, single_thread
+from bench.options import DEVICE_FLAGS, Flags, choose_device, output_path, settings_layer, whole_number
+from bench.report import format_table, interval, number, write_json
+from latentplan.compose import build_config
+from latentplan.config import UserError, to_dict
+
+FLAGS = {
+    "--checkpoint": ("DIR", "trained agent, or run (its best checkpoint)"),
+    "--objectives": ("A | B", "objectives as in eval.py, separated by |"),
+    "--constraints": ("A | B", "constraints as in eval.py, separated by |, each with the objective of the training"),
+    "--episodes": ("N", "episodes of each row, on the same starts (10)"),
+    "--seed": ("S", "episode i starts from a state that depends only on S and i (0)"),
+    "--workers": ("N", "rows played at once, each in its own process (1)"),
+    "--device": DEVICE_FLAGS["--device"],
+    "--json": ("FILE", "result as JSON"),
+}
+SETTINGS = ("planner",)
+OBJECTIVE_PLAYERS = ("planner", "actor", "random")
+CONSTRAINT_PLAYERS = ("planner", "unconstrained", "actor", "random")
+
+
+class Job(NamedTuple):
+    """One row of the result.
+
+    Attributes:
+        objective: What is scored, or None.
+        constraint: What is scored, or None.
+        player: `planner`, `actor`, `random`, or `unconstrained`: a planner that does not know of the constraint.
+    """
+
+    objective: str | None
+    constraint: str | None
+    player: str
+
+
+def run(flags: Flags) -> int:
+    """Play every goal with every player from the same starts."""
+    if "--checkpoint" not in flags:
+        raise UserError("flag --checkpoint is missing; give the folder of a trained agent or of a run")
+    checkpoint, json_path = flags["--checkpoint"], output_path(flags, "--json")
+    episodes, seed = whole_number(flags, "--episodes", 10), whole_number(flags, "--seed", 0, least=0)
+    workers = whole_number(flags, "--workers", 1)
+    jobs = list_jobs(flags)
+    info, trained = check_checkpoint(Path(checkpoint))
+    _check_goals(jobs, info["config"]["env"]["domain"])
+    typed = settings_layer(flags).get("planner", {})
+    planner = build_config({"planner": {**to_dict(trained), **typed}}).planner
+    overrides = {name: getattr(planner, name) for name in typed}
+    device = str(choose_device(flags))
+    from latentplan.rollout import episode_seed
+
+    seeds = [episode_seed(seed, index) for index in range(episodes)]
+    about = {
+        "checkpoint": checkpoint,
+        "domain": info["domain"],
+        "task": info["task"],
+        "env_frames_trained": info["env_frames"],
+        "render_quality": info["config"]["env"]["render_quality"],
+        "planner": to_dict(planner),
+        "seed": seed,
+        "episodes": episodes,
+    }
+    print(f"{about['domain']}-{about['task']}, {episodes} episodes per row, {workers} at once", flush=True)
+    rows: list[dict[str, Any]] = []
+    for row in _play(checkpoint, jobs, seeds, device, overrides, workers):
+        rows.append(row)
+        print(f"{row['goal']}, {row['player']}: {number(row['mean'], row['digits'])}", flush=True)
+        write_json(json_path, {**about, "rows": rows})
+    print(summary_table(rows))
+    return 0
+
+
+def list_jobs(flags: Flags) -> list[Job]:
+    """The rows that the flags ask for.
+
+    Raises:
+        UserError: They ask for none.
+    """
+    objectives, constraints = _parts(flags.get("--objectives", "")), _parts(flags.get("--constraints", ""))
+    if not objectives and not constraints:
+        raise UserError("give --objectives 'height > 1.2 | speed -> 2.0' or --constraints 'cart < 0.5', or both")
+    return [
+        *(Job(text, None, player) for text in objectives for player in OBJECTIVE_PLAYERS),
+        *(Job(None, text, player) for text in constraints for player in CONSTRAINT_PLAYERS),
+    ]
+
+
+def play_job(
+    checkpoint: str, job: Job, seeds: Sequence[int], device: str, overrides: dict[str, Any], threads: int
+) -> dict[str, Any]:
+    """Play one episode per seed and score it by the true quantities.
+
+    Returns:
+        The row: `goal`, `kind` (`objective` or `constraint`), `player`, the score of each episode in `scores`
+        (objective return, or violation rate), their `mean` and `ci95`, the task's `returns` and `mean_return` with
+        `return_ci95`, and `decision_ms`.
+    """
+    import torch
+
+    from bench.statistics import mean_estimate
+    from latentplan.checkpoint import load_agent, load_model
+    from latentplan.envs import make_env
+    from latentplan.rollout import run_episodes, summarize
+    from latentplan.scoring import read_goals, score_env
+
+    torch.set_num_threads(threads)
+    _, config, _ = load_model(checkpoint)
+    mode = "planner" if job.player == "unconstrained" else job.player
+    agent: Any = load_agent(checkpoint, mode=mode, device=device, **(overrides if mode == "planner" else {}))
+    goals = read_goals(job.objective, job.constraint, config.env.domain)
+    assert goals is not None, "a job names an objective or a constraint"
+    env = make_env(config.env)
+    try:
+        scored = score_env(env, goals, agent if job.player == "planner" else None)
+        result = summarize(run_episodes(scored, agent, seeds))
+    finally:
+        env.close()
+    is_objective = job.objective is not None
+    scores = [score.objective_return if is_objective else score.violation_rate for score in scored.scores]
+    estimate = mean_estimate(scores)
+    return {
+        "goal": job.objective or job.constraint,
+        "kind": "objective" if is_objective else "constraint",
+        "player": job.player,
+        "scores": scores,
+        "mean": estimate.mean,
+        "ci95": [estimate.low, estimate.high],
+        "digits": 1 if is_objective else 4,
+        "returns": result["returns"],
+        "mean_return": result["mean_return"],
+        "return_ci95": result["ci95"],
+        "decision_ms": result["decision_ms"],
+    }
+
+
+def summary_table(rows: Sequence[dict[str, Any]]) -> str:
+    """The rows for people: scores are objective returns, or for constraints violation rates."""
+    header = ["goal", "player", "score", "95 %", "task return", "95 %", "ms p50"]
+    lines = [
+        [
+            f"{row['goal']} ({row['kind']})",
+            row["player"],
+            number(row["mean"], row["digits"]),
+            interval(row["ci95"], row["digits"]),
+            number(row["mean_return"]),
+            interval(row["return_ci95"]),
+            number(row["decision_ms"]["p50"], 2),
+        ]
+        for row in rows
+    ]
+    return format_table(header, lines)
+
+
+def _parts(text: str) -> list[str]:
+    return list(dict.fromkeys(part.strip() for part in text.split("|") if part.strip()))
+
+
+def _check_goals(jobs: Sequence[Job], domain: str) -> None:
+    from latentplan.scoring import read_goals
+
+    for job in jobs:
+        read_goals(job.objective, job.constraint, domain)
+
+
+def _play(
+    checkpoint: str, jobs: Sequence[Job], seeds: Sequence[int], device: str, overrides: dict[str, Any], workers: int
+) -> Iterator[dict[str, Any]]:
+    """The rows in order, each as soon as it and those before it are there."""
+    if workers == 1:
+        for job in jobs:
+            yield play_job(checkpoint, job, seeds, device, overrides, 1)
+        return
+    import multiprocessing
+    from concurrent.futures import ProcessPoolExecutor
+
+    context = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(min(workers, len(jobs)), context, single_thread) as pool:
+        futures = [pool.submit(play_job, checkpoint, job, seeds, device, overrides, 1) for job in jobs]
+        for future in futures:
+            yield future.result()

@@ -1,0 +1,73 @@
+"""Goals that an agent was not trained for, measured with every player."""
+
+import json
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+
+from latentplan.checkpoint import save_checkpoint
+from latentplan.config import Config, EnvConfig, ModelConfig, PlannerConfig
+from latentplan.config.quantities import scales
+from latentplan.models import WorldModel
+
+sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "scripts"))
+
+import benchmark  # noqa: E402
+from bench.zero_shot import CONSTRAINT_PLAYERS, OBJECTIVE_PLAYERS, list_jobs  # noqa: E402
+
+ENV = EnvConfig(domain="cartpole", task="swingup", action_repeat=200, render_quality="fastest")
+MODEL = ModelConfig(deter_dim=8, hidden_dim=8, encoder_channels=(4, 4), decoder_channels=2, num_bins=5)
+PLANNER = PlannerConfig(horizon=3, num_samples=8, num_elites=2, num_policy_samples=1, num_iterations=2)
+
+
+@pytest.fixture(scope="module")
+def checkpoint(tmp_path_factory):
+    """An untrained agent for five-decision episodes of cartpole."""
+    folder = tmp_path_factory.mktemp("agent")
+    info = {"domain": "cartpole", "task": "swingup", "env_frames": 1234, "discount": 0.9, "metrics": {}}
+    torch.manual_seed(0)
+    model = WorldModel(MODEL, 1, scales("cartpole"))
+    save_checkpoint(folder, model, Config(env=ENV, model=MODEL, planner=PLANNER), info)
+    return folder
+
+
+def test_every_goal_is_measured_with_every_player(tmp_path, checkpoint, capsys):
+    path = tmp_path / "result.json"
+    flags = ["--objectives", "cart -> 1.0", "--constraints", "cart < 0.01", "--episodes", "2", "--json", str(path)]
+    flags += ["--planner.horizon", "2", "--device", "cpu"]
+    assert benchmark.main(["zero-shot", "--checkpoint", str(checkpoint), *flags]) == 0
+    result = json.loads(path.read_text())
+    found = [(row["goal"], row["kind"], row["player"]) for row in result["rows"]]
+    assert found == [
+        *(("cart -> 1.0", "objective", player) for player in OBJECTIVE_PLAYERS),
+        *(("cart < 0.01", "constraint", player) for player in CONSTRAINT_PLAYERS),
+    ]
+    by_player = {(row["kind"], row["player"]): row for row in result["rows"]}
+    assert all(0.0 <= rate <= 1.0 for rate in by_player["constraint", "planner"]["scores"])
+    assert all(row["ci95"][0] <= row["mean"] <= row["ci95"][1] for row in result["rows"])
+    # Who does not know of the goal plays the same whatever is scored.
+    for player in ("actor", "random"):
+        assert by_player["objective", player]["returns"] == by_player["constraint", player]["returns"]
+    assert result["planner"]["horizon"] == 2
+    assert "cart < 0.01 (constraint)" in capsys.readouterr().out
+
+
+def test_goals_are_listed_once_in_order():
+    jobs = list_jobs({"--objectives": "cart > 1; 500: cart < 1 | upright | upright |"})
+    assert [job.objective for job in jobs[::3]] == ["cart > 1; 500: cart < 1", "upright"]
+
+
+@pytest.mark.parametrize(
+    ("flags", "reason"),
+    [
+        ((), "give --objectives"),
+        (("--objectives", "crat > 1"), "Did you mean 'cart'"),
+        (("--constraints", "cart"), "ineq"),
+    ],
+)
+def test_bad_goals_are_one_line(capsys, checkpoint, flags, reason):
+    assert benchmark.main(["zero-shot", "--checkpoint", str(checkpoint), *flags]) == 2
+    error = capsys.readouterr().err
+    assert error.startswith("error: ") and error.count("\n") == 1 and reason in error
