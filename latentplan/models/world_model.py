@@ -46,9 +46,14 @@ class WorldModel(nn.Module):
         if self.labels:
             self.probe_head = Mlp(features, config.hidden_dim, len(self.labels))
 
-    def trunk_precision(self) -> AbstractContextManager[None]:
-        """Autocast to bfloat16 for the products in the trunk; heads leave it by themselves."""
-        return torch.autocast(self.device.type, dtype=torch.bfloat16)
+    def trunk_precision(self, *, cache: bool = True) -> AbstractContextManager[None]:
+        """Autocast to bfloat16 for the products in the trunk; heads leave it by themselves.
+
+        Args:
+            cache: Whether converted weights are kept while it lasts. All threads share one store, which each empties
+                when it leaves: what learns in two threads must not use it, or rounding would depend on timing.
+        """
+        return torch.autocast(self.device.type, dtype=torch.bfloat16, cache_enabled=cache)
 
     @contextmanager
     def planning(self) -> Iterator[None]:

@@ -74,6 +74,10 @@ class Experience(lightning.Callback):
             self._ask_evaluation(learner.updates)
             self.evaluated_weights = weights
 
+    def on_train_epoch_end(self, trainer: lightning.Trainer, learner: Learner) -> None:  # type: ignore[override]
+        """Bring the behaviour up to date before anything else looks at the learner."""
+        learner.catch_up()
+
     def take(self) -> None:
         """Wait for what was asked for, if anything was."""
         if self._asked_round:

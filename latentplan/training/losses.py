@@ -51,7 +51,7 @@ class Learned(NamedTuple):
 def world_model_loss(model: WorldModel, batch: Batch, config: LearningConfig, generator: torch.Generator) -> Learned:
     """Reconstruction, reward, continuation and balanced KL over a batch of sequences, and open-loop predictions."""
     size, frames_per_sequence = batch.frames.shape[:2]
-    with model.trunk_precision():
+    with model.trunk_precision(cache=False):
         embeddings = model.encoder(batch.frames.flatten(0, 1)).unflatten(0, (size, frames_per_sequence))
     noise = torch.randn(
         size, frames_per_sequence, model.config.latent_dim, generator=generator, device=batch.frames.device
@@ -60,7 +60,7 @@ def world_model_loss(model: WorldModel, batch: Batch, config: LearningConfig, ge
     features = states.features
     overshooting, open_loop = _predict_open_loop(model, batch, states, posterior, config)
     reached = open_loop.shape[1]
-    with model.trunk_precision():
+    with model.trunk_precision(cache=False):
         prior = model.dynamics.prior(states.deter)
         patches = model.decoder(features.flatten(0, 1))
         reward_logits = model.reward_head(features[:, 1:])
@@ -181,7 +181,7 @@ def _predict_open_loop(
 
 def _probe_loss(model: WorldModel, features: Tensor, labels: Tensor) -> Tensor:
     """Squared error of the quantities read off the latent, in typical sizes; the latent learns nothing from it."""
-    with model.trunk_precision():
+    with model.trunk_precision(cache=False):
         predicted = model.probe(features.detach())
     return ((predicted - labels) / model.label_scales).square().mean()
 

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import copy
+from concurrent.futures import Future, ThreadPoolExecutor
+from functools import cached_property
 
 import lightning
 import torch
@@ -12,12 +14,17 @@ from latentplan.config import LearningConfig, derive_seed
 from latentplan.models import State, WorldModel
 from latentplan.replay import Batch, Replay
 from latentplan.training.losses import Learned, imagine, lambda_return, value_loss, world_model_loss
+from latentplan.training.snapshot import Snapshot
 
 RETURN_RANGE_RATE = 0.01
 
 
 class Learner(lightning.LightningModule):
     """Learns a world model from replay, and an actor and a value in its imagination.
+
+    Behaviour learns in a thread of its own, from a snapshot of the model as it was after its latest update, while the
+    model takes the next one; both wait for each other after every update, so results do not depend on timing.
+    `catch_up` ends an epoch.
 
     Args:
         model: What is learned.
@@ -37,6 +44,8 @@ class Learner(lightning.LightningModule):
         self.register_buffer("return_range", torch.zeros(()))
         self.updates = 0
         self.metrics: dict[str, Tensor] = {}
+        self._thread = ThreadPoolExecutor(1, thread_name_prefix="behaviour")
+        self._waiting: tuple[Learned, Batch, torch.Generator] | None = None
 
     def configure_optimizers(self) -> list[torch.optim.Optimizer]:
         """One Adam for the world model, one for actor and value."""
@@ -49,24 +58,57 @@ class Learner(lightning.LightningModule):
         ]
 
     def training_step(self, batch: Batch, batch_index: int) -> None:
-        """One update of everything from one batch of sequences."""
-        optimizers = self.optimizers(use_pl_optimizer=False)
-        assert isinstance(optimizers, list)
-        world_optimizer, behaviour_optimizer = optimizers
+        """One update of the world model from a batch of sequences, and of behaviour from the batch before."""
+        world_optimizer, _ = self._optimizers()
+        behaviour = self._start_behaviour()
         generator = torch.Generator(self.device).manual_seed(derive_seed(self.seed, "update", self.updates))
-        learned = world_model_loss(self.model, batch, self.config, generator)
-        parts = learned.parts
-        parts["model_grad_norm"] = self._descend(world_optimizer, learned.loss)
+        try:
+            learned = world_model_loss(self.model, batch, self.config, generator)
+            learned.parts["model_grad_norm"] = self._descend(world_optimizer, learned.loss)
+        finally:
+            self._finish_behaviour(behaviour)
         self.replay.refresh(batch.rows, learned.states.deter)
-        loss, behaviour_parts = self._behaviour_loss(learned, batch, generator)
-        parts |= behaviour_parts
-        parts["behaviour_grad_norm"] = self._descend(behaviour_optimizer, loss)
+        self.snapshot.refresh()
+        self._waiting = (learned._replace(loss=learned.loss.detach()), batch, generator)
+        self.updates += 1
+        self.metrics |= learned.parts
+
+    @cached_property
+    def snapshot(self) -> Snapshot:
+        """Where behaviour dreams; made when the model is where it stays."""
+        return Snapshot(self.model)
+
+    def catch_up(self) -> None:
+        """Let behaviour learn from what the model has learned from; due before weights are used or saved."""
+        self._finish_behaviour(self._start_behaviour())
+
+    def teardown(self, stage: str) -> None:
+        """End the thread."""
+        self._thread.shutdown()
+
+    def _start_behaviour(self) -> Future[dict[str, Tensor]] | None:
+        if self._waiting is None:
+            return None
+        waiting, self._waiting = self._waiting, None
+        return self._thread.submit(self._learn_behaviour, *waiting)
+
+    def _finish_behaviour(self, behaviour: Future[dict[str, Tensor]] | None) -> None:
+        if behaviour is not None:
+            self.metrics |= behaviour.result()
+
+    def _learn_behaviour(self, learned: Learned, batch: Batch, generator: torch.Generator) -> dict[str, Tensor]:
+        loss, parts = self._behaviour_loss(learned, batch, generator)
+        parts["behaviour_grad_norm"] = self._descend(self._optimizers()[1], loss)
         with torch.no_grad():
             pairs = zip(self.target_value.parameters(), self.model.value_head.parameters(), strict=True)
             for slow, fast in pairs:
                 slow.lerp_(fast, self.config.target_rate)
-        self.updates += 1
-        self.metrics = parts
+        return parts
+
+    def _optimizers(self) -> list[torch.optim.Optimizer]:
+        optimizers = self.optimizers(use_pl_optimizer=False)
+        assert isinstance(optimizers, list)
+        return optimizers
 
     def _behaviour_loss(
         self, learned: Learned, batch: Batch, generator: torch.Generator
@@ -74,9 +116,12 @@ class Learner(lightning.LightningModule):
         config, states = self.config, learned.states
         flat = State(states.deter.flatten(0, 1), states.stoch.flatten(0, 1))
         chosen = torch.randperm(len(flat.deter), generator=generator, device=self.device)[: config.imagination_starts]
-        with self.model.trunk_precision():
+        with self.model.trunk_precision(cache=False):
             dream = imagine(
-                self.model, State(flat.deter[chosen], flat.stoch[chosen]), config.imagination_horizon, generator
+                self.snapshot.model,
+                State(flat.deter[chosen], flat.stoch[chosen]),
+                config.imagination_horizon,
+                generator,
             )
             values = self.target_value.mean(self.target_value(dream.features[1:]))
         discounts = self.discount * dream.continues
@@ -84,7 +129,7 @@ class Learner(lightning.LightningModule):
         reach = torch.cat([torch.ones_like(discounts[:1]), discounts[:-1]]).cumprod(0).detach()
         scale = self._return_scale(returns.detach())
         actor = -(reach * (returns / scale + config.entropy_scale * dream.entropies)).mean()
-        with self.model.trunk_precision():
+        with self.model.trunk_precision(cache=False):
             imagined = value_loss(self.model.value_head, dream.features[:-1], returns, reach)
             replayed = self._replayed_value_loss(learned, batch)
         parts = {
@@ -120,8 +165,8 @@ class Learner(lightning.LightningModule):
 
     def _descend(self, optimizer: torch.optim.Optimizer, loss: Tensor) -> Tensor:
         optimizer.zero_grad(set_to_none=True)
+        loss.backward()
         parameters = [parameter for group in optimizer.param_groups for parameter in group["params"]]
-        loss.backward(inputs=parameters)  # behaviour's loss runs through the world model, which must not learn from it
         norm = torch.nn.utils.clip_grad_norm_(parameters, self.config.max_grad_norm)
         if not torch.isfinite(norm):
             raise FloatingPointError(f"the gradient is not finite at update {self.updates} (loss {loss.item()})")

@@ -281,9 +281,10 @@ def _choose_device(run: RunConfig) -> torch.device:
 
 
 def _choose_threads(overlap: bool) -> int:
-    # One core is left to the process that collects: two threads that wait for each other on a shared one crawl.
+    # Model and behaviour each take this many, and one core is left to the process that collects: threads that wait for
+    # each other on a shared core crawl.
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    return max(1, cores - 1) if overlap else cores
+    return max(1, (cores - overlap) // 2)
 
 
 def _capacity(config: Config) -> int:

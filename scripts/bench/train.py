@@ -51,7 +51,7 @@ def run(flags: Flags) -> int:
 
 
 def _summary(result: dict[str, Any]) -> str:
-    total_ms, machine = result["update_ms"], result["machine"]
+    total_ms, machine = result["in_turn_ms"], result["machine"]
     rows = [
         [
             name,
@@ -60,7 +60,7 @@ def _summary(result: dict[str, Any]) -> str:
             number(part["flop"] / 1e9, 2),
             number(part["flop"] / part["ms"] / 1e6) if part["flop"] and part["ms"] > 0 else "-",
         ]
-        for name, part in {**result["parts"], "update": {"ms": total_ms, "flop": result["flop"]}}.items()
+        for name, part in {**result["parts"], "in turn": {"ms": total_ms, "flop": result["flop"]}}.items()
     ]
     limits = "; ".join(
         f"{name} {limit / 1e9:,.0f} GFLOP/s, of which {100.0 * result['fraction_of_limit'][name]:.1f} % are reached"
@@ -71,6 +71,7 @@ def _summary(result: dict[str, Any]) -> str:
             f"{result['domain']} on {machine['name']} ({machine['device']}, {machine['threads']} threads), "
             f"{result['parameters']:,} parameters, batch {result['batch_size']} x {result['sequence_length']}",
             format_table(["part", "ms", "%", "GFLOP", "GFLOP/s"], rows),
+            f"{result['update_ms']:.1f} ms with model and behaviour side by side: "
             f"{result['updates_per_s']:.2f} updates/s, {result['frames_per_s']:,.0f} frames replayed/s "
             f"(medians of {result['updates']} updates)",
             f"a big product: {limits}",

@@ -35,6 +35,13 @@ class StandaloneLearner(Learner):
         """The optimizers, as they are."""
         return self.own_optimizers
 
+    def step_in_turn(self, batch: Batch) -> None:
+        """An update whose two halves follow each other in one thread, so that each can be timed and counted."""
+        self.training_step(batch, 0)
+        assert self._waiting is not None
+        waiting, self._waiting = self._waiting, None
+        self._learn_behaviour(*waiting)
+
 
 class PhaseMeter:
     """Splits an update where its optimizers step, and charges what a meter counted to each phase.
@@ -75,7 +82,8 @@ class PhaseMeter:
 def measure_update(config: Config, action_dim: int, device: torch.device, updates: int) -> dict[str, Any]:
     """What an update of the learner that `config` describes costs.
 
-    `sample`, `behaviour`, `optimizer` and `other` are timed within whole updates; `encode`, `recurrence` and
+    `update_ms` is what a run pays, its two halves overlapping; `in_turn_ms` what they take one after the other.
+    `sample`, `behaviour`, `optimizer` and `other` are timed within the latter; `encode`, `recurrence` and
     `decode` are run forward and backward by themselves on the same batch, and `heads` is what is left of the
     world model's loss, its gradient clipping included.
 
@@ -91,7 +99,7 @@ def measure_update(config: Config, action_dim: int, device: torch.device, update
     alone = _parts_alone(model, _sample(learner, np.random.default_rng(3)))
     laps, flop = _timed_laps(learner, alone, device, updates), _counted_lap(learner, alone)
     parts = {name: {"ms": 1000.0 * median(lap[name] for lap in laps), "flop": int(flop.get(name, 0))} for name in PARTS}
-    seconds = median(lap["update"] for lap in laps)
+    seconds, in_turn = (median(lap[name] for lap in laps) for name in ("update", "in_turn"))
     sizes = config.learning
     return {
         "batch_size": sizes.batch_size,
@@ -99,10 +107,11 @@ def measure_update(config: Config, action_dim: int, device: torch.device, update
         "parameters": sum(parameter.numel() for parameter in model.parameters()),
         "updates": updates,
         "update_ms": 1000.0 * seconds,
+        "in_turn_ms": 1000.0 * in_turn,
         "updates_per_s": 1.0 / seconds,
         "frames_per_s": sizes.batch_size * (sizes.sequence_length + 1) / seconds,
-        "flop": int(flop["update"]),
-        "flop_per_s": flop["update"] / seconds,
+        "flop": int(flop["in_turn"]),
+        "flop_per_s": flop["in_turn"] / seconds,
         "parts": parts,
     }
 
@@ -131,7 +140,10 @@ def _timed_laps(learner: StandaloneLearner, alone: Parts, device: torch.device, 
     """Seconds of each part; what is run alone follows every update, so that a busy machine slows both alike."""
     meter = PhaseMeter(learner, lambda: now(device))
     rng = np.random.default_rng(1)
-    laps = [_lap(learner, alone, meter, rng) for _ in range(WARM_UP_UPDATES + updates)]
+    laps = []
+    for _ in range(WARM_UP_UPDATES + updates):
+        lap = _lap(learner, alone, meter, rng)
+        laps.append({**lap, "update": lap["sample"] + _overlapped_seconds(learner, device, rng)})
     meter.close()
     return laps[WARM_UP_UPDATES:]
 
@@ -148,16 +160,26 @@ def _lap(learner: StandaloneLearner, alone: Parts, meter: PhaseMeter, rng: np.ra
     meter.start()
     batch = _sample(learner, rng)
     meter.mark("sample")
-    learner.training_step(batch, 0)
+    learner.step_in_turn(batch)
     meter.mark("other")
-    update = sum(meter.lap.values())
+    in_turn = sum(meter.lap.values())
     for name, forward in alone.items():
         learner.model.zero_grad(set_to_none=True)
         meter.skip()
         _descend(forward())
         meter.mark(name)
     heads = meter.lap["model"] - sum(meter.lap[name] for name in alone)
-    return {**meter.lap, "heads": heads, "update": update}
+    return {**meter.lap, "heads": heads, "in_turn": in_turn}
+
+
+def _overlapped_seconds(learner: StandaloneLearner, device: torch.device, rng: np.random.Generator) -> float:
+    """One update as a run takes it: behaviour learns from the batch before while the model learns."""
+    learner.training_step(_sample(learner, rng), 0)
+    batch, started = _sample(learner, rng), now(device)
+    learner.training_step(batch, 0)
+    seconds = now(device) - started
+    learner.catch_up()
+    return seconds
 
 
 def _sample(learner: StandaloneLearner, rng: np.random.Generator) -> Batch:
