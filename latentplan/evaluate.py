@@ -23,7 +23,11 @@ from latentplan.config import DEVICES, EnvConfig, PlannerConfig, UserError, from
 if TYPE_CHECKING:
     import gymnasium
 
-    from latentplan.rollout import Agent, Episode, OnStep
+    from latentplan.envs.suite import SuiteEnv
+    from latentplan.latency import Latency
+    from latentplan.rollout import Agent, OnStep
+    from latentplan.timed_rollout import TimedEpisode
+    from latentplan.virtual_clock import VirtualClock
 
 MODES = ("planner", "actor", "random")
 FLAGS = {
@@ -32,6 +36,8 @@ FLAGS = {
     "--mode": ("|".join(MODES), "who acts (planner)"),
     "--video": ("FILE", "film of the first episode, .mp4 or .webm"),
     "--json": ("FILE", "result as JSON"),
+    "--control-hz": ("F", "decisions per second of a world that goes on while the agent thinks (it waits)"),
+    "--latency": ("measured|FILE", "what thinking costs there: as measured, or drawn from a file of ms (measured)"),
     "--seed": ("S", "episode i starts from a state that depends only on S and i (0)"),
     "--device": ("|".join(DEVICES), "where the agent computes (auto: cuda where usable)"),
     "--threads": ("N", "CPU threads (torch's own choice)"),
@@ -49,6 +55,8 @@ class EvaluationRequest:
         planner: Planner settings that replace the agent's, as they were typed.
         video: Where the film goes, or None.
         json: Where the result goes, or None.
+        control_hz: Decisions per second of a world that does not wait, or None for one that does.
+        latency: What thinking costs there.
         seed: Seed of the starts.
         device: `auto`, `cpu` or `cuda`.
         threads: CPU threads, or None to leave it to torch.
@@ -60,6 +68,8 @@ class EvaluationRequest:
     planner: dict[str, str]
     video: Path | None
     json: Path | None
+    control_hz: float | None
+    latency: Latency
     seed: int
     device: str
     threads: int | None
@@ -105,6 +115,9 @@ def parse_arguments(argv: Sequence[str]) -> EvaluationRequest:
     planner = {name.removeprefix("--planner."): value for name, value in flags.items() if name in settings}
     if planner and mode != "planner":
         raise UserError(f"--planner.{next(iter(planner))} has no effect in mode {mode}; use --mode planner")
+    from latentplan.latency import read_clock_flags
+
+    control_hz, latency = read_clock_flags(flags)
     return EvaluationRequest(
         checkpoint=Path(flags["--checkpoint"]),
         episodes=_whole_number(flags, "--episodes", 10, 1),
@@ -112,6 +125,8 @@ def parse_arguments(argv: Sequence[str]) -> EvaluationRequest:
         planner=planner,
         video=_output_path(flags, "--video"),
         json=_output_path(flags, "--json"),
+        control_hz=control_hz,
+        latency=latency,
         seed=_whole_number(flags, "--seed", 0, 0),
         device=device,
         threads=_whole_number(flags, "--threads", 1, 1) if "--threads" in flags else None,
@@ -124,6 +139,7 @@ def _evaluate(argv: Sequence[str]) -> int:
         return 0
     request = parse_arguments(argv)
     from latentplan.checkpoint import load_agent, read_info
+    from latentplan.virtual_clock import VirtualClock
 
     info = read_info(request.checkpoint)
     try:
@@ -143,7 +159,8 @@ def _evaluate(argv: Sequence[str]) -> int:
             f"{about['domain']}-{about['task']}, {request.mode} on {device}, pictures by {about['renderer']}",
             flush=True,
         )
-        return _play_and_report(request, env, agent, about, planner.horizon)
+        clock = VirtualClock(request.control_hz, request.latency)
+        return _play_and_report(request, env, agent, about, planner.horizon, clock)
     except OSError as error:
         raise UserError(f"an output could not be written: {error}") from error
     finally:
@@ -151,13 +168,14 @@ def _evaluate(argv: Sequence[str]) -> int:
 
 
 def _play_and_report(
-    request: EvaluationRequest, env: gymnasium.Env[Any, Any], agent: Any, about: dict[str, Any], horizon: int
+    request: EvaluationRequest, env: SuiteEnv, agent: Any, about: dict[str, Any], horizon: int, clock: VirtualClock
 ) -> int:
     """Plays, prints, writes; an interrupt reports the episodes that were finished."""
-    from latentplan.rollout import episode_seed, iterate_episodes, summarize
+    from latentplan.rollout import episode_seed
+    from latentplan.timed_rollout import iterate_timed_episodes, summarize_timed
 
     seeds = [episode_seed(request.seed, index) for index in range(request.episodes)]
-    episodes: list[Episode] = []
+    episodes: list[TimedEpisode] = []
     interrupted = False
     with contextlib.ExitStack() as stack:
         on_step = None
@@ -167,14 +185,14 @@ def _play_and_report(
             planner = agent if request.mode == "planner" else None
             on_step = stack.enter_context(filming(request.video, env, planner, horizon))
         try:
-            for episode in iterate_episodes(env, agent, seeds, on_step=on_step):
+            for episode in iterate_timed_episodes(env, agent, seeds, clock, on_step=on_step):
                 episodes.append(episode)
                 print(f"episode {len(episodes)} of {len(seeds)}: return {episode.total_return:.1f}", flush=True)
         except KeyboardInterrupt:
             interrupted = True
             print(f"\ninterrupted after {len(episodes)} of {len(seeds)} episodes", flush=True)
         if episodes:
-            _report(request, {**about, **summarize(episodes)})
+            _report(request, {**about, **summarize_timed(episodes, clock)})
     return 130 if interrupted else 0
 
 
@@ -201,6 +219,9 @@ def _report(request: EvaluationRequest, result: dict[str, Any]) -> None:
     latency = "   ".join(f"{name} {value:.2f}" for name, value in result["decision_ms"].items())
     print(f"mean return {result['mean_return']:.1f}  ({interval}; episodes: {result['episodes']})")
     print(f"decision ms  {latency}", flush=True)
+    if result["control_hz"] is not None:
+        sources = "   ".join(f"{name} {count}" for name, count in result["action_source"].items())
+        print(f"at {result['control_hz']:g} Hz  deadline misses {result['deadline_misses']}   {sources}", flush=True)
     if request.json is not None:
         partial = request.json.with_name(f".{request.json.name}.{os.getpid()}")
         partial.write_text(json.dumps(result, indent=2) + "\n")

@@ -22,6 +22,9 @@ LAYERS = {
     "reporting": (("config",), {"numpy", "cv2", "matplotlib", "rich"}),
     "agent": (("config", "models", "planning"), {"torch", "numpy", "einops"}),
     "rollout": (("config", "envs", "replay", "agent"), {"numpy"}),
+    "latency": (("config",), {"numpy"}),
+    "virtual_clock": (("config", "planning", "latency", "rollout"), {"numpy", "torch"}),
+    "timed_rollout": (("config", "agent", "rollout", "virtual_clock"), {"numpy"}),
     "checkpoint": (("config", "models", "planning", "agent"), {"torch", "numpy", "safetensors"}),
     "training": (
         (*ALL, "compose"),
