@@ -79,6 +79,12 @@ class ModelAgent:
     def _choose(self, state: State) -> Tensor:
         raise AssertionError("an agent defines how it chooses")
 
+    def _picture(self, state: State, actions: Tensor) -> np.ndarray:
+        """The decoded end of a plan (batch, horizon, action), uint8 (64, 64, 3), of the first environment."""
+        first = State(*(part[:1] for part in state))
+        _, last = self.model.rollout(first, actions[:1].to(first.deter.dtype))
+        return self.model.decoder.picture(last.features.float())[0].cpu().numpy()
+
     def _believe(self, frames: Tensor) -> State:
         if self.state is None or self._action is None:
             return self.model.see(self.model.dynamics.initial(len(frames)).deter, frames)
@@ -132,9 +138,7 @@ class PlanningAgent(ModelAgent):
         """The decoded last state of the present plan, uint8 (64, 64, 3), of the first environment."""
         if self.controller.plan is None or self.state is None:
             return None
-        first = State(*(part[:1] for part in self.state))
-        _, last = self.model.rollout(first, self.controller.plan.actions[:1].to(first.deter.dtype))
-        return self.model.decoder.picture(last.features.float())[0].cpu().numpy()
+        return self._picture(self.state, self.controller.plan.actions)
 
     def _choose(self, state: State) -> Tensor:
         # One autocast around the whole search converts each weight once, not once per model call.

@@ -25,9 +25,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from latentplan.agent import ActorAgent, PlanningAgent
+from latentplan.background import BackgroundAgent
 from latentplan.config import derive_seed
 from latentplan.rollout import Agent, Episode, Floats, OnStep, Step, latency_percentiles, summarize
-from latentplan.virtual_clock import VirtualClock
+from latentplan.virtual_clock import VirtualClock, VirtualExecutor
 
 Action = NDArray[np.float32]
 
@@ -146,11 +147,12 @@ def summarize_timed(episodes: Sequence[TimedEpisode], clock: VirtualClock) -> di
 
 def action_source(agent: Agent) -> str | None:
     """Where the agent's last action came from, one of `SOURCES`; None for agents that have neither plan nor actor."""
-    if isinstance(agent, ActorAgent):
-        return "actor"
     if isinstance(agent, PlanningAgent) and agent.controller.plan is not None:
         return "plan" if int(agent.controller.plan.elapsed[0]) == 1 else "tail"
-    return None
+    if isinstance(agent, ActorAgent):
+        return "actor"
+    source: str | None = getattr(agent, "last_source", None)
+    return source
 
 
 def _run_episode(
@@ -215,10 +217,14 @@ class _Record:
         if source is None:
             return
         self._sources[source] += 1
-        if source == "plan":
+        if source == "actor":
+            return
+        if isinstance(agent, BackgroundAgent) and isinstance(agent.scheduler.executor, VirtualExecutor):
+            assert agent.plan_age is not None
+            self._planned_ms = agent.scheduler.executor.asked_ms[agent.scheduler.tick - 1 - agent.plan_age]
+        elif source == "plan":
             self._planned_ms = now_ms
-        if source != "actor":
-            self._plan_age_ms.append(now_ms + decision_ms - self._planned_ms)
+        self._plan_age_ms.append(now_ms + decision_ms - self._planned_ms)
 
     def episode(self, total_return: float, env_frames: int) -> TimedEpisode:
         """The episode that was counted."""

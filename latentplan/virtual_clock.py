@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from latentplan.config import derive_seed
 from latentplan.latency import Charge, Latency
-from latentplan.planning.model import State
+from latentplan.planning.model import State, state_device
 from latentplan.planning.plan import Plan
 from latentplan.rollout import Agent
 
@@ -114,7 +114,7 @@ class VirtualExecutor:
         """
         if not self.is_idle:
             return False
-        generator = None if seed is None else torch.Generator().manual_seed(seed)
+        generator = None if seed is None else torch.Generator(state_device(state)).manual_seed(seed)
         plan, ready_ms = self.clock.charge_plan(
             lambda: self.planner.plan(self.model, state, previous, generator=generator)
         )

@@ -11,7 +11,19 @@ ROOT = Path(__file__).resolve().parent.parent
 PACKAGE = ROOT / "latentplan"
 
 # layer: (layers of latentplan it may import, libraries it may import); None allows anything.
-ALL = ("config", "planning", "models", "envs", "replay", "reporting", "agent", "rollout", "checkpoint")
+ALL = (
+    "config",
+    "planning",
+    "models",
+    "envs",
+    "replay",
+    "reporting",
+    "agent",
+    "background",
+    "gate",
+    "rollout",
+    "checkpoint",
+)
 SIMULATION = {"dm_control", "dm_env", "mujoco", "gymnasium", "OpenGL"}
 LAYERS = {
     "config": ((), set()),
@@ -21,11 +33,16 @@ LAYERS = {
     "replay": (("config",), {"numpy", "torch", "einops"}),
     "reporting": (("config",), {"numpy", "cv2", "matplotlib", "rich"}),
     "agent": (("config", "models", "planning"), {"torch", "numpy", "einops"}),
+    "background": (("config", "models", "planning", "agent"), {"torch", "numpy"}),
+    "gate": (("config", "models", "planning", "agent"), {"torch", "numpy"}),
     "rollout": (("config", "envs", "replay", "agent"), {"numpy"}),
     "latency": (("config",), {"numpy"}),
     "virtual_clock": (("config", "planning", "latency", "rollout"), {"numpy", "torch"}),
-    "timed_rollout": (("config", "agent", "rollout", "virtual_clock"), {"numpy"}),
-    "checkpoint": (("config", "models", "planning", "agent"), {"torch", "numpy", "safetensors"}),
+    "timed_rollout": (("config", "agent", "background", "rollout", "virtual_clock"), {"numpy"}),
+    "checkpoint": (
+        ("config", "models", "planning", "agent", "background", "gate"),
+        {"torch", "numpy", "safetensors"},
+    ),
     "training": (
         (*ALL, "compose"),
         {"lightning", "torch", "numpy", "einops", "rich", "tensorboard", "gymnasium", "yaml"},

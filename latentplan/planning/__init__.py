@@ -23,15 +23,22 @@ from latentplan.planning.objectives import (
     uncertainty_penalty,
 )
 from latentplan.planning.plan import Plan
+from latentplan.planning.realtime import BackgroundPlanner, PlanBuffer
+from latentplan.planning.schedule import Decision, PlanExecutor, PlanScheduler
 
 __all__ = [
+    "BackgroundPlanner",
     "CEMPlanner",
     "CEMTrajectoryOptimizer",
+    "Decision",
     "FunctionModel",
     "Model",
     "ModelPredictiveController",
     "Objective",
     "Plan",
+    "PlanBuffer",
+    "PlanExecutor",
+    "PlanScheduler",
     "Rollout",
     "action_penalty",
     "at_every_state",

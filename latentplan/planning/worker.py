@@ -1,0 +1,142 @@
+"""What runs beside the control loop: the process or thread that searches, and the thread that talks to it."""
+
+from __future__ import annotations
+
+import multiprocessing
+import pickle
+import signal
+import threading
+import traceback
+from multiprocessing.connection import Connection
+from multiprocessing.context import SpawnProcess
+from queue import SimpleQueue
+from typing import Any
+
+import torch
+
+from latentplan.planning.model import State
+from latentplan.planning.plan import Plan
+
+CLOSING_SECONDS = 2.0
+
+Request = tuple[State, int, Plan | None, int | None]  # state, tick, previous, seed
+Answer = tuple[str, Any]  # "ready", "plan" with (tick, plan), "error" with (error, where), or "ended"
+Problem = tuple[Any, ...]  # planner, model, objective, constraints
+
+
+def start_process() -> tuple[SpawnProcess, Connection]:
+    """A spawned process that waits for its problem, and our end of the pipe to it."""
+    context = multiprocessing.get_context("spawn")
+    ours, theirs = context.Pipe()
+    process = context.Process(target=_serve, args=(theirs,), name="latentplan-plan", daemon=True)
+    process.start()
+    theirs.close()
+    return process, ours
+
+
+def dump(problem: Problem) -> bytes:
+    """The problem as bytes, by value: torch's own way over pipes shares memory, which outlives a crash.
+
+    Raises:
+        TypeError: It cannot be sent to another process.
+    """
+    try:
+        return pickle.dumps(problem)
+    except Exception as error:
+        raise TypeError(
+            f"planner, model, objective and constraints must be picklable to plan in another process ({error}); "
+            "define them at the top of a module, or give worker='thread'"
+        ) from error
+
+
+def drive_process(
+    connection: Connection,
+    problem: bytes,
+    requests: SimpleQueue[Request | None],
+    answers: SimpleQueue[Answer],
+    ready: threading.Event,
+) -> None:
+    """Waits on the pipe in a thread of the loop's process, so that the loop never waits for a full or empty one."""
+    try:
+        connection.send_bytes(problem)
+        started = pickle.loads(connection.recv_bytes())
+        if started[0] != "ready":
+            answers.put(started)
+        ready.set()
+        while (request := requests.get()) is not None:
+            answers.put(_exchange(connection, request))
+    except (EOFError, OSError):
+        answers.put(("ended", None))
+    finally:
+        ready.set()
+        connection.close()
+
+
+def drive_search(
+    problem: Problem, requests: SimpleQueue[Request | None], answers: SimpleQueue[Answer], ready: threading.Event
+) -> None:
+    """Searches in a thread of the loop's process."""
+    ready.set()
+    while (request := requests.get()) is not None:
+        answers.put(_search(problem, request))
+
+
+def end(requests: SimpleQueue[Request | None], thread: threading.Thread, process: SpawnProcess | None) -> None:
+    """End a worker, whatever it is doing; only a thread that hangs is left behind, as a daemon."""
+    requests.put(None)
+    if process is not None:
+        process.terminate()  # it holds nothing that would have to be put away
+        process.join(CLOSING_SECONDS)
+        if process.is_alive():
+            process.kill()
+            process.join()
+    if thread is not threading.current_thread():  # garbage is collected in any thread
+        thread.join(CLOSING_SECONDS)
+
+
+def _exchange(connection: Connection, request: Request) -> Answer:
+    try:
+        message = pickle.dumps(request)
+    except Exception as error:
+        return "error", _portable(error)
+    connection.send_bytes(message)
+    answer: Answer = pickle.loads(connection.recv_bytes())
+    return answer
+
+
+def _serve(connection: Connection) -> None:
+    """Searches in a process of its own, until the other end of the pipe is gone."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches the whole group; the loop decides what follows
+    torch.set_num_threads(1)
+    try:
+        try:
+            problem = pickle.loads(connection.recv_bytes())
+        except (AttributeError, ImportError, pickle.UnpicklingError) as error:  # defined where this process cannot see
+            connection.send_bytes(pickle.dumps(("error", _portable(error))))
+            return
+        connection.send_bytes(pickle.dumps(("ready", None)))
+        while True:
+            connection.send_bytes(pickle.dumps(_search(problem, pickle.loads(connection.recv_bytes()))))
+    except (EOFError, OSError):
+        return
+
+
+def _search(problem: Problem, request: Request) -> Answer:
+    planner, model, objective, constraints = problem
+    state, tick, previous, seed = request
+    generator = None if seed is None else torch.Generator().manual_seed(seed)
+    try:
+        plan = planner.plan(model, state, previous, objective=objective, constraints=constraints, generator=generator)
+    except Exception as error:
+        return "error", _portable(error)
+    return "plan", (tick, plan)
+
+
+def _portable(error: Exception) -> tuple[Exception, str]:
+    """An error that survives the pipe, and where it happened."""
+    where = traceback.format_exc()
+    try:
+        pickle.loads(pickle.dumps(error))
+    except Exception:
+        error = RuntimeError(f"{type(error).__name__}: {error}")
+    return error.with_traceback(None), where
