@@ -13,6 +13,7 @@ import tempfile
 from argparse import SUPPRESS
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -29,7 +30,8 @@ if TYPE_CHECKING:
     from latentplan.timed_rollout import TimedEpisode
     from latentplan.virtual_clock import VirtualClock
 
-MODES = ("planner", "actor", "random")
+MODES = ("planner", "actor", "random", "gated", "background")
+PLANNING_MODES = ("planner", "gated", "background")
 FLAGS = {
     "--checkpoint": ("DIR", "folder of a trained agent, or of a run (its best checkpoint)"),
     "--episodes": ("N", "episodes to play (10)"),
@@ -51,7 +53,7 @@ class EvaluationRequest:
     Attributes:
         checkpoint: Folder of the agent.
         episodes: Episodes to play.
-        mode: `planner`, `actor` or `random`.
+        mode: One of `MODES`.
         planner: Planner settings that replace the agent's, as they were typed.
         video: Where the film goes, or None.
         json: Where the result goes, or None.
@@ -113,7 +115,7 @@ def parse_arguments(argv: Sequence[str]) -> EvaluationRequest:
     if device not in DEVICES:
         raise_unknown("device", device, DEVICES)
     planner = {name.removeprefix("--planner."): value for name, value in flags.items() if name in settings}
-    if planner and mode != "planner":
+    if planner and mode not in PLANNING_MODES:
         raise UserError(f"--planner.{next(iter(planner))} has no effect in mode {mode}; use --mode planner")
     from latentplan.latency import read_clock_flags
 
@@ -138,7 +140,7 @@ def _evaluate(argv: Sequence[str]) -> int:
         print(_help())
         return 0
     request = parse_arguments(argv)
-    from latentplan.checkpoint import load_agent, read_info
+    from latentplan.checkpoint import read_info
     from latentplan.virtual_clock import VirtualClock
 
     info = read_info(request.checkpoint)
@@ -147,24 +149,38 @@ def _evaluate(argv: Sequence[str]) -> int:
     except ValueError as error:
         raise UserError(f"{request.checkpoint} has settings of another version: {error}") from None
     planner = build_config({"planner": {**to_dict(config.planner), **request.planner}}).planner
-    overrides = {name: getattr(planner, name) for name in request.planner}
     device = _choose_device(request)
     from latentplan.envs import make_env
 
     env = make_env(config.env)
     try:
-        agent = load_agent(request.checkpoint, mode=request.mode, device=device, **overrides)
+        clock = VirtualClock(request.control_hz, request.latency)
+        agent = _load_agent(request, device, planner, clock)
         about = _describe(request, info, config.env, planner)
         print(
             f"{about['domain']}-{about['task']}, {request.mode} on {device}, pictures by {about['renderer']}",
             flush=True,
         )
-        clock = VirtualClock(request.control_hz, request.latency)
         return _play_and_report(request, env, agent, about, planner.horizon, clock)
     except OSError as error:
         raise UserError(f"an output could not be written: {error}") from error
     finally:
         env.close()
+
+
+def _load_agent(request: EvaluationRequest, device: str, planner: PlannerConfig, clock: VirtualClock) -> Any:
+    """The agent; one that plans beside its decisions gets its plans by the clock."""
+    from latentplan.checkpoint import load_agent, load_model
+
+    if request.mode != "background":
+        overrides = {name: getattr(planner, name) for name in request.planner}
+        return load_agent(request.checkpoint, mode=request.mode, device=device, **overrides)
+    from latentplan.background import BackgroundAgent
+    from latentplan.virtual_clock import VirtualExecutor
+
+    model, config, info = load_model(request.checkpoint, device)
+    make_executor = partial(VirtualExecutor, clock=clock)
+    return BackgroundAgent(model, config, info["discount"], planner=planner, make_executor=make_executor)
 
 
 def _play_and_report(
@@ -182,7 +198,7 @@ def _play_and_report(
         if request.video is not None:
             from latentplan.reporting.film import filming
 
-            planner = agent if request.mode == "planner" else None
+            planner = agent if request.mode in PLANNING_MODES else None
             on_step = stack.enter_context(filming(request.video, env, planner, horizon))
         try:
             for episode in iterate_timed_episodes(env, agent, seeds, clock, on_step=on_step):
@@ -210,7 +226,7 @@ def _describe(
         "render_quality": env.render_quality,
         "renderer": render_info()["renderer"],
     }
-    return {**described, "planner": to_dict(planner)} if request.mode == "planner" else described
+    return {**described, "planner": to_dict(planner)} if request.mode in PLANNING_MODES else described
 
 
 def _report(request: EvaluationRequest, result: dict[str, Any]) -> None:

@@ -41,28 +41,36 @@ def zeros(tmp_path):
     return path
 
 
-@pytest.mark.parametrize("mode", ["planner", "actor", "random"])
+@pytest.mark.parametrize("mode", ["planner", "actor", "random", "background"])
 def test_thinking_that_costs_nothing_earns_what_a_world_that_waits_pays(tmp_path, checkpoint, zeros, mode):
     flags = ("--mode", mode, "--episodes", 2)
     waiting = result_of(tmp_path, checkpoint, *flags)
     timed = result_of(tmp_path, checkpoint, *flags, "--control-hz", 50, "--latency", zeros)
-    plain = evaluate.evaluate_agent(load_agent(checkpoint, mode), make_env(ENV), seed=0, episodes=2)
-    assert timed["returns"] == waiting["returns"] == plain["returns"]
+    assert timed["returns"] == waiting["returns"]
     assert (timed["deadline_misses"], timed["control_hz"], timed["latency"]) == (0, 50.0, str(zeros))
     assert (waiting["deadline_misses"], waiting["control_hz"], waiting["latency"]) == (0, None, None)
     assert timed["action_source"] == waiting["action_source"]
     assert timed["decision_ms"] == {"p50": 0.0, "p95": 0.0, "p99": 0.0}
 
 
-def test_a_given_latency_gives_the_same_result_twice_and_costs_return(tmp_path, checkpoint):
+@pytest.mark.parametrize("mode", ["planner", "actor", "random"])
+def test_a_world_that_waits_is_that_of_plain_rollouts(tmp_path, checkpoint, mode):
+    env = make_env(ENV)
+    plain = evaluate.evaluate_agent(load_agent(checkpoint, mode), env, seed=0, episodes=2)
+    env.close()
+    assert result_of(tmp_path, checkpoint, "--mode", mode, "--episodes", 2)["returns"] == plain["returns"]
+
+
+@pytest.mark.parametrize("mode", ["planner", "background"])
+def test_a_given_latency_gives_the_same_result_twice_and_changes_the_return(tmp_path, checkpoint, mode):
     spread = tmp_path / "spread.json"
     spread.write_text('{"decision_ms": [5, 15, 45, 70]}')
-    flags = ("--episodes", 2, "--control-hz", 20, "--latency", spread)
+    flags = ("--mode", mode, "--episodes", 2, "--control-hz", 20, "--latency", spread)
     first, again = (result_of(tmp_path, checkpoint, *flags) for _ in range(2))
     assert first == again
     assert first["deadline_misses"] > 0
     assert sum(first["action_source"].values()) + first["deadline_misses"] == 2 * 10
-    assert first["returns"] != result_of(tmp_path, checkpoint, "--episodes", 2)["returns"]
+    assert first["returns"] != result_of(tmp_path, checkpoint, *flags[:4])["returns"]
 
 
 @pytest.mark.parametrize(
