@@ -13,7 +13,6 @@ import tempfile
 from argparse import SUPPRESS
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -141,6 +140,7 @@ def _evaluate(argv: Sequence[str]) -> int:
         return 0
     request = parse_arguments(argv)
     from latentplan.checkpoint import read_info
+    from latentplan.timed_rollout import load_timed_agent
     from latentplan.virtual_clock import VirtualClock
 
     info = read_info(request.checkpoint)
@@ -149,13 +149,14 @@ def _evaluate(argv: Sequence[str]) -> int:
     except ValueError as error:
         raise UserError(f"{request.checkpoint} has settings of another version: {error}") from None
     planner = build_config({"planner": {**to_dict(config.planner), **request.planner}}).planner
+    overrides = {name: getattr(planner, name) for name in request.planner}
     device = _choose_device(request)
     from latentplan.envs import make_env
 
     env = make_env(config.env)
     try:
         clock = VirtualClock(request.control_hz, request.latency)
-        agent = _load_agent(request, device, planner, clock)
+        agent = load_timed_agent(request.checkpoint, request.mode, clock, device, **overrides)
         about = _describe(request, info, config.env, planner)
         print(
             f"{about['domain']}-{about['task']}, {request.mode} on {device}, pictures by {about['renderer']}",
@@ -166,21 +167,6 @@ def _evaluate(argv: Sequence[str]) -> int:
         raise UserError(f"an output could not be written: {error}") from error
     finally:
         env.close()
-
-
-def _load_agent(request: EvaluationRequest, device: str, planner: PlannerConfig, clock: VirtualClock) -> Any:
-    """The agent; one that plans beside its decisions gets its plans by the clock."""
-    from latentplan.checkpoint import load_agent, load_model
-
-    if request.mode != "background":
-        overrides = {name: getattr(planner, name) for name in request.planner}
-        return load_agent(request.checkpoint, mode=request.mode, device=device, **overrides)
-    from latentplan.background import BackgroundAgent
-    from latentplan.virtual_clock import VirtualExecutor
-
-    model, config, info = load_model(request.checkpoint, device)
-    make_executor = partial(VirtualExecutor, clock=clock)
-    return BackgroundAgent(model, config, info["discount"], planner=planner, make_executor=make_executor)
 
 
 def _play_and_report(

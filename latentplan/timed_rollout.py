@@ -18,14 +18,17 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
 from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from latentplan.agent import ActorAgent, PlanningAgent
+from latentplan.agent import ActorAgent, PlanningAgent, RandomAgent
 from latentplan.background import BackgroundAgent
+from latentplan.checkpoint import load_agent, load_model
 from latentplan.config import derive_seed
 from latentplan.rollout import Agent, Episode, Floats, OnStep, Step, latency_percentiles, summarize
 from latentplan.virtual_clock import VirtualClock, VirtualExecutor
@@ -103,6 +106,22 @@ class Motors:
         self._wait -= before
         parts = [(self._held, before), (self._coming, self.substeps - before)]
         return [(action, count) for action, count in parts if count > 0]
+
+
+def load_timed_agent(
+    path: str | Path, mode: str, clock: VirtualClock, device: str = "cpu", **planner: Any
+) -> PlanningAgent | ActorAgent | RandomAgent | BackgroundAgent:
+    """A trained agent as `load_agent` gives it, except that plans made beside its decisions come by the clock.
+
+    Raises:
+        UserError: The checkpoint, the mode or a setting cannot be used.
+    """
+    if mode != "background":
+        return load_agent(path, mode=mode, device=device, **planner)
+    model, config, info = load_model(path, device)
+    make_executor = partial(VirtualExecutor, clock=clock)
+    settings = replace(config.planner, **planner)
+    return BackgroundAgent(model, config, info["discount"], planner=settings, make_executor=make_executor)
 
 
 def iterate_timed_episodes(

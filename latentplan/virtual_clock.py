@@ -65,15 +65,14 @@ class VirtualClock:
     def charge_plan(self, compute: Callable[[], Result]) -> tuple[Result, float]:
         """What is computed beside the decision that goes on, and the time on this clock when it is there."""
         asked_ms = self.now_ms
-        if self.control_hz is None:
-            return compute(), asked_ms
         if not self.latency.is_replayed:  # after what the decision has done so far
             asked_ms += _milliseconds_since(self._decision_began) - self._beside_ms
         started = time.perf_counter()
         result = compute()
         elapsed_ms = _milliseconds_since(started)
         self._beside_ms += elapsed_ms
-        return result, asked_ms + self._charge_plan(elapsed_ms)
+        waits = self.control_hz is None
+        return result, self.now_ms if waits else asked_ms + self._charge_plan(elapsed_ms)
 
 
 class VirtualExecutor:

@@ -38,11 +38,11 @@ LAYERS = {
     "rollout": (("config", "envs", "replay", "agent"), {"numpy"}),
     "latency": (("config",), {"numpy"}),
     "virtual_clock": (("config", "planning", "latency", "rollout"), {"numpy", "torch"}),
-    "timed_rollout": (("config", "agent", "background", "rollout", "virtual_clock"), {"numpy"}),
     "checkpoint": (
         ("config", "models", "planning", "agent", "background", "gate"),
         {"torch", "numpy", "safetensors"},
     ),
+    "timed_rollout": (("config", "agent", "background", "rollout", "checkpoint", "virtual_clock"), {"numpy"}),
     "training": (
         (*ALL, "compose"),
         {"lightning", "torch", "numpy", "einops", "rich", "tensorboard", "gymnasium", "yaml"},
