@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+import time
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import torch
 from torch import Tensor
 
 from latentplan.config import PlannerConfig
+from latentplan.planning.deadline import Pace
 from latentplan.planning.model import Model, State, per_dimension
 from latentplan.planning.objectives import Constraint, Term
 from latentplan.planning.plan import Plan
@@ -30,7 +33,7 @@ _CHOICES = {
 class CEMPlanner:
     """Searches action sequences by refitting a Gaussian to its best samples, inside a model.
 
-    A search keeps nothing: the last plan is passed in, and every option is fixed at construction.
+    A search keeps nothing but how long it took: the last plan is passed in, and every option is fixed at construction.
 
     Attributes:
         action_dim: Numbers in an action.
@@ -62,6 +65,8 @@ class CEMPlanner:
         gradient_steps: Steps of gradient ascent on the chosen sequence; the model must be differentiable.
         gradient_step_size: Largest change of an action in the first of these steps, in action units.
         constraint_penalty: None ranks feasible candidates first; a number subtracts that much per unit of violation.
+        deadline_ms: Milliseconds that a call of `plan` may take; None is as long as the search likes.
+        clock: Gives the time in seconds; None takes `time.perf_counter`.
     """
 
     action_dim: int
@@ -92,9 +97,16 @@ class CEMPlanner:
     gradient_steps: int = 0
     gradient_step_size: float = 0.1
     constraint_penalty: float | None = None
+    deadline_ms: float | None = None
+    clock: Callable[[], float] | None = None
 
     def __post_init__(self) -> None:
         _validate(self)
+
+    @cached_property
+    def pace(self) -> Pace:
+        """What the parts of earlier searches took, for deadlines; the one thing of a planner that changes."""
+        return Pace()
 
     @property
     def num_kept(self) -> int:
@@ -124,6 +136,7 @@ class CEMPlanner:
         objective: Term | None = None,
         constraints: Sequence[Constraint] = (),
         generator: Generators = None,
+        deadline_ms: float | None = None,
     ) -> Plan:
         """Searches the best action sequence from each state.
 
@@ -136,18 +149,28 @@ class CEMPlanner:
             constraints: What candidates must keep: each gives a violation `(rows,)`, 0 where it is kept.
             generator: One for all environments (each then sees the same noise), or a list of one per environment;
                 None takes torch's default. A plan does not depend on which environments share the call.
+            deadline_ms: What the call may take, from here on; None takes the planner's own, infinity lifts it. No
+                iteration, and no gradient refinement, is started that is not expected to end in time, judged by
+                those measured before at this problem size (see `Pace`).
 
         Returns:
             The plan. Its `info`: `elite_return` and `std` (batch, iteration), `iterations`, `num_nonfinite` and
-            `is_fallback` (batch,) (nothing finite was found, so the last plan's tail or zeros stand in), and
-            `violation` (batch,) of the chosen sequence when there are constraints.
+            `is_fallback` (batch,) (nothing finite was found, or there was no time for one iteration, so the last
+            plan's tail or zeros stand in), `violation` (batch,) of the chosen sequence when there are constraints,
+            and `stopped`, what ended the search: "iterations", "agreement" (of the elites: `stop_std`) or "deadline".
 
         Raises:
-            ValueError: The model lacks what a setting asks for, or something returned a wrong shape.
+            ValueError: The model lacks what a setting asks for, something returned a wrong shape, or the deadline is
+                negative.
         """
+        started = (self.clock or time.perf_counter)()
+        deadline_ms = self.deadline_ms if deadline_ms is None else deadline_ms
+        if deadline_ms is not None and not deadline_ms >= 0.0:
+            raise ValueError(f"deadline_ms must be at least 0, got {deadline_ms}")
         # Leaving inference mode keeps the plan usable as a training target, and lets gradient steps work.
         with torch.inference_mode(False), torch.no_grad():
-            return Search(self, model, state, objective, constraints, generator).run(previous)
+            search = Search(self, model, state, objective, constraints, generator, started, deadline_ms)
+            return search.run(previous)
 
 
 def _validate(planner: CEMPlanner) -> None:
@@ -174,8 +197,8 @@ def _validate(planner: CEMPlanner) -> None:
             raise ValueError(f"{name} must be at least 0, got {getattr(planner, name)}")
     if not 0.0 <= planner.keep_elite_fraction <= 1.0:
         raise ValueError(f"keep_elite_fraction must lie in [0, 1], got {planner.keep_elite_fraction}")
-    for name in ("temperature", "gradient_step_size"):
-        if getattr(planner, name) is not None and getattr(planner, name) <= 0.0:
+    for name in ("temperature", "gradient_step_size", "deadline_ms"):
+        if getattr(planner, name) is not None and not getattr(planner, name) > 0.0:
             raise ValueError(f"{name} must be above 0, got {getattr(planner, name)}")
     _validate_bounds(planner)
 

@@ -21,7 +21,7 @@ class Plan:
         var: Variance of the search distribution, (batch, horizon, action).
         expected_return: Predicted return of what the choice rests on, (batch,): of the last elites on average, or of
             the best candidate when that is executed. NaN where nothing finite was found.
-        info: Diagnostics, each (batch,) or (batch, iteration); see `CEMPlanner.plan`.
+        info: Diagnostics, (batch,) or (batch, iteration), and what stopped the search; see `CEMPlanner.plan`.
         elites: Kept elites, (batch, kept, horizon, action), when the planner keeps some.
         is_warm: Whether the next search may start here, (batch,) bool on the CPU.
         elapsed: Actions executed since this plan was made, (batch,) on the CPU; the next search shifts by as many.
@@ -31,7 +31,7 @@ class Plan:
     mean: Tensor
     var: Tensor
     expected_return: Tensor
-    info: dict[str, Tensor]
+    info: dict[str, Any]
     elites: Tensor | None
     is_warm: Tensor
     elapsed: Tensor
@@ -48,6 +48,25 @@ class Plan:
     def executed(self, elapsed: Tensor) -> Plan:
         """The same plan, `elapsed` (batch,) of whose actions have been executed."""
         return replace(self, elapsed=elapsed)
+
+    def aged(self) -> Plan:
+        """The same plan one step later, in which somebody else acted; where it has run out the next search is cold."""
+        elapsed = self.elapsed + 1
+        return replace(self, elapsed=elapsed).forget(elapsed >= self.mean.shape[1])
+
+    def take(self, rows: Tensor) -> Plan:
+        """The plans of some environments, rows (chosen,) int; one may be taken more than once."""
+
+        def pick(value: Any) -> Any:
+            return value[rows.to(value.device)] if isinstance(value, Tensor) else value
+
+        fields = ("actions", "mean", "var", "expected_return", "elites", "is_warm", "elapsed")
+        info = {name: pick(value) for name, value in self.info.items()}
+        return Plan(info=info, **{name: pick(getattr(self, name)) for name in fields})
+
+    def spread(self, mask: Tensor) -> Plan:
+        """These plans as those of the environments in mask (batch,) bool, in order; the others' are cold copies."""
+        return self.take((mask.cumsum(0) - 1).clamp_min(0)).forget(~mask)
 
     def updated(self, mask: Tensor, new: Plan) -> Plan:
         """This plan, with the environments in mask (batch,) bool taken from a newer one."""

@@ -2,37 +2,27 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
-from torch.utils._pytree import tree_map
 
-from latentplan.planning.elites import Elites, Scores, mean_return, move_towards, select_elites
+from latentplan.planning.deadline import Budget
+from latentplan.planning.elites import Scores, mean_return, move_towards, select_elites
 from latentplan.planning.gradient import ascend
 from latentplan.planning.imagination import Scorer
 from latentplan.planning.model import Model, State, action_dtype, count_rows, per_dimension, state_device
 from latentplan.planning.objectives import Constraint, Term
 from latentplan.planning.plan import Plan, WarmStart, shift_plan
+from latentplan.planning.progress import Progress
 from latentplan.planning.sampling import Generators, Streams
 
 if TYPE_CHECKING:
     from latentplan.planning.cem import CEMPlanner
 
 Candidates = tuple[Tensor, Scores]  # sequences (batch, sample, horizon, action) and how good they are
-
-
-class _Progress(NamedTuple):
-    """Where a search stands; dim 0 of everything is the environment, so that those that are done can be frozen."""
-
-    mean: Tensor
-    var: Tensor
-    elites: Elites | None
-    expected_return: Tensor
-    num_nonfinite: Tensor
-    iterations: Tensor
-    is_found: Tensor
 
 
 class Search:
@@ -45,6 +35,8 @@ class Search:
         objective: What is maximised; None for the predicted return.
         constraints: What candidates must keep.
         generator: See `CEMPlanner.plan`.
+        started: When the call began, by the planner's clock.
+        deadline_ms: What the call may take; None is as long as it likes.
 
     Raises:
         ValueError: The model lacks what a setting asks for.
@@ -58,6 +50,8 @@ class Search:
         objective: Term | None,
         constraints: Sequence[Constraint],
         generator: Generators,
+        started: float,
+        deadline_ms: float | None,
     ) -> None:
         self.options, self.state = options, state
         self.batch, self.device, self.dtype = count_rows(state), state_device(state), action_dtype(state)
@@ -76,21 +70,31 @@ class Search:
             use_continues=options.use_continues,
             penalty=options.constraint_penalty,
         )
+        size = (self.batch, self.scorer.objective.num_particles, self.dtype, self.device)
+        seconds = None if deadline_ms is None else deadline_ms / 1000
+        self.budget = Budget(options.pace, size, options.clock or time.perf_counter, started, seconds, self.device)
 
     def run(self, previous: Plan | None) -> Plan:
         """The plan, warm-started from the last one in the environments where it may be."""
         options = self.options
         last = self._cold_start() if previous is None else self._shift(previous)
         start = last if options.warm_start else self._cold_start()
+        if not self.budget.allows("propose", "iteration", "choose"):
+            return self._fall_back(last)
+        self.budget.lap()
         proposals: list[Candidates] = []
         if options.num_policy_samples:
             generators, bounds = self.streams.policy_generators(), (self.low, self.high)
             proposals = [self.scorer.propose(self.state, options.num_policy_samples, generators, bounds)]
-        progress, history = self._iterate(start, proposals)
+            self.budget.lap("propose")
+        progress, history, stopped = self._iterate(start, proposals)
         # Where nothing finite was found: the last plan's tail, or zeros clamped into the bounds.
         mean = torch.where(progress.is_found[:, None, None], progress.mean, last.mean).clamp(self.low, self.high)
         actions, expected, violation = self._choose(progress, mean)
-        if options.gradient_steps:
+        self.budget.lap("choose")
+        if options.gradient_steps and not self.budget.allows("gradient"):
+            stopped = "deadline"
+        elif options.gradient_steps:
             actions, expected, violation = ascend(
                 self.scorer,
                 self.state,
@@ -99,13 +103,8 @@ class Search:
                 step_size=options.gradient_step_size,
                 bounds=(self.low, self.high),
             )
-        info = {
-            "elite_return": torch.stack([elite_return for elite_return, _ in history], dim=1),
-            "std": torch.stack([std for _, std in history], dim=1),
-            "iterations": progress.iterations,
-            "num_nonfinite": progress.num_nonfinite,
-            "is_fallback": ~progress.is_found,
-        }
+            self.budget.lap("gradient")
+        info = progress.describe(history, stopped)
         if violation is not None:
             info["violation"] = violation
         kept = None
@@ -114,8 +113,19 @@ class Search:
         ones = torch.ones(self.batch, dtype=torch.long)
         return Plan(actions, mean, progress.var, expected, info, kept, ones.bool(), ones)
 
-    def _iterate(self, start: WarmStart, proposals: list[Candidates]) -> tuple[_Progress, list[tuple[Tensor, Tensor]]]:
-        """The refits; and after each, the elites' mean return and the mean sampling std, both (batch,)."""
+    def _fall_back(self, last: WarmStart) -> Plan:
+        """The shifted last plan, or zeros, where there is no time to search; what is cold stays cold."""
+        progress, _, _ = self._begin(last, [], 1)
+        info = progress.describe([], "deadline")
+        if self.scorer.constraints:
+            info["violation"] = torch.full_like(progress.expected_return, float("nan"))
+        ones = torch.ones(self.batch, dtype=torch.long)
+        return Plan(last.mean, last.mean, last.var, progress.expected_return, info, last.elites, last.is_warm, ones)
+
+    def _iterate(
+        self, start: WarmStart, proposals: list[Candidates]
+    ) -> tuple[Progress, list[tuple[Tensor, Tensor]], str]:
+        """The refits; after each, the elites' mean return and the mean sampling std, both (batch,); what ended them."""
         options, num_fresh = self.options, self.options.num_samples - self.options.num_policy_samples
         rows = self.scorer.start_rows(self.state, num_fresh)
         progress, centre, spread = self._begin(start, proposals, num_fresh)
@@ -123,8 +133,11 @@ class Search:
         budget = torch.where(start.is_warm, warm_iterations, options.num_iterations)
         num_common = int(budget.min())
         is_active = torch.ones(self.batch, dtype=torch.bool, device=self.device)
-        known, history = proposals, []
+        known, history, stopped = proposals, [], "iterations"
         for iteration in range(int(budget.max())):
+            if iteration and not self.budget.allows("iteration", "choose"):
+                stopped = "deadline"
+                break
             fresh = self._sample(centre, spread, num_fresh)
             fresh[:, 0] = progress.mean if iteration else start.mean
             if iteration == 0:
@@ -134,18 +147,20 @@ class Search:
             if iteration == 0:  # the shifted last plan stays among the candidates
                 known = [*proposals, (fresh[:, :1], scores.first(1))]
             elif iteration >= num_common or options.stop_std > 0:
-                updated = _choose_rows(is_active & (budget > iteration).to(self.device), updated, progress)
+                updated = progress.updated(is_active & (budget > iteration).to(self.device), updated)
             progress = updated
             spread = self._sampling_std(progress.var)[:, None]
             centre = progress.mean[:, None]
             history.append((progress.expected_return, spread.mean(dim=(1, 2, 3))))
+            self.budget.lap("iteration")
             if options.stop_std > 0:
                 is_active = is_active & (progress.var.amax(dim=(1, 2)).sqrt() >= options.stop_std)
                 if not bool(is_active.any()):
+                    stopped = "agreement"
                     break
-        return progress, history
+        return progress, history, stopped
 
-    def _begin(self, start: WarmStart, proposals: list[Candidates], num_fresh: int) -> tuple[_Progress, Tensor, Tensor]:
+    def _begin(self, start: WarmStart, proposals: list[Candidates], num_fresh: int) -> tuple[Progress, Tensor, Tensor]:
         """The first distribution, and the centre and std of its samples, (batch, 1 or sample, horizon, action)."""
         mean, var = start.mean, start.var
         centre, spread = mean[:, None], self._sampling_std(var)[:, None]
@@ -163,7 +178,7 @@ class Search:
                 mean = (mean + mode) / 2
         nothing = torch.zeros(self.batch, dtype=torch.long, device=self.device)
         unknown = torch.full((self.batch,), float("nan"), dtype=self.dtype, device=self.device)
-        return _Progress(mean, var, None, unknown, nothing, nothing, nothing.bool()), centre, spread
+        return Progress(mean, var, None, unknown, nothing, nothing, nothing.bool()), centre, spread
 
     def _sample(self, centre: Tensor, spread: Tensor, num: int) -> Tensor:
         options = self.options
@@ -178,14 +193,14 @@ class Search:
             is_warm = start.is_warm.to(self.device)[:, None, None, None]
             fresh[:, 1:end] = torch.where(is_warm, start.elites[:, : end - 1], fresh[:, 1:end])
 
-    def _kept(self, progress: _Progress) -> list[Candidates]:
+    def _kept(self, progress: Progress) -> list[Candidates]:
         needs_best = self.options.final == "best" or bool(self.scorer.constraints)
         num = max(self.options.num_kept, int(needs_best))
         if progress.elites is None or num == 0:
             return []
         return [(progress.elites.actions[:, :num], progress.elites.scores.first(num))]
 
-    def _refit(self, progress: _Progress, candidates: list[Candidates], fresh_returns: Tensor) -> _Progress:
+    def _refit(self, progress: Progress, candidates: list[Candidates], fresh_returns: Tensor) -> Progress:
         options = self.options
         elites = select_elites(
             torch.cat([actions for actions, _ in candidates], dim=1),
@@ -197,7 +212,7 @@ class Search:
             elites, progress.mean, progress.var, smoothing=options.smoothing, adapt_std=options.adapt_std
         )
         is_found = elites.weights.sum(dim=1) > 0
-        return _Progress(
+        return Progress(
             mean,
             var,
             elites,
@@ -207,7 +222,7 @@ class Search:
             progress.is_found | is_found,
         )
 
-    def _choose(self, progress: _Progress, mean: Tensor) -> tuple[Tensor, Tensor, Tensor | None]:
+    def _choose(self, progress: Progress, mean: Tensor) -> tuple[Tensor, Tensor, Tensor | None]:
         """What is executed, its expected return and its violation (when there are constraints)."""
         assert progress.elites is not None
         best, scores = progress.elites.actions[:, 0], progress.elites.scores
@@ -256,15 +271,3 @@ class Search:
 
     def _constant(self, value: float | Sequence[float] | Tensor, name: str) -> Tensor:
         return per_dimension(value, self.options.action_dim, name).to(dtype=self.dtype, device=self.device)
-
-
-def _choose_rows(mask: Tensor, new: _Progress, old: _Progress) -> _Progress:
-    """Environments in mask (batch,) from `new`, the others from `old`."""
-
-    def choose(fresh: Any, past: Any) -> Any:
-        if not isinstance(fresh, Tensor):
-            return fresh
-        return torch.where(mask.reshape(-1, *[1] * (fresh.ndim - 1)), fresh, past)
-
-    chosen: _Progress = tree_map(choose, new, old)
-    return chosen

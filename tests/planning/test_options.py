@@ -72,7 +72,7 @@ def test_every_option_is_covered_here(make_planner):
     import dataclasses
 
     named = {name for options in CHANGES + CHANGES_OF_THE_CHOICE + CHANGES_WHEN_WARM for name in options}
-    elsewhere = {"action_dim", "constraint_penalty", "gradient_step_size"}
+    elsewhere = {"action_dim", "constraint_penalty", "gradient_step_size", "deadline_ms", "clock"}
     assert {field.name for field in dataclasses.fields(make_planner())} == named | elsewhere
 
 
