@@ -30,6 +30,7 @@ from latentplan.agent import ActorAgent, PlanningAgent, RandomAgent
 from latentplan.background import BackgroundAgent
 from latentplan.checkpoint import load_agent, load_model
 from latentplan.config import derive_seed
+from latentplan.gate import GatedAgent
 from latentplan.rollout import Agent, Episode, Floats, OnStep, Step, latency_percentiles, summarize
 from latentplan.virtual_clock import VirtualClock, VirtualExecutor
 
@@ -166,12 +167,11 @@ def summarize_timed(episodes: Sequence[TimedEpisode], clock: VirtualClock) -> di
 
 def action_source(agent: Agent) -> str | None:
     """Where the agent's last action came from, one of `SOURCES`; None for agents that have neither plan nor actor."""
+    if isinstance(agent, GatedAgent | BackgroundAgent):
+        return str(agent.last_source)
     if isinstance(agent, PlanningAgent) and agent.controller.plan is not None:
         return "plan" if int(agent.controller.plan.elapsed[0]) == 1 else "tail"
-    if isinstance(agent, ActorAgent):
-        return "actor"
-    source: str | None = getattr(agent, "last_source", None)
-    return source
+    return "actor" if isinstance(agent, ActorAgent) else None
 
 
 def _run_episode(

@@ -42,7 +42,10 @@ LAYERS = {
         ("config", "models", "planning", "agent", "background", "gate"),
         {"torch", "numpy", "safetensors"},
     ),
-    "timed_rollout": (("config", "agent", "background", "rollout", "checkpoint", "virtual_clock"), {"numpy"}),
+    "timed_rollout": (
+        ("config", "agent", "background", "gate", "rollout", "checkpoint", "virtual_clock"),
+        {"numpy"},
+    ),
     "training": (
         (*ALL, "compose"),
         {"lightning", "torch", "numpy", "einops", "rich", "tensorboard", "gymnasium", "yaml"},

@@ -5,6 +5,7 @@ import torch
 from latentplan.background import BackgroundAgent
 from latentplan.config import Config, EnvConfig, ModelConfig, PlannerConfig
 from latentplan.envs import make_env
+from latentplan.gate import GatedAgent
 from latentplan.latency import Latency
 from latentplan.models import WorldModel
 from latentplan.timed_rollout import iterate_timed_episodes, summarize_timed
@@ -145,3 +146,13 @@ def test_plans_of_several_periods_are_as_old_as_they_took(env, model):
     assert result["deadline_misses"] == 0
     assert result["plan_age_ms"]["p50"] >= 60.0  # found at the third boundary after it was asked for
     assert result["planned_fraction"] > 0.7
+
+
+def test_a_gated_agent_is_charged_like_any_other_and_tells_what_it_planned(env, model):
+    clock = VirtualClock(50.0, constant(5, 0))
+    agent = GatedAgent(model, Config(env=ENV, model=MODEL, planner=PLANNER), 0.9, planning_budget=0.5)
+    result = summarize_timed(list(iterate_timed_episodes(env, agent, [0, 1], clock)), clock)
+    sources = result["action_source"]
+    assert sources["plan"] > 0 and sources["actor"] > 0 and sum(sources.values()) == 40
+    assert result["planned_fraction"] == agent.planned_fraction == sources["plan"] / 40
+    assert result["plan_age_ms"]["p99"] == 5.0
