@@ -1,4 +1,4 @@
-"""Measure the program: `python scripts/benchmark.py train|render|decide|plan|ablate|learn`; --help lists them."""
+"""Measure the program: `python scripts/benchmark.py COMMAND`; --help lists the commands."""
 
 from __future__ import annotations
 
@@ -18,6 +18,8 @@ COMMANDS = {
     "decide": "milliseconds per decision of planner and actor",
     "plan": "milliseconds per search beside other planners, on the same model with the same settings",
     "ablate": "what each part of a trained planner earns, in paired episodes",
+    "realtime": "what thinking earns and costs: iterations, control rates, prediction error, re-planning",
+    "soak": "deadlines that agents miss on the wall clock, beside those that the machine itself misses",
     "learn": "learning curves over tasks and seeds: frames and minutes to a return, and the final return",
 }
 
@@ -31,7 +33,7 @@ def _dispatch(argv: Sequence[str]) -> int:
     command = argv[0] if argv else "--help"
     if command in ("-h", "--help"):
         print("usage: benchmark.py {" + ",".join(COMMANDS) + "} [--name value ...]\n")
-        print("\n".join(f"  {name:<8}{summary}" for name, summary in COMMANDS.items()))
+        print("\n".join(f"  {name:<10}{summary}" for name, summary in COMMANDS.items()))
         print("\nbenchmark.py COMMAND --help lists the flags of one.")
         return 0
     if command not in COMMANDS:
