@@ -25,7 +25,8 @@ if TYPE_CHECKING:
 
     from latentplan.rollout import Agent, Episode, OnStep
 
-MODES = ("planner", "actor", "random")
+PLANNING_MODES = ("planner", "gated", "background")
+MODES = (*PLANNING_MODES, "actor", "random")
 FLAGS = {
     "--checkpoint": ("DIR", "folder of a trained agent, or of a run (its best checkpoint)"),
     "--episodes": ("N", "episodes to play (10)"),
@@ -45,7 +46,7 @@ class EvaluationRequest:
     Attributes:
         checkpoint: Folder of the agent.
         episodes: Episodes to play.
-        mode: `planner`, `actor` or `random`.
+        mode: One of `MODES`.
         planner: Planner settings that replace the agent's, as they were typed.
         video: Where the film goes, or None.
         json: Where the result goes, or None.
@@ -76,7 +77,7 @@ def evaluate_agent(
     """Plays episodes whose starts depend only on `seed` and their index.
 
     Returns:
-        `seed`, `episodes`, `returns`, `mean_return`, `ci95` (a pair) and `decision_ms` (`p50`, `p95`, `p99`).
+        `seed`, and what `latentplan.rollout.summarize` gives.
 
     Raises:
         ValueError: `episodes` is below 1.
@@ -103,7 +104,7 @@ def parse_arguments(argv: Sequence[str]) -> EvaluationRequest:
     if device not in DEVICES:
         raise_unknown("device", device, DEVICES)
     planner = {name.removeprefix("--planner."): value for name, value in flags.items() if name in settings}
-    if planner and mode != "planner":
+    if planner and mode not in PLANNING_MODES:
         raise UserError(f"--planner.{next(iter(planner))} has no effect in mode {mode}; use --mode planner")
     return EvaluationRequest(
         checkpoint=Path(flags["--checkpoint"]),
@@ -137,13 +138,14 @@ def _evaluate(argv: Sequence[str]) -> int:
 
     env = make_env(config.env)
     try:
-        agent = load_agent(request.checkpoint, mode=request.mode, device=device, **overrides)
+        agent: Any = load_agent(request.checkpoint, mode=request.mode, device=device, **overrides)
         about = _describe(request, info, config.env, planner)
         print(
             f"{about['domain']}-{about['task']}, {request.mode} on {device}, pictures by {about['renderer']}",
             flush=True,
         )
-        return _play_and_report(request, env, agent, about, planner.horizon)
+        with contextlib.closing(agent) if request.mode == "background" else contextlib.nullcontext():
+            return _play_and_report(request, env, agent, about, planner.horizon)
     except OSError as error:
         raise UserError(f"an output could not be written: {error}") from error
     finally:
@@ -164,7 +166,7 @@ def _play_and_report(
         if request.video is not None:
             from latentplan.reporting.film import filming
 
-            planner = agent if request.mode == "planner" else None
+            planner = agent if request.mode in PLANNING_MODES else None
             on_step = stack.enter_context(filming(request.video, env, planner, horizon))
         try:
             for episode in iterate_episodes(env, agent, seeds, on_step=on_step):
@@ -192,7 +194,7 @@ def _describe(
         "render_quality": env.render_quality,
         "renderer": render_info()["renderer"],
     }
-    return {**described, "planner": to_dict(planner)} if request.mode == "planner" else described
+    return {**described, "planner": to_dict(planner)} if request.mode in PLANNING_MODES else described
 
 
 def _report(request: EvaluationRequest, result: dict[str, Any]) -> None:
