@@ -29,8 +29,8 @@ if TYPE_CHECKING:
     from latentplan.timed_rollout import TimedEpisode
     from latentplan.virtual_clock import VirtualClock
 
-MODES = ("planner", "actor", "random", "gated", "background")
 PLANNING_MODES = ("planner", "gated", "background")
+MODES = (*PLANNING_MODES, "actor", "random")
 FLAGS = {
     "--checkpoint": ("DIR", "folder of a trained agent, or of a run (its best checkpoint)"),
     "--episodes": ("N", "episodes to play (10)"),
@@ -87,7 +87,7 @@ def evaluate_agent(
     """Plays episodes whose starts depend only on `seed` and their index.
 
     Returns:
-        `seed`, `episodes`, `returns`, `mean_return`, `ci95` (a pair) and `decision_ms` (`p50`, `p95`, `p99`).
+        `seed`, and what `latentplan.rollout.summarize` gives.
 
     Raises:
         ValueError: `episodes` is below 1.

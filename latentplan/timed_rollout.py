@@ -16,9 +16,8 @@ a thought of d milliseconds takes d of them from the world:
 from __future__ import annotations
 
 import math
-from collections import Counter
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 from typing import Any, Protocol
@@ -26,17 +25,15 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from latentplan.agent import ActorAgent, PlanningAgent, RandomAgent
+from latentplan.agent import Agent as AnyAgent
 from latentplan.background import BackgroundAgent
-from latentplan.checkpoint import load_agent, load_model
+from latentplan.checkpoint import load_agent
 from latentplan.config import derive_seed
-from latentplan.gate import GatedAgent
-from latentplan.rollout import Agent, Episode, Floats, OnStep, Step, latency_percentiles, summarize
+from latentplan.rollout import SOURCES, Agent, Episode, Floats, OnStep, Step, latency_percentiles, summarize
 from latentplan.virtual_clock import VirtualClock, VirtualExecutor
 
 Action = NDArray[np.float32]
 
-SOURCES = ("plan", "tail", "actor")
 WARM_UP_DECISIONS = 2
 _ROUNDING = 1e-9  # substeps; a thought that ends with a substep acts in the next one, whatever its last digit says
 
@@ -64,13 +61,11 @@ class TimedEpisode(Episode):
 
     Attributes:
         deadline_misses: Boundaries at which the agent was still thinking.
-        sources: How many actions came from where, by the names in `SOURCES`.
         plan_age_ms: For each action from a plan: from the frame that the plan began with until the action acts.
     """
 
-    deadline_misses: int
-    sources: Counter[str]
-    plan_age_ms: Floats
+    deadline_misses: int = 0
+    plan_age_ms: Floats = field(default_factory=lambda: np.zeros(0))
 
 
 class Motors:
@@ -110,19 +105,16 @@ class Motors:
 
 
 def load_timed_agent(
-    path: str | Path, mode: str, clock: VirtualClock, device: str = "cpu", **planner: Any
-) -> PlanningAgent | ActorAgent | RandomAgent | BackgroundAgent:
+    path: str | Path, mode: str, clock: VirtualClock, device: str = "cpu", **settings: Any
+) -> AnyAgent | BackgroundAgent:
     """A trained agent as `load_agent` gives it, except that plans made beside its decisions come by the clock.
 
     Raises:
         UserError: The checkpoint, the mode or a setting cannot be used.
     """
-    if mode != "background":
-        return load_agent(path, mode=mode, device=device, **planner)
-    model, config, info = load_model(path, device)
-    make_executor = partial(VirtualExecutor, clock=clock)
-    settings = replace(config.planner, **planner)
-    return BackgroundAgent(model, config, info["discount"], planner=settings, make_executor=make_executor)
+    if mode == "background":
+        settings["make_executor"] = partial(VirtualExecutor, clock=clock)
+    return load_agent(path, mode, device, **settings)
 
 
 def iterate_timed_episodes(
@@ -147,31 +139,18 @@ def summarize_timed(episodes: Sequence[TimedEpisode], clock: VirtualClock) -> di
     """What `summarize` tells, and how the agent kept up with the world, as plain values for JSON.
 
     Returns:
-        Besides: `planned_fraction`, `action_source`, `plan_age_ms` (`p50`, `p95`, `p99`; None without a plan),
+        Besides: `plan_age_ms` (`p50`, `p95`, `p99`; None without a plan),
         `deadline_misses`, `control_hz` and `latency`. In a world that waits, age, rate and latency are None.
     """
-    sources = sum((episode.sources for episode in episodes), Counter())
     ages = np.concatenate([episode.plan_age_ms for episode in episodes])
-    decisions = sum(episode.num_decisions for episode in episodes)
     waits = clock.control_hz is None
     return {
         **summarize(episodes),
-        "planned_fraction": (sources["plan"] + sources["tail"]) / decisions,
-        "action_source": {name: sources[name] for name in SOURCES},
         "plan_age_ms": None if waits or not len(ages) else latency_percentiles(ages),
         "deadline_misses": sum(episode.deadline_misses for episode in episodes),
         "control_hz": clock.control_hz,
         "latency": None if waits else clock.latency.name,
     }
-
-
-def action_source(agent: Agent) -> str | None:
-    """Where the agent's last action came from, one of `SOURCES`; None for agents that have neither plan nor actor."""
-    if isinstance(agent, GatedAgent | BackgroundAgent):
-        return str(agent.last_source)
-    if isinstance(agent, PlanningAgent) and agent.controller.plan is not None:
-        return "plan" if int(agent.controller.plan.elapsed[0]) == 1 else "tail"
-    return "actor" if isinstance(agent, ActorAgent) else None
 
 
 def _run_episode(
@@ -225,16 +204,14 @@ class _Record:
     def __init__(self) -> None:
         self.deadline_misses = 0
         self._decision_ms: list[float] = []
-        self._sources: Counter[str] = Counter()
+        self._sources = dict.fromkeys(SOURCES, 0)
         self._plan_age_ms: list[float] = []
         self._planned_ms = 0.0  # when the present plan's frame was seen
 
     def add(self, agent: Agent, now_ms: float, decision_ms: float) -> None:
         """Counts a decision that began now."""
         self._decision_ms.append(decision_ms)
-        source = action_source(agent)
-        if source is None:
-            return
+        source = getattr(agent, "last_source", "actor")
         self._sources[source] += 1
         if source == "actor":
             return
@@ -252,7 +229,7 @@ class _Record:
             len(self._decision_ms),
             env_frames,
             np.asarray(self._decision_ms),
-            self.deadline_misses,
             self._sources,
+            self.deadline_misses,
             np.asarray(self._plan_age_ms),
         )

@@ -41,7 +41,7 @@ def zeros(tmp_path):
     return path
 
 
-@pytest.mark.parametrize("mode", ["planner", "actor", "random", "background"])
+@pytest.mark.parametrize("mode", ["planner", "actor", "random", "gated", "background"])
 def test_thinking_that_costs_nothing_earns_what_a_world_that_waits_pays(tmp_path, checkpoint, zeros, mode):
     flags = ("--mode", mode, "--episodes", 2)
     waiting = result_of(tmp_path, checkpoint, *flags)
@@ -53,7 +53,7 @@ def test_thinking_that_costs_nothing_earns_what_a_world_that_waits_pays(tmp_path
     assert timed["decision_ms"] == {"p50": 0.0, "p95": 0.0, "p99": 0.0}
 
 
-@pytest.mark.parametrize("mode", ["planner", "actor", "random"])
+@pytest.mark.parametrize("mode", ["planner", "actor", "random", "gated"])
 def test_a_world_that_waits_is_that_of_plain_rollouts(tmp_path, checkpoint, mode):
     env = make_env(ENV)
     plain = evaluate.evaluate_agent(load_agent(checkpoint, mode), env, seed=0, episodes=2)
@@ -61,7 +61,7 @@ def test_a_world_that_waits_is_that_of_plain_rollouts(tmp_path, checkpoint, mode
     assert result_of(tmp_path, checkpoint, "--mode", mode, "--episodes", 2)["returns"] == plain["returns"]
 
 
-@pytest.mark.parametrize("mode", ["planner", "background"])
+@pytest.mark.parametrize("mode", ["planner", "gated", "background"])
 def test_a_given_latency_gives_the_same_result_twice_and_changes_the_return(tmp_path, checkpoint, mode):
     spread = tmp_path / "spread.json"
     spread.write_text('{"decision_ms": [5, 15, 45, 70]}')
@@ -74,7 +74,7 @@ def test_a_given_latency_gives_the_same_result_twice_and_changes_the_return(tmp_
 
 
 @pytest.mark.parametrize(
-    ("mode", "source", "fraction"), [("planner", "plan", 1.0), ("actor", "actor", 0.0), ("random", None, 0.0)]
+    ("mode", "source", "fraction"), [("planner", "plan", 1.0), ("actor", "actor", 0.0), ("random", "actor", 0.0)]
 )
 def test_results_tell_where_actions_came_from(tmp_path, checkpoint, mode, source, fraction):
     latency = tmp_path / "latency.txt"

@@ -43,7 +43,7 @@ LAYERS = {
         {"torch", "numpy", "safetensors"},
     ),
     "timed_rollout": (
-        ("config", "agent", "background", "gate", "rollout", "checkpoint", "virtual_clock"),
+        ("config", "agent", "background", "rollout", "checkpoint", "virtual_clock"),
         {"numpy"},
     ),
     "training": (

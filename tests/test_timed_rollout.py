@@ -162,6 +162,6 @@ def test_a_summary_adds_how_the_agent_kept_up():
     assert summary["episodes"] == 2
     assert summary["decision_ms"]["p50"] == 60.0
     assert (summary["control_hz"], summary["latency"], summary["deadline_misses"]) == (20.0, "file", 4)
-    assert summary["action_source"] == {"plan": 0, "tail": 0, "actor": 0}
+    assert summary["action_source"] == {"plan": 0, "tail": 0, "actor": 6}
     assert summary["planned_fraction"] == 0.0
     assert summary["plan_age_ms"] is None
