@@ -2,12 +2,14 @@ import numpy as np
 import pytest
 import torch
 
+from latentplan.agent import ActorAgent, PlanningAgent, RandomAgent
 from latentplan.background import BackgroundAgent
 from latentplan.config import Config, EnvConfig, ModelConfig, PlannerConfig
 from latentplan.envs import make_env
 from latentplan.gate import GatedAgent
 from latentplan.latency import Latency
 from latentplan.models import WorldModel
+from latentplan.rollout import run_episodes
 from latentplan.timed_rollout import iterate_timed_episodes, summarize_timed
 from latentplan.virtual_clock import VirtualClock, VirtualExecutor
 
@@ -105,6 +107,17 @@ def env():
 def model():
     torch.manual_seed(0)
     return WorldModel(MODEL, action_dim=1)
+
+
+@pytest.mark.parametrize("kind", [PlanningAgent, GatedAgent, ActorAgent, RandomAgent])
+def test_a_world_that_waits_is_that_of_plain_rollouts_and_of_thoughts_that_take_no_time(env, model, kind):
+    config = Config(env=ENV, model=MODEL, planner=PLANNER)
+    makers = {RandomAgent: lambda: RandomAgent(1), ActorAgent: lambda: ActorAgent(model, config)}
+    make = makers.get(kind, lambda: kind(model, config, 0.9))
+    returns = [[episode.total_return for episode in run_episodes(env, make(), [0, 1])]]
+    for clock in (VirtualClock(None, Latency()), VirtualClock(50.0, constant(0, 0))):
+        returns.append([episode.total_return for episode in iterate_timed_episodes(env, make(), [0, 1], clock)])
+    assert returns[0] == returns[1] == returns[2]
 
 
 def play_background(env, model, control_hz, latency, episodes=1):
