@@ -66,7 +66,7 @@ class ModelAgent:
         if self.noise_std > 0.0:
             noise = torch.randn(action.shape, generator=self.generator, device=action.device)
             action = (action + self.noise_std * noise).clamp(-1.0, 1.0)
-        self.state, self._action = state, action
+        self.state, self._action, self._forget = state, action, None
         result = action.float().cpu().numpy()
         return result[0] if single else result
 
@@ -99,7 +99,6 @@ class ModelAgent:
         deter = self.model.dynamics.advance(self.state, self._action)
         if self._forget is not None:
             deter = torch.where(self._forget[:, None], 0.0, deter)
-            self._forget = None
         return self._see(deter, frames)
 
     def _see(self, deter: Tensor, frames: Tensor) -> State:
