@@ -285,5 +285,5 @@ def test_a_slow_model_keeps_a_real_deadline(state):
     plan = planner.plan(model, state, deadline_ms=120)
     spent_ms = 1000 * (time.perf_counter() - started)
     assert plan.info["stopped"] == "deadline"
-    assert 2 <= int(plan.info["iterations"][0]) <= 10
-    assert spent_ms < 200  # one iteration of a busy machine beyond
+    assert 1 <= int(plan.info["iterations"][0]) <= 10
+    assert spent_ms < 230  # what a busy machine adds stays below what all iterations sleep
