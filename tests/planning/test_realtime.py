@@ -16,8 +16,8 @@ from latentplan.planning import BackgroundPlanner, CEMPlanner, FunctionModel, Pl
 STATE = torch.tensor([[1.0]])
 CEM = CEMPlanner(action_dim=1, horizon=4, num_samples=16, num_elites=4, num_iterations=2)
 STARTING_SECONDS = 60.0  # a process imports torch first
-# A loop that waited for a plan would take seconds; what a busy machine adds is far below.
-DECISION_SECONDS = 0.25
+# A loop that waited for a search that hangs would take minutes; what a busy machine adds is far below this.
+DECISION_SECONDS = 1.0
 
 
 class StubbornError(Exception):
