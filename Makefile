@@ -1,4 +1,5 @@
 # `make train` and `make test` set up everything they need; `make train ARGS="--domain cartpole --minutes 5"`.
+# `make soak` fuzzes for long; `make soak ARGS="--checkpoint DIR"` counts missed deadlines on the wall clock.
 
 PYTHON ?= python3 python3.11 python3.12 python3.13
 ARGS ?=
@@ -27,7 +28,7 @@ bench: $(STAMP)
 	@$(BIN)/python scripts/benchmark.py $(ARGS)
 
 soak: $(STAMP)
-	$(BIN)/python -m pytest -m soak
+	@$(BIN)/python $(if $(ARGS),scripts/benchmark.py soak $(ARGS),-m pytest -m soak)
 
 clean:
 	rm -rf .venv build dist *.egg-info .mypy_cache .ruff_cache .pytest_cache

@@ -26,12 +26,18 @@ class ModelAgent:
     One frame (64, 64, 3) in gives one action (action,) out; several, (batch, 64, 64, 3), give (batch, action).
     The belief is the posterior's mean.
 
+    Attributes:
+        last_source: What the most recent action came from, "plan", "tail" (of an older plan) or "actor"; a list of
+            these where environments of a batch can differ.
+
     Args:
         model: The world model; put into evaluation mode and never changed.
         config: Settings it was trained with.
         noise_std: Standard deviation of Gaussian noise added to each action, for exploration.
         seed: Of the agent's own random stream.
     """
+
+    last_source: str | list[str] = "actor"
 
     def __init__(self, model: WorldModel, config: Config, *, noise_std: float = 0.0, seed: int = 0) -> None:
         self.model, self.config, self.noise_std = model.eval(), config, noise_std
@@ -68,7 +74,7 @@ class ModelAgent:
         if self.noise_std > 0.0:
             noise = torch.randn(action.shape, generator=self.generator, device=action.device)
             action = (action + self.noise_std * noise).clamp(-1.0, 1.0)
-        self.state, self._action = state, action
+        self.state, self._action, self._forget = state, action, None
         result = action.float().cpu().numpy()
         return result[0] if single else result
 
@@ -95,13 +101,15 @@ class ModelAgent:
 
     def _believe(self, frames: Tensor) -> State:
         if self.state is None or self._action is None:
-            return self.model.see(self.model.dynamics.initial(len(frames)).deter, frames)
+            return self._see(self.model.dynamics.initial(len(frames)).deter, frames)
         if len(self.state.deter) != len(frames):
             raise ValueError(f"got {len(frames)} frames after {len(self.state.deter)}: call reset() between batches")
         deter = self.model.dynamics.advance(self.state, self._action)
         if self._forget is not None:
             deter = torch.where(self._forget[:, None], 0.0, deter)
-            self._forget = None
+        return self._see(deter, frames)
+
+    def _see(self, deter: Tensor, frames: Tensor) -> State:
         return self.model.see(deter, frames)
 
     def _check(self, frames: np.ndarray) -> Tensor:
@@ -121,6 +129,8 @@ class PlanningAgent(ModelAgent):
         noise_std: Of exploration noise.
         seed: Of the agent's own random stream.
     """
+
+    last_source: str | list[str] = "plan"
 
     def __init__(
         self,
@@ -206,6 +216,8 @@ class ActorAgent(ModelAgent):
 
 class RandomAgent:
     """Uniform actions in [-1, 1]."""
+
+    last_source = "actor"
 
     def __init__(self, num_actions: int, seed: int = 0) -> None:
         self.num_actions = num_actions

@@ -75,7 +75,6 @@ class BackgroundAgent(ModelAgent):
         self.scheduler = PlanScheduler(
             search, self.model, executor, max_age=max_age, fresh_ticks=fresh_ticks, generator=self.generator
         )
-        self.last_source = "actor"
         self.plan_age: int | None = None
 
     def reset(self, mask: np.ndarray | None = None) -> None:

@@ -11,12 +11,15 @@ from typing import Any
 from safetensors.torch import load_file, save_file
 
 from latentplan.agent import ActorAgent, Agent, PlanningAgent, RandomAgent
+from latentplan.background import BackgroundAgent
 from latentplan.config import Config, PlannerConfig, UserError, from_dict, to_dict
+from latentplan.gate import GatedAgent
 from latentplan.models import WorldModel
 
 WEIGHTS = "weights.safetensors"
 INFO = "info.json"
-MODES = ("planner", "actor", "random")
+MODES = ("planner", "gated", "background", "actor", "random")
+OPTIONS = {"gated": ("planning_budget", "signal"), "background": ("worker", "max_age", "fresh_ticks", "make_executor")}
 REQUIRED = ("domain", "task", "env_frames", "discount", "action_dim", "config", "sha256")
 
 
@@ -85,14 +88,18 @@ def load_model(path: str | Path, device: str = "cpu") -> tuple[WorldModel, Confi
         raise UserError(f"device {device!r} cannot be used: {str(error).splitlines()[0]}") from None
 
 
-def load_agent(path: str | Path, mode: str = "planner", device: str = "cpu", **planner: Any) -> Agent:
+def load_agent(
+    path: str | Path, mode: str = "planner", device: str = "cpu", **settings: Any
+) -> Agent | BackgroundAgent:
     """A trained agent, ready to act.
 
     Args:
         path: A checkpoint, or a run folder.
-        mode: `planner`, `actor` or `random`.
+        mode: `planner`, `actor`, `random`, `gated` (the actor, and the planner in doubt; see `GatedAgent`) or
+            `background` (acts at once and plans beside, see `BackgroundAgent`; close it in the end).
         device: `cpu` or `cuda`.
-        **planner: Settings of the search that replace the trained ones, such as `horizon=10`.
+        **settings: Settings of the search that replace the trained ones, such as `horizon=10`; `planning_budget` and
+            `signal` of a gated agent; those of `BackgroundAgent` where it plans in the background.
 
     Raises:
         UserError: The checkpoint, the mode or a setting cannot be used.
@@ -105,13 +112,21 @@ def load_agent(path: str | Path, mode: str = "planner", device: str = "cpu", **p
     if mode == "actor":
         return ActorAgent(model, config)
     known = to_dict(config.planner)
-    for name in planner:
+    options = {name: settings.pop(name) for name in OPTIONS.get(mode, ()) if name in settings}
+    for name in settings:
         if name not in known:
-            raise UserError(f"unknown planner setting {name!r}{_suggestion(name, {key: key for key in known})}")
+            names = (*known, *OPTIONS.get(mode, ()))
+            raise UserError(f"unknown planner setting {name!r}{_suggestion(name, {key: key for key in names})}")
+    kind: Any = {"planner": PlanningAgent, "gated": GatedAgent, "background": BackgroundAgent}[mode]
     try:
-        return PlanningAgent(model, config, info["discount"], planner=PlannerConfig(**(known | planner)))
+        agent: Agent | BackgroundAgent = kind(
+            model, config, info["discount"], planner=PlannerConfig(**(known | settings)), **options
+        )
     except (TypeError, ValueError) as error:
         raise UserError(f"planner settings: {error}") from None
+    if isinstance(agent, BackgroundAgent):
+        agent.wait_until_ready()  # so that the first episode is not one of the actor alone
+    return agent
 
 
 def resolve_checkpoint(path: str | Path) -> Path:

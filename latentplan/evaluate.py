@@ -23,9 +23,15 @@ from latentplan.config import DEVICES, EnvConfig, PlannerConfig, UserError, from
 if TYPE_CHECKING:
     import gymnasium
 
-    from latentplan.rollout import Agent, Episode, OnStep
+    from latentplan.envs.suite import SuiteEnv
+    from latentplan.latency import Latency
+    from latentplan.rollout import Agent, OnStep
+    from latentplan.timed_rollout import TimedEpisode
+    from latentplan.virtual_clock import VirtualClock
 
-MODES = ("planner", "actor", "random")
+PLANNING_MODES = ("planner", "gated", "background")
+GOAL_MODES = ("planner", "gated")  # who pursues an objective; the others are scored on it
+MODES = (*PLANNING_MODES, "actor", "random")
 FLAGS = {
     "--checkpoint": ("DIR", "folder of a trained agent, or of a run (its best checkpoint)"),
     "--episodes": ("N", "episodes to play (10)"),
@@ -37,6 +43,8 @@ FLAGS = {
     "--mode": ("|".join(MODES), "who acts (planner)"),
     "--video": ("FILE", "film of the first episode, .mp4 or .webm"),
     "--json": ("FILE", "result as JSON"),
+    "--control-hz": ("F", "decisions per second of a world that goes on while the agent thinks (it waits)"),
+    "--latency": ("measured|FILE", "what thinking costs there: as measured, or drawn from a file of ms (measured)"),
     "--seed": ("S", "episode i starts from a state that depends only on S and i (0)"),
     "--device": ("|".join(DEVICES), "where the agent computes (auto: cuda where usable)"),
     "--threads": ("N", "CPU threads (torch's own choice)"),
@@ -52,10 +60,12 @@ class EvaluationRequest:
         episodes: Episodes to play.
         objective: What counts instead of the task, or None.
         constraint: What must hold at every moment, or None.
-        mode: `planner`, `actor` or `random`.
+        mode: One of `MODES`.
         planner: Planner settings that replace the agent's, as they were typed.
         video: Where the film goes, or None.
         json: Where the result goes, or None.
+        control_hz: Decisions per second of a world that does not wait, or None for one that does.
+        latency: What thinking costs there.
         seed: Seed of the starts.
         device: `auto`, `cpu` or `cuda`.
         threads: CPU threads, or None to leave it to torch.
@@ -69,6 +79,8 @@ class EvaluationRequest:
     planner: dict[str, str]
     video: Path | None
     json: Path | None
+    control_hz: float | None
+    latency: Latency
     seed: int
     device: str
     threads: int | None
@@ -85,7 +97,7 @@ def evaluate_agent(
     """Plays episodes whose starts depend only on `seed` and their index.
 
     Returns:
-        `seed`, `episodes`, `returns`, `mean_return`, `ci95` (a pair) and `decision_ms` (`p50`, `p95`, `p99`).
+        `seed`, and what `latentplan.rollout.summarize` gives.
 
     Raises:
         ValueError: `episodes` is below 1.
@@ -112,8 +124,13 @@ def parse_arguments(argv: Sequence[str]) -> EvaluationRequest:
     if device not in DEVICES:
         raise_unknown("device", device, DEVICES)
     planner = {name.removeprefix("--planner."): value for name, value in flags.items() if name in settings}
-    if planner and mode != "planner":
+    if planner and mode not in PLANNING_MODES:
         raise UserError(f"--planner.{next(iter(planner))} has no effect in mode {mode}; use --mode planner")
+    from latentplan.latency import read_clock_flags
+
+    control_hz, latency = read_clock_flags(flags)
+    if mode == "background" and ("--objective" in flags or "--constraint" in flags):
+        raise UserError("mode background plans for the learned return alone; give goals to --mode planner or gated")
     return EvaluationRequest(
         checkpoint=Path(flags["--checkpoint"]),
         episodes=_whole_number(flags, "--episodes", 10, 1),
@@ -123,6 +140,8 @@ def parse_arguments(argv: Sequence[str]) -> EvaluationRequest:
         planner=planner,
         video=_output_path(flags, "--video"),
         json=_output_path(flags, "--json"),
+        control_hz=control_hz,
+        latency=latency,
         seed=_whole_number(flags, "--seed", 0, 0),
         device=device,
         threads=_whole_number(flags, "--threads", 1, 1) if "--threads" in flags else None,
@@ -134,7 +153,9 @@ def _evaluate(argv: Sequence[str]) -> int:
         print(_help())
         return 0
     request = parse_arguments(argv)
-    from latentplan.checkpoint import load_agent, read_info
+    from latentplan.checkpoint import read_info
+    from latentplan.timed_rollout import load_timed_agent
+    from latentplan.virtual_clock import VirtualClock
 
     info = read_info(request.checkpoint)
     try:
@@ -150,14 +171,15 @@ def _evaluate(argv: Sequence[str]) -> int:
     goals = read_goals(request.objective, request.constraint, config.env.domain)
     env = make_env(config.env)
     try:
-        agent = load_agent(request.checkpoint, mode=request.mode, device=device, **overrides)
+        clock = VirtualClock(request.control_hz, request.latency)
+        agent = load_timed_agent(request.checkpoint, request.mode, clock, device, **overrides)
         about = _describe(request, info, config.env, planner)
         print(
             f"{about['domain']}-{about['task']}, {request.mode} on {device}, pictures by {about['renderer']}",
             flush=True,
         )
-        played = env if goals is None else score_env(env, goals, agent if request.mode == "planner" else None)
-        return _play_and_report(request, played, agent, about, planner.horizon)
+        played = env if goals is None else score_env(env, goals, agent if request.mode in GOAL_MODES else None)
+        return _play_and_report(request, played, agent, about, planner.horizon, clock)
     except OSError as error:
         raise UserError(f"an output could not be written: {error}") from error
     finally:
@@ -165,25 +187,26 @@ def _evaluate(argv: Sequence[str]) -> int:
 
 
 def _play_and_report(
-    request: EvaluationRequest, env: gymnasium.Env[Any, Any], agent: Any, about: dict[str, Any], horizon: int
+    request: EvaluationRequest, env: SuiteEnv, agent: Any, about: dict[str, Any], horizon: int, clock: VirtualClock
 ) -> int:
     """Plays, prints, writes; an interrupt reports the episodes that were finished."""
-    from latentplan.rollout import episode_seed, iterate_episodes, summarize
+    from latentplan.rollout import episode_seed
     from latentplan.scoring import ScoredEnv
+    from latentplan.timed_rollout import iterate_timed_episodes, summarize_timed
 
     scored = env if isinstance(env, ScoredEnv) else None
     seeds = [episode_seed(request.seed, index) for index in range(request.episodes)]
-    episodes: list[Episode] = []
+    episodes: list[TimedEpisode] = []
     interrupted = False
     with contextlib.ExitStack() as stack:
         on_step = None
         if request.video is not None:
             from latentplan.reporting.film import filming
 
-            planner = agent if request.mode == "planner" else None
+            planner = agent if request.mode in PLANNING_MODES else None
             on_step = stack.enter_context(filming(request.video, env, planner, horizon, judge=scored))
         try:
-            for episode in iterate_episodes(env, agent, seeds, on_step=on_step):
+            for episode in iterate_timed_episodes(env, agent, seeds, clock, on_step=on_step):
                 episodes.append(episode)
                 print(f"episode {len(episodes)} of {len(seeds)}: return {episode.total_return:.1f}", flush=True)
         except KeyboardInterrupt:
@@ -191,7 +214,7 @@ def _play_and_report(
             print(f"\ninterrupted after {len(episodes)} of {len(seeds)} episodes", flush=True)
         if episodes:
             scores = {} if scored is None else scored.summarize(len(episodes))
-            _report(request, {**about, **summarize(episodes), **scores})
+            _report(request, {**about, **summarize_timed(episodes, clock), **scores})
     return 130 if interrupted else 0
 
 
@@ -209,7 +232,7 @@ def _describe(
         "render_quality": env.render_quality,
         "renderer": render_info()["renderer"],
     }
-    return {**described, "planner": to_dict(planner)} if request.mode == "planner" else described
+    return {**described, "planner": to_dict(planner)} if request.mode in PLANNING_MODES else described
 
 
 def _report(request: EvaluationRequest, result: dict[str, Any]) -> None:
@@ -222,6 +245,9 @@ def _report(request: EvaluationRequest, result: dict[str, Any]) -> None:
     if "violation_rate" in result:
         print(f"violation rate {result['violation_rate']:.4f}  ({result['constraint']})")
     print(f"decision ms  {latency}", flush=True)
+    if result["control_hz"] is not None:
+        sources = "   ".join(f"{name} {count}" for name, count in result["action_source"].items())
+        print(f"at {result['control_hz']:g} Hz  deadline misses {result['deadline_misses']}   {sources}", flush=True)
     if request.json is not None:
         partial = request.json.with_name(f".{request.json.name}.{os.getpid()}")
         partial.write_text(json.dumps(result, indent=2) + "\n")

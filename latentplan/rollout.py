@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
@@ -26,8 +26,15 @@ Floats = NDArray[np.float64]
 _T_QUANTILES = (12.7062, 4.3027, 3.1824, 2.7764, 2.5706, 2.4469, 2.3646, 2.3060, 2.2622, 2.2281)
 
 
+SOURCES = ("plan", "tail", "actor")
+
+
 class Agent(Protocol):
-    """Whatever turns frames into actions."""
+    """Whatever turns frames into actions.
+
+    Its attribute `last_source`, where it has one, says what the most recent action came from: "plan", "tail" (of an
+    older plan) or "actor". An agent that does not say so does not plan.
+    """
 
     def act(self, frame: NDArray[np.uint8]) -> NDArray[np.float32]:
         """The action, (action,), for a frame, (height, width, channel)."""
@@ -70,12 +77,14 @@ class Episode:
         num_decisions: Actions chosen.
         env_frames: Simulator control steps, counted before action repeat.
         decision_ms: Milliseconds from a frame in memory to an action, (decision,).
+        action_source: Decisions by what their action came from: "plan", "tail" or "actor".
     """
 
     total_return: float
     num_decisions: int
     env_frames: int
     decision_ms: Floats
+    action_source: dict[str, int] = field(default_factory=dict)
 
 
 OnStep = Callable[[Step], None]
@@ -117,10 +126,12 @@ def _run_episode(env: gymnasium.Env[Any, Any], agent: Agent, index: int, seed: i
     agent.seed(derive_seed(seed, "agent"))  # a stream of its own: the start must not correlate with the actions
     total_return, env_frames, over = 0.0, 0, False
     decision_ms: list[float] = []
+    action_source = dict.fromkeys(SOURCES, 0)
     while not over:
         started = time.perf_counter()
         action = agent.act(frame)
         decision_ms.append(1000.0 * (time.perf_counter() - started))
+        action_source[getattr(agent, "last_source", "actor")] += 1
         if on_step is not None:
             on_step(Step(index, len(decision_ms) - 1, total_return, frame, action))
         frame, reward, terminated, truncated, info = env.step(action)
@@ -129,27 +140,31 @@ def _run_episode(env: gymnasium.Env[Any, Any], agent: Agent, index: int, seed: i
         over = terminated or truncated
     if on_step is not None:
         on_step(Step(index, len(decision_ms), total_return, frame, None))
-    return Episode(total_return, len(decision_ms), env_frames, np.asarray(decision_ms))
+    return Episode(total_return, len(decision_ms), env_frames, np.asarray(decision_ms), action_source)
 
 
 def summarize(episodes: Sequence[Episode]) -> dict[str, Any]:
     """Returns, their mean and interval, and decision latency, as plain values for JSON.
 
     Returns:
-        `episodes`, `returns`, `mean_return`, `ci95` (a pair; of None where one episode gives no interval) and
-        `decision_ms` with `p50`, `p95` and `p99`.
+        `episodes`, `returns`, `mean_return`, `ci95` (a pair; of None where one episode gives no interval),
+        `decision_ms` with `p50`, `p95` and `p99`, `action_source` (decisions by `plan`, `tail` and `actor`) and
+        `planned_fraction` (the share of `plan` and `tail` among them).
 
     Raises:
         ValueError: There is no episode.
     """
     returns = [episode.total_return for episode in episodes]
     low, high = confidence_interval(returns)
+    sources = {name: sum(episode.action_source.get(name, 0) for episode in episodes) for name in SOURCES}
     return {
         "episodes": len(returns),
         "returns": returns,
         "mean_return": float(np.mean(returns)),
         "ci95": [None, None] if math.isnan(low) else [low, high],
         "decision_ms": latency_percentiles(np.concatenate([episode.decision_ms for episode in episodes])),
+        "planned_fraction": (sources["plan"] + sources["tail"]) / max(1, sum(sources.values())),
+        "action_source": sources,
     }
 
 

@@ -6,7 +6,7 @@ for a goal image from the camera's own pictures. It is the same whoever acts.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -101,6 +101,7 @@ class ScoredEnv(gymnasium.Wrapper[Any, Any, Any, Any]):
             on_objective: Called with the objective when an episode begins and when another takes its place.
         """
         super().__init__(env)
+        self._suite_env = env
         env.record_quantities = True
         self.goals, self.scores = goals, list[Score]()
         self.worth: list[float] = []
@@ -118,9 +119,18 @@ class ScoredEnv(gymnasium.Wrapper[Any, Any, Any, Any]):
         self._announce()
         return self.env.reset(seed=seed, options=options)
 
+    @property
+    def substeps_per_decision(self) -> int:
+        """Steps of the simulator per decision."""
+        return self._suite_env.substeps_per_decision
+
     def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
         """Steps the environment and scores each of its control steps."""
-        frame, reward, terminated, truncated, info = self.env.step(action)
+        return self.step_schedule([(action, self.substeps_per_decision)])
+
+    def step_schedule(self, schedule: Sequence[tuple[Any, int]]) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
+        """As `SuiteEnv.step_schedule`, and scores each control step."""
+        frame, reward, terminated, truncated, info = self._suite_env.step_schedule(schedule)
         for quantities, frame_reward in zip(info["quantities"], info["rewards"], strict=True):
             self._score(dict(zip(self._names, quantities, strict=True)), frame_reward, frame)
         if terminated or truncated:

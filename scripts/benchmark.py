@@ -19,6 +19,8 @@ COMMANDS = {
     "plan": "milliseconds per search beside other planners, on the same model with the same settings",
     "ablate": "what each part of a trained planner earns, in paired episodes",
     "zero-shot": "goals that an agent was not trained for, pursued by planner, actor and chance",
+    "realtime": "what thinking earns and costs: iterations, control rates, prediction error, re-planning",
+    "soak": "deadlines that agents miss on the wall clock, beside those that the machine itself misses",
     "learn": "learning curves over tasks and seeds: frames and minutes to a return, and the final return",
 }
 

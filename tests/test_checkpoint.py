@@ -64,7 +64,7 @@ def test_weights_and_settings_come_back(model, folder):
     assert all(torch.equal(value, loaded.state_dict()[name]) for name, value in model.state_dict().items())
 
 
-@pytest.mark.parametrize("mode", ["planner", "actor", "random"])
+@pytest.mark.parametrize("mode", ["planner", "gated", "actor", "random"])
 def test_an_agent_acts_the_same_each_time_it_is_loaded(folder, mode):
     first, second = history(load_agent(folder, mode)), history(load_agent(folder, mode))
     assert first.shape == (4, 2)
@@ -167,7 +167,7 @@ def test_shipped_checkpoints_are_suggested(model, tmp_path, monkeypatch):
 
 
 def test_what_cannot_be_chosen_is_named(folder):
-    assert_refused(lambda: load_agent(folder, "plan"), "'plan'", "planner, actor, random")
+    assert_refused(lambda: load_agent(folder, "plan"), "'plan'", "planner, gated, background, actor, random")
     assert_refused(lambda: load_agent(folder, horizn=3), "'horizn'", "did you mean horizon?")
     assert_refused(lambda: load_agent(folder, horizon=0), "horizon")
     assert_refused(lambda: load_agent(folder, horizon="far"), "planner settings")
@@ -180,6 +180,18 @@ def test_settings_of_the_search_can_be_replaced(folder):
     assert (agent.controller.planner.horizon, agent.controller.planner.num_samples) == (5, 20)
     agent.act(FRAMES[0])
     assert agent.controller.plan.mean.shape == (1, 5, 2)
+
+
+def test_agents_that_plan_in_real_time_take_their_settings(folder):
+    gated = load_agent(folder, "gated", planning_budget=0.1, signal="random", horizon=4)
+    assert (gated.planning_budget, gated.signal, gated.controller.planner.horizon) == (0.1, "random", 4)
+    with load_agent(folder, "background", worker="thread", max_age=2, deadline_ms=50.0) as agent:
+        assert (agent.scheduler.buffer.max_age, agent.scheduler.planner.deadline_ms) == (2, 50.0)
+        assert agent.act(FRAMES[0]).shape == (2,)
+    assert_refused(lambda: load_agent(folder, "gated", planning_budget=2), "planning_budget", "[0, 1]")
+    assert_refused(lambda: load_agent(folder, "gated", planing_budget=2), "did you mean planning_budget?")
+    assert_refused(lambda: load_agent(folder, "background", worker="fork"), "process, thread")
+    assert_refused(lambda: load_agent(folder, planning_budget=0.1), "'planning_budget'")
 
 
 def test_agents_act_without_lightning_or_a_simulator(folder, run_python):

@@ -56,7 +56,7 @@ def error_line(capsys, *flags, code=2):
     return captured.err
 
 
-@pytest.mark.parametrize("mode", ["planner", "actor", "random"])
+@pytest.mark.parametrize("mode", ["planner", "gated", "background", "actor", "random"])
 def test_results_hold_the_promised_keys(tmp_path, checkpoint, mode):
     result = result_of(tmp_path, checkpoint, "--mode", mode, "--episodes", 2, "--seed", 5)
     promised = {"domain", "task", "mode", "seed", "returns", "mean_return", "ci95", "decision_ms"}
@@ -67,6 +67,13 @@ def test_results_hold_the_promised_keys(tmp_path, checkpoint, mode):
     assert result["mean_return"] == pytest.approx(np.mean(result["returns"]))
     assert result["ci95"][0] <= result["mean_return"] <= result["ci95"][1]
     assert 0 < result["decision_ms"]["p50"] <= result["decision_ms"]["p95"] <= result["decision_ms"]["p99"]
+    sources, fraction = result["action_source"], result["planned_fraction"]
+    assert sources.keys() == {"plan", "tail", "actor"} and sum(sources.values()) == 20
+    assert fraction == (sources["plan"] + sources["tail"]) / 20
+    if mode in ("planner", "actor", "random"):
+        assert sources["plan" if mode == "planner" else "actor"] == 20
+    elif mode == "gated":
+        assert sources["plan"] >= 2 and sources["tail"] == 0  # an episode's first decision is planned
 
 
 def test_the_same_call_gives_the_same_returns(tmp_path, checkpoint):
@@ -90,6 +97,12 @@ def test_planner_settings_replace_those_of_the_checkpoint(tmp_path, checkpoint):
     flags = ("--episodes", 1, "--planner.horizon", 1, "--planner.terminal_value", "false")
     planner = result_of(tmp_path, checkpoint, *flags)["planner"]
     assert (planner["horizon"], planner["terminal_value"], planner["num_samples"]) == (1, False, PLANNER.num_samples)
+
+
+@pytest.mark.parametrize("mode", ["planner", "gated"])
+def test_a_deadline_can_be_given(tmp_path, checkpoint, mode):
+    result = result_of(tmp_path, checkpoint, "--episodes", 1, "--mode", mode, "--planner.deadline_ms", 5)
+    assert result["planner"]["deadline_ms"] == 5.0
 
 
 def test_mean_interval_and_latency_are_printed(capsys, checkpoint):
@@ -137,6 +150,7 @@ def test_evaluate_agent_pairs_agents_by_episode():
         (("--episodes", "0"), ("--episodes", "at least 1", "'0'")),
         (("--episodes", "ten"), ("--episodes", "whole number", "'ten'")),
         (("--seed", "-1"), ("--seed", "at least 0")),
+        (("--planner.deadline_ms", "0"), ("planner.deadline_ms", "above 0")),
         (("--planner.horizon", "long"), ("planner.horizon", "'long'")),
         (("--planner.num_elites", "9"), ("num_elites (9)", "num_samples (8)")),
         (("--mode", "actor", "--planner.horizon", "3"), ("--planner.horizon", "--mode planner")),

@@ -40,9 +40,15 @@ LAYERS = {
     "background": (("config", "models", "planning", "agent"), {"torch", "numpy"}),
     "gate": (("config", "models", "planning", "agent"), {"torch", "numpy"}),
     "rollout": (("config", "envs", "replay", "agent"), {"numpy"}),
+    "latency": (("config",), {"numpy"}),
+    "virtual_clock": (("config", "planning", "latency", "rollout"), {"numpy", "torch"}),
     "checkpoint": (
         ("config", "models", "planning", "agent", "background", "gate"),
         {"torch", "numpy", "safetensors"},
+    ),
+    "timed_rollout": (
+        ("config", "agent", "background", "rollout", "checkpoint", "virtual_clock"),
+        {"numpy"},
     ),
     "training": (
         (*ALL, "compose"),

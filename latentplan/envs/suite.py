@@ -16,9 +16,10 @@ from latentplan.config import EnvConfig, UserError
 from latentplan.envs.gl import explain_gl_errors, require_backend
 from latentplan.envs.quantities import measure, scales, true_values
 from latentplan.envs.render import FrameRenderer
+from latentplan.envs.schedule import control_step, split_schedule
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator
+    from collections.abc import Iterable, Iterator, Sequence
 
     from dm_control.mujoco import Physics
 
@@ -74,6 +75,7 @@ class SuiteEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         record_quantities: Whether `info` of a step tells what was true after each of its control steps: `quantities`,
             float64 (control step, quantity) in the order of `quantity_names`, and `rewards`, float64 (control step,).
         labels: Names of the quantities in `info["labels"]`, and the typical size of each.
+        substeps_per_decision: Steps of the simulator itself per decision, the finest time at which actions change.
     """
 
     metadata = {"render_modes": ["rgb_array"]}
@@ -103,6 +105,7 @@ class SuiteEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         self.record_quantities = False
         self._recorded: list[tuple[np.ndarray, float]] = []
         self.action_repeat = config.action_repeat
+        self.substeps_per_decision = config.action_repeat * self._task_env._n_sub_steps
         frames_per_second = 1.0 / (self._task_env.control_timestep() * config.action_repeat)
         self.metadata = {**SuiteEnv.metadata, "render_fps": frames_per_second}
         self.decisions_per_episode = math.ceil(self._steps_per_episode / config.action_repeat)
@@ -158,12 +161,33 @@ class SuiteEnv(gymnasium.Env[np.ndarray, np.ndarray]):
             ResetNeeded: The episode is over.
             ValueError: The action has another shape or is not finite.
         """
+        return self.step_schedule([(action, self.substeps_per_decision)])
+
+    def step_schedule(
+        self, schedule: Sequence[tuple[np.ndarray, int]]
+    ) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
+        """One decision during which the action changes: each acts for as many of the simulator's substeps.
+
+        Args:
+            schedule: Actions (action,), clipped to [-1, 1], and their substeps, which add up to
+                `substeps_per_decision`.
+
+        Returns:
+            As `step`, whose schedule is a single action.
+
+        Raises:
+            ResetNeeded: The episode is over.
+            ValueError: An action has another shape or is not finite, or the substeps do not add up.
+        """
         if self._needs_reset:
             raise ResetNeeded("the episode is over; call reset() first")
-        control = self._scaled(action)
+        counts = [count for _, count in schedule]
+        if min(counts, default=0) < 1 or sum(counts) != self.substeps_per_decision:
+            raise ValueError(f"substeps must be positive and add up to {self.substeps_per_decision}, got {counts}")
+        controls = [(self._scaled(action), count) for action, count in schedule]
         reward, env_frames, terminated = 0.0, 0, False
-        while env_frames < self.action_repeat and not self._needs_reset:
-            outcome = self._task_env.step(control)
+        for control in split_schedule(controls, self._task_env._n_sub_steps):
+            outcome = control_step(self._task_env, control)
             reward += float(outcome.reward)
             env_frames += 1
             self._record(outcome.reward)
@@ -171,6 +195,8 @@ class SuiteEnv(gymnasium.Env[np.ndarray, np.ndarray]):
             # The suite marks an end of its own with discount 0, and the time limit with discount 1.
             terminated = outcome.last() and outcome.discount == 0.0
             self._needs_reset = outcome.last() or self._steps_left <= 0
+            if self._needs_reset:
+                break
         return self.render(), reward, terminated, self._needs_reset and not terminated, self._info(env_frames)
 
     def render(self) -> np.ndarray:  # type: ignore[override]

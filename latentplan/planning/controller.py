@@ -9,6 +9,7 @@ from typing import Any
 
 import torch
 from torch import Tensor
+from torch.utils._pytree import tree_map
 
 from latentplan.planning.adapters import CEMTrajectoryOptimizer, RolloutController
 from latentplan.planning.cem import CEMPlanner
@@ -69,16 +70,52 @@ class ModelPredictiveController:
         Args:
             state: Where each environment is now, rows (batch,).
         """
+        return self._act(state, self.generator)
+
+    def act_where(self, state: State, where: Tensor) -> Tensor:
+        """The next action where it is asked for; elsewhere somebody else acts, and the plans age by that step.
+
+        Args:
+            state: Where each environment is now, rows (batch,).
+            where: Environments to decide for, (batch,) bool.
+
+        Returns:
+            Actions of the environments in `where`, in order: (chosen, action).
+
+        Raises:
+            ValueError: There is no environment in `where`.
+        """
+        where = where.to("cpu", torch.bool)
+        rows = where.nonzero().squeeze(1)
+        if len(rows) == 0:
+            raise ValueError("act_where() needs at least one environment; skip() lets others act everywhere")
+        whole = None if self.plan is None or len(self.plan.is_warm) != len(where) else self.plan.aged()
+        self.plan = None if whole is None or self.plan is None else self.plan.take(rows)
+        generator = self.generator
+        if not (generator is None or isinstance(generator, torch.Generator)):
+            generator = [generator[row] for row in rows.tolist()]
+        action = self._act(tree_map(lambda leaf: leaf[rows.to(leaf.device)], state), generator)
+        assert self.plan is not None
+        spread = self.plan.spread(where)
+        self.plan = spread if whole is None else whole.updated(where, spread)
+        return action
+
+    def skip(self) -> None:
+        """Notes that somebody else acted in every environment: the plan ages by that step."""
+        if self.plan is not None:
+            self.plan = self.plan.aged()
+
+    def _act(self, state: State, generator: Generators) -> Tensor:
         started = time.perf_counter()
         if self.plan is None or self.plan.mean.shape[0] != count_rows(state):
-            self.plan = self._search(state, None)
+            self.plan = self._search(state, None, generator)
             is_due = torch.ones(count_rows(state), dtype=torch.bool)
         else:
             is_due = ~self.plan.is_warm | (self.plan.elapsed >= self.replan_every) | self._is_stale
             if bool(is_due.all()):
-                self.plan = self._search(state, self.plan)
+                self.plan = self._search(state, self.plan, generator)
             elif bool(is_due.any()):
-                self.plan = self.plan.updated(is_due, self._search(state, self.plan))
+                self.plan = self.plan.updated(is_due, self._search(state, self.plan, generator))
         self._is_stale = False
         action = self.plan.actions[torch.arange(len(is_due)), self.plan.elapsed]
         self.plan = self.plan.executed(self.plan.elapsed + 1)
@@ -122,13 +159,13 @@ class ModelPredictiveController:
         p50, p95, p99 = torch.quantile(times, torch.tensor([0.5, 0.95, 0.99], dtype=torch.float64)).tolist()
         return {"mean_ms": float(times.mean()), "p50_ms": p50, "p95_ms": p95, "p99_ms": p99}
 
-    def _search(self, state: State, previous: Plan | None) -> Plan:
+    def _search(self, state: State, previous: Plan | None, generator: Generators) -> Plan:
         plan = self.planner.plan(
             self.model,
             state,
             previous,
             objective=self.objective,
             constraints=self.constraints,
-            generator=self.generator,
+            generator=generator,
         )
         return plan.executed(torch.zeros_like(plan.elapsed))

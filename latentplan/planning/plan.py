@@ -49,6 +49,25 @@ class Plan:
         """The same plan, `elapsed` (batch,) of whose actions have been executed."""
         return replace(self, elapsed=elapsed)
 
+    def aged(self) -> Plan:
+        """The same plan one step later, in which somebody else acted; where it has run out the next search is cold."""
+        elapsed = self.elapsed + 1
+        return replace(self, elapsed=elapsed).forget(elapsed >= self.mean.shape[1])
+
+    def take(self, rows: Tensor) -> Plan:
+        """The plans of some environments, rows (chosen,) int; one may be taken more than once."""
+
+        def pick(value: Any) -> Any:
+            return value[rows.to(value.device)] if isinstance(value, Tensor) else value
+
+        fields = ("actions", "mean", "var", "expected_return", "elites", "is_warm", "elapsed")
+        info = {name: pick(value) for name, value in self.info.items()}
+        return Plan(info=info, **{name: pick(getattr(self, name)) for name in fields})
+
+    def spread(self, mask: Tensor) -> Plan:
+        """These plans as those of the environments in mask (batch,) bool, in order; the others' are cold copies."""
+        return self.take((mask.cumsum(0) - 1).clamp_min(0)).forget(~mask)
+
     def updated(self, mask: Tensor, new: Plan) -> Plan:
         """This plan, with the environments in mask (batch,) bool taken from a newer one."""
 

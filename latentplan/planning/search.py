@@ -120,7 +120,7 @@ class Search:
         if self.scorer.constraints:
             info["violation"] = torch.full_like(progress.expected_return, float("nan"))
         ones = torch.ones(self.batch, dtype=torch.long)
-        return Plan(last.mean, last.mean, last.var, progress.expected_return, info, None, last.is_warm, ones)
+        return Plan(last.mean, last.mean, last.var, progress.expected_return, info, last.elites, last.is_warm, ones)
 
     def _iterate(self, start: WarmStart, proposals: Tensor | None) -> tuple[Progress, list[tuple[Tensor, Tensor]], str]:
         """The refits; after each, the elites' mean return and the mean sampling std, both (batch,); what ended them."""

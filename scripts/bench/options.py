@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -35,6 +36,22 @@ def whole_number(flags: Flags, name: str, default: int, least: int = 1) -> int:
     if not text.isascii() or not text.isdigit() or int(text) < least:
         raise UserError(f"{name} must be a whole number of at least {least}, got {text!r}")
     return int(text)
+
+
+def positive_number(flags: Flags, name: str, default: float) -> float:
+    """The number above 0 that a flag gives.
+
+    Raises:
+        UserError: It is none.
+    """
+    text = flags.get(name, str(default))
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not 0.0 < value < math.inf:
+        raise UserError(f"{name} must be a number above 0, got {text!r}")
+    return value
 
 
 def choice(flags: Flags, name: str, default: str, allowed: Sequence[str]) -> str:

@@ -108,3 +108,49 @@ def test_latency_is_measured(states, make_controller):
 def test_more_steps_per_plan_than_it_has_are_refused(make_controller):
     with pytest.raises(ValueError, match=r"replan_every \(7\)"):
         make_controller(replan_every=7)
+
+
+def test_deciding_for_some_environments_leaves_the_others_plans_to_age(states, make_controller):
+    controller, reference = make_controller(), make_controller()
+    reference.act(states)
+    controller.act(states)
+    before = controller.plan
+    where = torch.tensor([0, 1, 0, 1, 1]).bool()
+    action = controller.act_where(states + 0.1, where)
+    torch.testing.assert_close(action, reference.act(states + 0.1)[where], atol=1e-5, rtol=0)
+    assert controller.plan.elapsed.tolist() == [2, 1, 2, 1, 1]
+    assert torch.equal(controller.plan.actions[~where], before.actions[~where])
+
+
+def test_the_warm_start_skips_what_others_did(states, make_controller):
+    controller = make_controller()
+    controller.act(states)
+    last = controller.plan
+    frozen = make_controller(init_std=0.0, num_iterations=1)
+    frozen.plan = last
+    for _ in range(2):
+        frozen.skip()
+    frozen.act(states)
+    torch.testing.assert_close(frozen.plan.mean[:, :3], last.actions[:, 3:])
+
+
+def test_a_plan_that_has_run_out_is_no_warm_start(states, make_controller):
+    controller = make_controller(num_iterations=4, warm_start_iterations=1)
+    controller.skip()  # nothing to age yet
+    controller.act(states)
+    for _ in range(4):
+        controller.skip()
+    assert controller.plan.is_warm.all()
+    controller.act_where(states, torch.tensor([1, 0, 0, 0, 0]).bool())  # the others' plans of 6 steps run out
+    assert controller.plan.is_warm.tolist() == [True, False, False, False, False]
+    controller.act(states)
+    assert controller.plan.info["iterations"].tolist() == [1, 4, 4, 4, 4]
+
+
+def test_deciding_for_some_first_leaves_the_others_cold(states, make_controller, seeded):
+    controller = make_controller(num_iterations=4, warm_start_iterations=1)
+    controller.generator = [seeded(seed) for seed in range(5)]
+    controller.act_where(states, torch.tensor([0, 0, 1, 0, 0]).bool())
+    assert controller.plan.is_warm.tolist() == [False, False, True, False, False]
+    with pytest.raises(ValueError, match="at least one"):
+        controller.act_where(states, torch.zeros(5))

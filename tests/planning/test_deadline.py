@@ -275,15 +275,15 @@ def test_the_settings_hold_the_deadline():
 
 def test_a_slow_model_keeps_a_real_deadline(state):
     def dynamics(state, action):
-        time.sleep(0.003)
+        time.sleep(0.02)
         return state + 0.3 * action
 
     model = FunctionModel(dynamics, lambda state, action: -state.square().sum(dim=1))
-    planner = CEMPlanner(action_dim=2, horizon=HORIZON, num_samples=16, num_elites=4, num_iterations=20)
-    planner.plan(model, state)  # an iteration sleeps 12 ms, all of them 240 ms
+    planner = CEMPlanner(action_dim=2, horizon=HORIZON, num_samples=16, num_elites=4, num_iterations=12)
+    planner.plan(model, state)  # an iteration sleeps 80 ms, all of them 960 ms
     started = time.perf_counter()
-    plan = planner.plan(model, state, deadline_ms=120)
+    plan = planner.plan(model, state, deadline_ms=400)
     spent_ms = 1000 * (time.perf_counter() - started)
     assert plan.info["stopped"] == "deadline"
-    assert 2 <= int(plan.info["iterations"][0]) <= 10
-    assert spent_ms < 200  # one iteration of a busy machine beyond
+    assert 1 <= int(plan.info["iterations"][0]) <= 5
+    assert spent_ms < 800  # what a busy machine adds stays below what all iterations sleep

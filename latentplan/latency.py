@@ -1,0 +1,120 @@
+"""How long thoughts take: as measured here, or drawn from a distribution that was given."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from latentplan.config import UserError, derive_seed
+
+MEASURED = "measured"
+_FORMATS = 'a JSON list of milliseconds, {"decision_ms": [...]}, or one number per line'
+
+_LONGEST_MS = 1e9  # eleven days
+
+Milliseconds = NDArray[np.float64]
+Charge = Callable[[float], float]  # what a thought that took so many milliseconds is charged
+
+
+@dataclass(frozen=True)
+class Latency:
+    """The durations that the virtual clock charges.
+
+    Attributes:
+        name: `measured`, or the file that the durations came from.
+        decision_ms: Of decisions, (duration,); None charges what was measured.
+        plan_ms: Of plans that are made beside the decisions, (duration,); None charges what was measured.
+    """
+
+    name: str = MEASURED
+    decision_ms: Milliseconds | None = None
+    plan_ms: Milliseconds | None = None
+
+    @property
+    def is_replayed(self) -> bool:
+        """Whether durations are drawn, so that results repeat exactly."""
+        return self.decision_ms is not None
+
+    def charges(self, seed: int) -> tuple[Charge, Charge]:
+        """What decisions and plans are charged in an episode: two streams that depend on its seed alone."""
+        return _charge(self.decision_ms, derive_seed(seed, "decision_ms")), _charge(
+            self.plan_ms, derive_seed(seed, "plan_ms")
+        )
+
+
+def read_clock_flags(flags: Mapping[str, str]) -> tuple[float | None, Latency]:
+    """What `--control-hz` and `--latency` ask for; a rate of None is a world that waits.
+
+    Raises:
+        UserError: The rate is no number above 0, the latency cannot be read, or it is given without a rate.
+    """
+    if "--control-hz" not in flags:
+        if "--latency" in flags:
+            raise UserError("--latency has no effect in a world that waits; give --control-hz too")
+        return None, Latency()
+    text = flags["--control-hz"]
+    try:
+        control_hz = float(text)
+    except ValueError:
+        control_hz = math.nan
+    if not 0.0 < control_hz < math.inf:
+        raise UserError(f"--control-hz must be a number above 0, got {text!r}")
+    return control_hz, read_latency(flags.get("--latency", MEASURED))
+
+
+def read_latency(text: str) -> Latency:
+    """The durations that `--latency` names: `measured`, or a file of milliseconds.
+
+    A file without `plan_ms` gives its `decision_ms` to the plans too.
+
+    Raises:
+        UserError: The file cannot be read, or holds no durations.
+    """
+    if text == MEASURED:
+        return Latency()
+    try:
+        content = _parsed(Path(text).read_text())
+    except OSError as error:
+        raise UserError(f"--latency {text}: {error.strerror}; give {MEASURED!r} or a file of milliseconds") from None
+    except ValueError:
+        raise UserError(f"--latency {text}: not a file of milliseconds; write {_FORMATS}") from None
+    durations = content if isinstance(content, dict) else {"decision_ms": content}
+    unknown = [name for name in durations if name not in ("decision_ms", "plan_ms")]
+    if unknown or "decision_ms" not in durations:
+        raise UserError(f"--latency {text}: the keys are decision_ms and, if plans differ, plan_ms; got {unknown}")
+    decision_ms = _checked(text, "decision_ms", durations["decision_ms"])
+    plan_ms = _checked(text, "plan_ms", durations["plan_ms"]) if "plan_ms" in durations else decision_ms
+    return Latency(text, decision_ms, plan_ms)
+
+
+def _charge(durations: Milliseconds | None, seed: int) -> Charge:
+    if durations is None:
+        return lambda measured_ms: measured_ms
+    rng, known = np.random.default_rng(seed), durations
+    return lambda measured_ms: float(rng.choice(known))
+
+
+def _parsed(text: str) -> Any:
+    """JSON, else one number per line."""
+    try:
+        content = json.loads(text)
+    except json.JSONDecodeError:
+        return [float(line) for line in text.splitlines() if line.strip()]
+    return content if isinstance(content, list | dict) else [content]
+
+
+def _checked(text: str, name: str, values: Any) -> Milliseconds:
+    if not isinstance(values, list) or not values:
+        raise UserError(f"--latency {text}: {name} must be a list of at least one number; write {_FORMATS}")
+    for value in values:
+        is_number = isinstance(value, int | float) and not isinstance(value, bool)
+        if not is_number or not 0 <= value <= _LONGEST_MS:  # NaN is in no interval
+            raise UserError(f"--latency {text}: {name} must lie in 0 to {_LONGEST_MS:g}, got {value!r}")
+    return np.asarray(values, dtype=np.float64)

@@ -1,0 +1,225 @@
+"""`benchmark.py soak`: deadlines missed on the wall clock, beside those that the machine itself misses."""
+
+from __future__ import annotations
+
+import contextlib
+import math
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from bench.options import DEVICE_FLAGS, Flags, choose_device, output_path, positive_number, whole_number, words
+from bench.report import format_table, number, write_json
+from latentplan.compose import raise_unknown
+from latentplan.config import UserError
+
+if TYPE_CHECKING:
+    import numpy as np
+
+    from latentplan.rollout import Agent
+
+MODES = ("actor", "gated", "background", "planner")
+IDLE = "no-op"
+FLAGS = {
+    "--checkpoint": ("DIR", "trained agent, or run (its best checkpoint)"),
+    "--mode": ("M,M", f"any of {','.join(MODES)} (actor,gated,background); an agent that does nothing joins them"),
+    "--control-hz": ("F", "decisions per second (50)"),
+    "--decisions": ("N", "decisions that are due, of each agent (10000)"),
+    "--block": ("N", "decisions of one agent before the next takes over (250)"),
+    **DEVICE_FLAGS,
+    "--json": ("FILE", "result as JSON"),
+}
+SETTINGS = ()
+NUM_FRAMES = 250
+WARM_UP_DECISIONS = 5
+PAUSE_SECONDS = 0.2  # between blocks, so that what one agent still searches does not disturb the next
+
+
+@dataclass
+class Tally:
+    """What one agent did.
+
+    Attributes:
+        due: Boundaries at which a decision was due.
+        misses: Those at which the agent was still busy with an earlier one.
+        decision_ms: From a frame in memory to an action.
+        wake_ms: From a boundary to the loop's awakening, which is the machine's doing.
+    """
+
+    due: int = 0
+    misses: int = 0
+    decision_ms: list[float] = field(default_factory=list)
+    wake_ms: list[float] = field(default_factory=list)
+
+
+class IdleAgent:
+    """Decides nothing, so that what it misses is what the machine misses."""
+
+    def act(self, frame: np.ndarray) -> None:
+        """Nothing."""
+
+    def reset(self) -> None:
+        """Nothing to forget."""
+
+
+def run(flags: Flags) -> int:
+    """Let the agents take turns in real time, and count what each misses."""
+    if "--checkpoint" not in flags:
+        raise UserError("flag --checkpoint is missing; give the folder of a trained agent or of a run")
+    modes = words(flags, "--mode", "actor,gated,background")
+    for mode in modes:
+        if mode not in MODES:
+            raise_unknown("mode", mode, MODES)
+    control_hz = positive_number(flags, "--control-hz", 50.0)
+    decisions, block = whole_number(flags, "--decisions", 10_000), whole_number(flags, "--block", 250)
+    json_path, device = output_path(flags, "--json"), choose_device(flags)
+    from bench.machine import describe_machine
+
+    about = {
+        "checkpoint": flags["--checkpoint"],
+        "control_hz": control_hz,
+        "block": block,
+        "machine": describe_machine(device),
+    }
+    frames = _record_frames(Path(flags["--checkpoint"]), str(device))
+    seconds = decisions / control_hz * (len(modes) + 1)
+    print(f"{', '.join([IDLE, *modes])} at {control_hz:g} Hz in turns, {seconds:.0f} s in all", flush=True)
+    tallies = {name: Tally() for name in (IDLE, *modes)}
+    code = 0
+    with _loaded_agents(flags["--checkpoint"], modes, str(device)) as agents:
+        try:
+            take_turns(agents, frames, control_hz, decisions, block, tallies)
+        except KeyboardInterrupt:
+            code = 130
+            print("\ninterrupted", flush=True)
+    rows = soak_rows(tallies)
+    print(soak_table(rows))
+    write_json(json_path, {**about, "agents": rows})
+    return code
+
+
+def take_turns(
+    agents: Mapping[str, Any],
+    frames: Sequence[np.ndarray],
+    control_hz: float,
+    decisions: int,
+    block: int,
+    tallies: Mapping[str, Tally],
+) -> None:
+    """Plays blocks of every agent in turn, so that the machine's noise meets them all.
+
+    Args:
+        agents: By name.
+        frames: uint8 (64, 64, 3) each, shown again and again.
+        control_hz: Decisions per second.
+        decisions: That are due of each agent.
+        block: Decisions of one agent before the next takes over.
+        tallies: By name; filled.
+    """
+    for first in range(0, decisions, block):
+        for name, agent in agents.items():
+            agent.reset()
+            for frame in frames[:WARM_UP_DECISIONS]:
+                agent.act(frame)
+            play_block(agent, frames, control_hz, min(block, decisions - first), tallies[name])
+            time.sleep(PAUSE_SECONDS)
+
+
+def play_block(
+    agent: Agent | IdleAgent, frames: Sequence[np.ndarray], control_hz: float, due: int, tally: Tally
+) -> None:
+    """Decides at the boundaries of the wall clock; one that passes while the agent is busy is missed."""
+    period = 1.0 / control_hz
+    began = time.perf_counter() + period
+    boundary = 0
+    while boundary < due:
+        time.sleep(max(0.0, began + boundary * period - time.perf_counter()))
+        woken = time.perf_counter()
+        agent.act(frames[boundary % len(frames)])
+        finished = time.perf_counter()
+        following = min(max(boundary + 1, math.ceil((finished - began) * control_hz)), due)
+        tally.misses += following - boundary - 1
+        tally.wake_ms.append(1000.0 * (woken - began - boundary * period))
+        tally.decision_ms.append(1000.0 * (finished - woken))
+        boundary = following
+    tally.due += due
+
+
+def soak_rows(tallies: Mapping[str, Tally]) -> dict[str, dict[str, Any]]:
+    """What each agent did, as plain values; agents that had no turn are left out."""
+    import numpy as np
+
+    from latentplan.rollout import latency_percentiles
+
+    played = {name: tally for name, tally in tallies.items() if tally.due}
+    idle = played[IDLE].misses / played[IDLE].due if IDLE in played else math.nan
+    return {
+        name: {
+            "decisions_due": tally.due,
+            "deadline_misses": tally.misses,
+            "misses_per_10000": 1e4 * tally.misses / tally.due,
+            "minus_no_op": 1e4 * (tally.misses / tally.due - idle),
+            "decision_ms": {
+                **latency_percentiles(np.asarray(tally.decision_ms)),
+                "max": max(tally.decision_ms),
+            },
+            "wake_ms": {**latency_percentiles(np.asarray(tally.wake_ms)), "max": max(tally.wake_ms)},
+        }
+        for name, tally in played.items()
+    }
+
+
+def soak_table(rows: Mapping[str, dict[str, Any]]) -> str:
+    """The agents for people."""
+    header = ["agent", "due", "missed", "per 10,000", "minus no-op", "ms p50", "p99", "max", "wake p99"]
+    lines = [
+        [
+            name,
+            f"{row['decisions_due']:,}",
+            f"{row['deadline_misses']:,}",
+            number(row["misses_per_10000"]),
+            "-" if name == IDLE else number(row["minus_no_op"], sign=True),
+            *(number(row["decision_ms"][key], 2) for key in ("p50", "p99", "max")),
+            number(row["wake_ms"]["p99"], 2),
+        ]
+        for name, row in rows.items()
+    ]
+    return format_table(header, lines)
+
+
+def _record_frames(checkpoint: Path, device: str) -> list[np.ndarray]:
+    """What the actor sees in an episode, held in memory."""
+    from latentplan.checkpoint import load_agent, load_model
+    from latentplan.envs import make_env
+
+    _, config, _ = load_model(checkpoint)
+    agent = load_agent(checkpoint, mode="actor", device=device)
+    env = make_env(config.env)
+    try:
+        frame, _ = env.reset(seed=0)
+        frames, over = [frame], False
+        while len(frames) < NUM_FRAMES and not over:
+            frame, _, terminated, truncated, _ = env.step(agent.act(frame))
+            frames.append(frame)
+            over = terminated or truncated
+        return frames
+    finally:
+        env.close()
+
+
+@contextlib.contextmanager
+def _loaded_agents(checkpoint: str, modes: Sequence[str], device: str) -> Any:
+    """The agents by name, ready to act."""
+    from latentplan.background import BackgroundAgent
+    from latentplan.checkpoint import load_agent
+
+    with contextlib.ExitStack() as stack:
+        agents: dict[str, Any] = {IDLE: IdleAgent()}
+        for mode in modes:
+            agent: Any = load_agent(checkpoint, mode=mode, device=device)
+            if isinstance(agent, BackgroundAgent):
+                stack.enter_context(agent).wait_until_ready()
+            agents[mode] = agent
+        yield agents

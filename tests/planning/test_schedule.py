@@ -1,0 +1,238 @@
+"""Which action a tick takes, and what is asked for: no clock, no process, ticks only."""
+
+import pytest
+import torch
+
+from latentplan.planning import CEMPlanner, FunctionModel, PlanBuffer, PlanScheduler
+
+HORIZON = 4
+
+
+def plan_of(value, horizon=HORIZON):
+    """Actions (1, horizon, 1) that tell their plan and index: value.0, value.1, ..."""
+    return (value + 0.1 * torch.arange(horizon))[None, :, None]
+
+
+def chosen(buffer, tick):
+    action, source, age = buffer.choose(tick)
+    return None if action is None else (round(action.item(), 4), source, age)
+
+
+def test_a_tick_takes_the_action_of_its_age():
+    buffer = PlanBuffer(fresh_ticks=1)
+    buffer.submit(plan_of(1.0), 10)
+    expected = [(1.0, "plan", 0), (1.1, "plan", 1), (1.2, "tail", 2), (1.3, "tail", 3), None]
+    assert [chosen(buffer, tick) for tick in range(10, 15)] == expected
+    assert buffer.choose(15) == (None, None, None)
+
+
+def test_plans_are_dropped_by_age():
+    buffer = PlanBuffer(max_age=2, fresh_ticks=0)
+    buffer.submit(plan_of(1.0), 10)
+    assert [chosen(buffer, tick) for tick in (10, 12, 13)] == [(1.0, "plan", 0), (1.2, "tail", 2), None]
+
+
+def test_a_late_plan_is_used_from_the_action_that_the_tick_has_reached():
+    buffer = PlanBuffer()
+    buffer.submit(plan_of(1.0), 10)
+    assert chosen(buffer, 12) == (1.2, "tail", 2)
+
+
+def test_a_plan_that_is_not_due_waits_while_the_last_one_goes_on():
+    buffer = PlanBuffer()
+    buffer.submit(plan_of(1.0), 10)
+    buffer.submit(plan_of(2.0), 12)
+    assert [chosen(buffer, tick)[0] for tick in (10, 11, 12, 13)] == [1.0, 1.1, 2.0, 2.1]
+    buffer.submit(plan_of(3.0), 20)
+    assert chosen(buffer, 16) is None and chosen(buffer, 20) == (3.0, "plan", 0)
+
+
+def test_an_older_plan_never_replaces_a_newer_one():
+    buffer = PlanBuffer()
+    buffer.submit(plan_of(2.0), 12)
+    buffer.submit(plan_of(1.0), 11)
+    assert chosen(buffer, 11) is None and chosen(buffer, 12)[0] == 2.0
+    buffer.submit(plan_of(3.0), 12)  # another for the same tick is newer
+    assert chosen(buffer, 12)[0] == 3.0
+
+
+def test_looking_ahead_drops_nothing():
+    buffer = PlanBuffer()
+    buffer.submit(plan_of(1.0), 10)
+    buffer.submit(plan_of(2.0), 12)
+    assert [None if buffer.peek(tick) is None else round(buffer.peek(tick).item(), 4) for tick in (9, 11, 13, 16)] == [
+        *(None, 1.1, 2.1, None)
+    ]
+    assert chosen(buffer, 10)[0] == 1.0
+    assert buffer.remaining(11).shape == (1, 3, 1) and buffer.remaining(16) is None
+    buffer.clear()
+    assert chosen(buffer, 12) is None
+
+
+@pytest.mark.parametrize("name", ["max_age", "fresh_ticks"])
+def test_negative_ages_are_refused(name):
+    with pytest.raises(ValueError, match=name):
+        PlanBuffer(**{name: -1})
+
+
+class VirtualExecutor:
+    """Computes a plan when it is asked for, and gives it when the virtual time has come."""
+
+    def __init__(self, planner, model, durations):
+        self.planner, self.model, self.durations = planner, model, iter(durations)
+        self.now, self.requests, self.work = 0.0, [], None
+
+    @property
+    def is_idle(self):
+        return self.work is None
+
+    def request(self, state, tick, previous=None, seed=None):
+        self.requests.append((state, tick, previous, seed))
+        generator = None if seed is None else torch.Generator().manual_seed(seed)
+        plan = self.planner.plan(self.model, state, previous, generator=generator)
+        self.work = (self.now + next(self.durations), tick, plan)
+        return True
+
+    def poll(self):
+        if self.work is None or self.work[0] > self.now:
+            return None
+        (_, tick, plan), self.work = self.work, None
+        if isinstance(plan, Exception):
+            raise plan
+        return tick, plan
+
+
+def dynamics(state, action):
+    return state + action
+
+
+def reward(state, action):
+    return -(state + action).square().sum(dim=1)
+
+
+def policy(state, generator):
+    return torch.full((len(state), 1), 0.05)
+
+
+@pytest.fixture
+def model():
+    return FunctionModel(dynamics, reward, policy=policy)
+
+
+def make(model, durations, **options):
+    planner = CEMPlanner(
+        action_dim=1, horizon=HORIZON, num_samples=32, num_elites=4, num_iterations=3, warm_start_iterations=1
+    )
+    executor = VirtualExecutor(planner, model, durations)
+    return PlanScheduler(planner, model, executor, generator=torch.Generator().manual_seed(0), **options), executor
+
+
+def drive(scheduler, executor, ticks, start=2.0):
+    """Decisions one unit of virtual time apart, in a world that is as modelled; and where each was made."""
+    state, decisions, states = torch.tensor([[start]]), [], []
+    for _ in range(ticks):
+        states.append(state)
+        decisions.append(scheduler.decide(state))
+        state = dynamics(state, decisions[-1].action)
+        executor.now += 1.0
+    return decisions, states
+
+
+def test_plans_are_made_for_the_state_of_their_tick(model):
+    """In a world as modelled the state that a plan starts from is the one that its tick finds."""
+    scheduler, executor = make(model, [2.5] * 100)
+    _, states = drive(scheduler, executor, 30)
+    asked = [(state, tick) for state, tick, _, _ in executor.requests if 6 < tick < 30]
+    assert len(asked) >= 7
+    for state, tick in asked:
+        torch.testing.assert_close(state, states[tick])
+
+
+def test_the_latency_is_counted_in_ticks_and_the_first_left_out(model):
+    scheduler, executor = make(model, [3.5, *[1.5] * 100])
+    drive(scheduler, executor, 5)
+    assert scheduler.latency_ticks == 1
+    decisions, _ = drive(scheduler, executor, 25)
+    assert scheduler.latency_ticks == scheduler.buffer.fresh_ticks == 2
+    assert {(decision.source, decision.age) for decision in decisions[-10:]} == {("plan", 0), ("plan", 1)}
+
+
+def test_the_expected_latency_is_no_more_than_a_plan_is_long(model):
+    scheduler, executor = make(model, [1.0, *[50.0] * 10])
+    drive(scheduler, executor, 200)
+    assert scheduler.latency_ticks == HORIZON
+
+
+def test_a_jittering_latency_leaves_no_tick_without_a_plan(model):
+    scheduler, executor = make(model, [(0.4, 1.6, 1.2, 0.9, 2.3)[index % 5] for index in range(100)])
+    decisions, _ = drive(scheduler, executor, 60)
+    assert all(decision.source in ("plan", "tail") for decision in decisions[8:])
+    assert all(decision.action.abs() <= 1.0 for decision in decisions)
+
+
+def test_a_plan_that_does_not_come_gives_way_to_the_tail_and_then_to_the_actor(model):
+    scheduler, executor = make(model, [0.5] * 5 + [1e9])
+    decisions, _ = drive(scheduler, executor, 16)
+    sources = [decision.source for decision in decisions]
+    assert sources[0] == "actor" and sources[1:6] == ["plan"] * 5
+    assert sources[6:9] == ["plan", "tail", "tail"]  # ages 1 to 3 of the last plan that came
+    assert sources[9:] == ["actor"] * 7
+    assert all(decision.action == 0.05 and decision.age is None for decision in decisions[9:])
+
+
+def test_each_search_starts_from_the_last_plan_shifted_to_its_tick(model):
+    scheduler, executor = make(model, [1.5] * 100)
+    drive(scheduler, executor, 20)
+    assert executor.requests[0][2] is None
+    for (_, before, _, _), (_, tick, previous, _) in zip(executor.requests[3:], executor.requests[4:], strict=False):
+        assert previous.elapsed.tolist() == [tick - before]
+    late, executor = make(model, [8.0] * 100)
+    drive(late, executor, 40)
+    assert all(previous is None for _, _, previous, _ in executor.requests)  # nothing of the last plan is left
+
+
+def test_requests_are_for_rising_ticks_and_have_seeds_of_their_own(model):
+    scheduler, executor = make(model, [(0.2, 2.5)[index % 2] for index in range(100)])
+    drive(scheduler, executor, 60)
+    ticks, seeds = [request[1] for request in executor.requests], [request[3] for request in executor.requests]
+    assert all(left < right for left, right in zip(ticks, ticks[1:], strict=False))
+    assert len(set(seeds)) == len(seeds)
+
+
+def test_a_reset_forgets_the_plan_in_work_too(model):
+    scheduler, executor = make(model, [2.5] * 100)
+    drive(scheduler, executor, 10)
+    assert not executor.is_idle
+    due = executor.requests[-1][1]
+    scheduler.reset()
+    decisions, _ = drive(scheduler, executor, 4)
+    assert [decision.source for decision in decisions[:3]] == ["actor"] * 3
+    after = [request for request in executor.requests if request[1] > due]
+    assert after[0][2] is None  # the next search starts cold
+    decisions, _ = drive(scheduler, executor, 10)
+    assert decisions[-1].source == "plan"
+
+
+def test_without_a_policy_zeros_within_the_bounds_stand_in():
+    planner = CEMPlanner(action_dim=1, horizon=HORIZON, action_low=0.2)
+    model = FunctionModel(dynamics, reward)
+    scheduler = PlanScheduler(planner, model, VirtualExecutor(planner, model, [1e9]))
+    assert scheduler.decide(torch.zeros(2, 1)).action.tolist() == [[pytest.approx(0.2)]] * 2
+
+
+def test_a_failure_surfaces_once_and_the_loop_goes_on(model):
+    scheduler, executor = make(model, [0.5] * 100)
+    drive(scheduler, executor, 4)
+    scheduler.executor.work = (executor.now, 4, KeyError("broken"))
+    with pytest.raises(KeyError, match="broken"):
+        scheduler.decide(torch.zeros(1, 1))
+    decisions, _ = drive(scheduler, executor, 5)
+    assert decisions[-1].source == "plan"
+
+
+def test_equal_streams_and_durations_give_equal_decisions(model):
+    runs = []
+    for _ in range(2):
+        scheduler, executor = make(model, [1.3] * 100)
+        runs.append(torch.cat([decision.action for decision in drive(scheduler, executor, 20)[0]]))
+    assert torch.equal(*runs)
