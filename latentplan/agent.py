@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from latentplan.config import Config, PlannerConfig
-from latentplan.models import State, WorldModel
+from latentplan.models import State, WorldModel, reflex
 from latentplan.models.heads import sample_action
 from latentplan.planning import CEMPlanner, ModelPredictiveController
 
@@ -32,6 +32,7 @@ class ModelAgent:
         self.state: State | None = None
         self._action: Tensor | None = None
         self._forget: Tensor | None = None
+        self._weights = reflex.lay_out(model)
         self.seed(seed)
 
     def seed(self, seed: int) -> None:
@@ -80,15 +81,17 @@ class ModelAgent:
         raise AssertionError("an agent defines how it chooses")
 
     def _believe(self, frames: Tensor) -> State:
+        if self.state is None or self.model.device.type != "cpu":  # elsewhere the weights do not follow the model's
+            self._weights = reflex.lay_out(self.model)
         if self.state is None or self._action is None:
-            return self.model.see(self.model.dynamics.initial(len(frames)).deter, frames)
+            return reflex.see(self._weights, self.model.dynamics.initial(len(frames)).deter, frames)
         if len(self.state.deter) != len(frames):
             raise ValueError(f"got {len(frames)} frames after {len(self.state.deter)}: call reset() between batches")
-        deter = self.model.dynamics.advance(self.state, self._action)
+        deter = reflex.advance(self._weights, self.state, self._action)
         if self._forget is not None:
             deter = torch.where(self._forget[:, None], 0.0, deter)
             self._forget = None
-        return self.model.see(deter, frames)
+        return reflex.see(self._weights, deter, frames)
 
     def _check(self, frames: np.ndarray) -> Tensor:
         if frames.dtype != np.uint8 or frames.shape[1:] != (64, 64, 3):
@@ -156,8 +159,17 @@ class ActorAgent(ModelAgent):
         super().__init__(model, config, seed=seed)
         self.explore = explore
 
+    @torch.inference_mode()
+    def act(self, frame: np.ndarray) -> np.ndarray:
+        """The action in [-1, 1], float32 (action,) or (batch, action), for uint8 frame(s).
+
+        Raises:
+            ValueError: The frame has another shape or dtype, or the batch changed without a reset.
+        """
+        return super().act(frame)
+
     def _choose(self, state: State) -> Tensor:
-        mean, std = self.model.actor(state.features)
+        mean, std = reflex.act(self._weights, state)
         if not self.explore:
             return mean
         noise = torch.randn(mean.shape, generator=self.generator, device=mean.device)

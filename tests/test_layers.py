@@ -23,6 +23,7 @@ LAYERS = {
     "agent": (("config", "models", "planning"), {"torch", "numpy", "einops"}),
     "rollout": (("config", "envs", "replay", "agent"), {"numpy"}),
     "checkpoint": (("config", "models", "planning", "agent"), {"torch", "numpy", "safetensors"}),
+    "export": (("config", "models", "agent", "checkpoint"), {"torch"}),
     "training": (
         (*ALL, "compose"),
         {"lightning", "torch", "numpy", "einops", "rich", "tensorboard", "gymnasium", "yaml"},
@@ -31,6 +32,7 @@ LAYERS = {
     "cli": None,
     "doctor": None,
     "evaluate": None,
+    "distill": None,
     "__init__": None,
     "__main__": None,
 }

@@ -86,9 +86,14 @@ class Actor(nn.Module):
 
     def forward(self, features: Tensor) -> tuple[Tensor, Tensor]:
         """Mean and std of the action, float32 (..., action) each, for features (..., in)."""
-        mean, raw_std = self.mlp(features).chunk(2, -1)
-        std = (MAX_ACTION_STD - MIN_ACTION_STD) * torch.sigmoid(raw_std + 2.0) + MIN_ACTION_STD
-        return torch.tanh(mean), std
+        return action_distribution(self.mlp(features))
+
+
+def action_distribution(raw: Tensor) -> tuple[Tensor, Tensor]:
+    """Mean in [-1, 1] and std in [0.1, 1] of the action, (..., action) each, for the actor's output (..., 2 action)."""
+    mean, raw_std = raw.chunk(2, -1)
+    std = (MAX_ACTION_STD - MIN_ACTION_STD) * torch.sigmoid(raw_std + 2.0) + MIN_ACTION_STD
+    return torch.tanh(mean), std
 
 
 def sample_action(mean: Tensor, std: Tensor, noise: Tensor) -> Tensor:
