@@ -11,11 +11,13 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from latentplan.config.checks import UserError, above_zero, at_least, derive_seed, one_of, within
+from latentplan.config.distill import DistillConfig
 from latentplan.config.planner import PlannerConfig
 
 __all__ = [
     "Config",
     "CollectionConfig",
+    "DistillConfig",
     "EnvConfig",
     "EvaluationConfig",
     "LearningConfig",

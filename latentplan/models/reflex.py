@@ -60,7 +60,7 @@ def lay_out(model: WorldModel) -> Reflex:
     """The weights of a world model.
 
     On the CPU they share its memory and so follow whatever changes it in place; to that end the convolutions' weights
-    are moved, unchanged, to where their channels lie side by side. On other devices those of the convolutions are copies.
+    are moved, unchanged, to where their channels lie side by side. On other devices these are copies.
     """
     encoder, dynamics, latent = model.encoder, model.dynamics, model.dynamics.latent_dim
     output = dynamics.posterior_output

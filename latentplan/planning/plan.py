@@ -41,6 +41,17 @@ class Plan:
         """The first action of the chosen sequence, (batch, action)."""
         return self.actions[:, 0]
 
+    def action_distribution(self, min_std: float) -> tuple[Tensor, Tensor]:
+        """Mean and std of the search distribution over the first action, (batch, action) each; std at least `min_std`.
+
+        Raises:
+            FloatingPointError: No candidate had a finite return somewhere, so that nothing was searched there.
+        """
+        num_failed = int(self.info["is_fallback"].sum())
+        if num_failed:
+            raise FloatingPointError(f"the planner found no finite return at {num_failed} of {len(self.mean)} states")
+        return self.mean[:, 0], self.var[:, 0].sqrt().clamp_min(min_std)
+
     def forget(self, mask: Tensor) -> Plan:
         """The same plan, except that environments in mask (batch,) bool start their next search cold."""
         return replace(self, is_warm=self.is_warm & ~mask.to("cpu", torch.bool))
