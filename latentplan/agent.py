@@ -139,6 +139,17 @@ class PlanningAgent(ModelAgent):
         _, last = self.model.rollout(first, self.controller.plan.actions[:1].to(first.deter.dtype))
         return self.model.decoder.picture(last.features.float())[0].cpu().numpy()
 
+    def planned_action(self) -> np.ndarray | None:
+        """Mean and std of the last plan's first action side by side, float32 (batch, 2 action); None without a plan.
+
+        Zeros where the search found nothing finite.
+        """
+        plan = self.controller.plan
+        if plan is None:
+            return None
+        planned = torch.cat(plan.action_distribution(self.controller.planner.min_std), -1)
+        return planned.masked_fill(plan.info["is_fallback"][:, None], 0.0).float().cpu().numpy()
+
     def _choose(self, state: State) -> Tensor:
         # One autocast around the whole search converts each weight once, not once per model call.
         with self.model.trunk_precision():

@@ -23,7 +23,7 @@ FRAME_SHAPE = (64, 64, 3)
 FRAME_BYTES = 64 * 64 * 3
 MEMORY_SHARE = 0.9
 SAMPLING_ROUNDS = 1000
-COLUMNS = ("deter", "actions", "rewards", "continues")
+COLUMNS = ("deter", "actions", "rewards", "continues", "plan")
 LOADED_AT_ONCE = 1024
 MEMORY_FACTS = Path("/proc/meminfo")
 
@@ -39,6 +39,8 @@ class Rows:
         rewards: Arriving with the next frame, float32 (n,).
         continues: 1 unless the episode ended in a terminal state with the next frame, float32 (n,).
         is_first: Whether an episode starts at this row, bool (n,).
+        plan: Mean and std of the planner's first action there, float32 (n, 2 action); zeros where it did not act.
+            None stands for zeros everywhere.
     """
 
     frames: np.ndarray
@@ -47,6 +49,11 @@ class Rows:
     rewards: np.ndarray
     continues: np.ndarray
     is_first: np.ndarray
+    plan: np.ndarray | None = None
+
+    def __post_init__(self) -> None:
+        if self.plan is None:
+            self.plan = np.zeros((len(self.frames), 2 * self.actions.shape[-1]), np.float32)
 
 
 class Batch(NamedTuple):
@@ -59,6 +66,7 @@ class Batch(NamedTuple):
         rewards: rewards[t] arrived with frames[t + 1], (batch, time).
         continues: Whether the episode went on at frames[t + 1], (batch, time).
         rows: Where each frame lives in replay, (batch, time + 1), for `Replay.refresh`.
+        plan: Mean and std of the planner's action at frames[t], (batch, time, 2 action); zeros where it did not act.
     """
 
     frames: Tensor
@@ -67,6 +75,7 @@ class Batch(NamedTuple):
     rewards: Tensor
     continues: Tensor
     rows: Tensor
+    plan: Tensor
 
 
 class Replay:
@@ -94,6 +103,7 @@ class Replay:
         self.actions = torch.zeros(total, action_dim, device=device)
         self.rewards = torch.zeros(total, device=device)
         self.continues = torch.ones(total, device=device)
+        self.plan = torch.zeros(total, 2 * action_dim, device=device)
         self.episode = np.full((num_lanes, self.lane_size), -1, dtype=np.int64)
         self.written = np.zeros(num_lanes, dtype=np.int64)
         self._saved = np.zeros(num_lanes, dtype=np.int64)
@@ -133,6 +143,7 @@ class Replay:
             rewards=self.rewards[acted],
             continues=self.continues[acted],
             rows=rows,
+            plan=self.plan[acted],
         )
 
     def refresh(self, rows: Tensor, deter: Tensor) -> None:
@@ -186,7 +197,7 @@ class Replay:
             self._saved[lane] = self.written[lane] if np.array_equal(old, new) else 0
             self.episode[lane, new] = state["episode"].numpy()[lane, old]
             index = torch.from_numpy(new + lane * self.lane_size).to(self.device)
-            for name in COLUMNS:
+            for name in [name for name in COLUMNS if name in state]:  # older runs kept no plans
                 store = getattr(self, name)
                 store[index] = state[name][old + lane * saved_size].to(self.device)
             self._load_frames(folder / f"frames_{lane}.u8", min(written, saved_size), old, index)
@@ -224,7 +235,7 @@ class Replay:
 
 def replay_bytes(num_rows: int, action_dim: int, deter_dim: int) -> int:
     """Memory that a replay of `num_rows` rows takes, in bytes."""
-    return num_rows * (FRAME_BYTES + 2 * deter_dim + 4 * action_dim + 4 + 4 + 8)
+    return num_rows * (FRAME_BYTES + 2 * deter_dim + 12 * action_dim + 4 + 4 + 8)
 
 
 def _check_memory(num_bytes: int, device: torch.device) -> None:

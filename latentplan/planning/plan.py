@@ -44,13 +44,11 @@ class Plan:
     def action_distribution(self, min_std: float) -> tuple[Tensor, Tensor]:
         """Mean and std of the search distribution over the first action, (batch, action) each; std at least `min_std`.
 
-        Raises:
-            FloatingPointError: No candidate had a finite return somewhere, so that nothing was searched there.
+        NaN where no candidate had a finite return: nothing was searched there.
         """
-        num_failed = int(self.info["is_fallback"].sum())
-        if num_failed:
-            raise FloatingPointError(f"the planner found no finite return at {num_failed} of {len(self.mean)} states")
-        return self.mean[:, 0], self.var[:, 0].sqrt().clamp_min(min_std)
+        failed = self.info["is_fallback"][:, None]
+        std = self.var[:, 0].sqrt().clamp_min(min_std)
+        return self.mean[:, 0].masked_fill(failed, torch.nan), std.masked_fill(failed, torch.nan)
 
     def forget(self, mask: Tensor) -> Plan:
         """The same plan, except that environments in mask (batch,) bool start their next search cold."""

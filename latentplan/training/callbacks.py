@@ -29,7 +29,7 @@ COLUMNS = (
     *("env_frames", "decisions", "updates", "minutes", "episode_return"),
     *("planner_return", "actor_return", "planner_minus_actor"),
     *("reconstruction", "reward", "continue", "dynamics", "representation", "overshooting", "overshot_reward"),
-    *("actor", "value", "imagined_return", "entropy", "model_grad_norm", "behaviour_grad_norm"),
+    *("actor", "imitation", "value", "imagined_return", "entropy", "model_grad_norm", "behaviour_grad_norm"),
 )
 
 

@@ -179,12 +179,13 @@ class Collector:
         actions = agent.act(frames)
         state = agent.state if isinstance(agent, ModelAgent) else None
         deter = None if state is None else state.deter.float().cpu().numpy()
+        plan = agent.planned_action() if isinstance(agent, PlanningAgent) else None
         self._frames, rewards, terminated, truncated, info = self.envs.step(actions)
         if not np.isfinite(rewards).all():
             raise UserError(f"the environment gave rewards that are not finite: {rewards.tolist()}")
         self._ended = terminated | truncated
         self._returns += rewards
-        log.append(frames, deter, actions, rewards, ~terminated, first, np.asarray(info["env_frames"]))
+        log.append(frames, deter, actions, rewards, ~terminated, first, np.asarray(info["env_frames"]), plan)
         for lane in np.flatnonzero(self._ended):
             log.finish(int(lane), self._frames[lane].copy(), float(self._returns[lane]))
 
@@ -201,6 +202,7 @@ class _Log:
         self._lanes: list[list[tuple[Any, ...]]] = [[] for _ in range(lanes)]
         self._no_deter = np.zeros((lanes, deter_dim), np.float32)
         self._no_action = np.zeros(action_dim, np.float32)
+        self._no_plan = np.zeros((lanes, 2 * action_dim), np.float32)
         self.returns: list[float] = []
         self.env_frames = 0
 
@@ -213,16 +215,26 @@ class _Log:
         continues: np.ndarray,
         first: np.ndarray,
         env_frames: np.ndarray,
+        plan: np.ndarray | None,
     ) -> None:
         beliefs = self._no_deter if deter is None else deter
+        plans = self._no_plan if plan is None else plan
         for lane, entries in enumerate(self._lanes):
             entries.append(
-                (frames[lane], beliefs[lane], actions[lane], rewards[lane], float(continues[lane]), first[lane])
+                (
+                    frames[lane],
+                    beliefs[lane],
+                    actions[lane],
+                    rewards[lane],
+                    float(continues[lane]),
+                    first[lane],
+                    plans[lane],
+                )
             )
         self.env_frames += int(env_frames.sum())
 
     def finish(self, lane: int, frame: np.ndarray, total_return: float) -> None:
-        self._lanes[lane].append((frame, self._no_deter[lane], self._no_action, 0.0, 1.0, False))
+        self._lanes[lane].append((frame, self._no_deter[lane], self._no_action, 0.0, 1.0, False, self._no_plan[lane]))
         self.returns.append(total_return)
 
     def rows(self) -> list[Rows]:
@@ -230,7 +242,7 @@ class _Log:
 
 
 def _stack(entries: list[tuple[Any, ...]]) -> Rows:
-    frames, deter, actions, rewards, continues, is_first = zip(*entries, strict=True)
+    frames, deter, actions, rewards, continues, is_first, plan = zip(*entries, strict=True)
     return Rows(
         frames=np.stack(frames),
         deter=np.stack(deter),
@@ -238,4 +250,5 @@ def _stack(entries: list[tuple[Any, ...]]) -> Rows:
         rewards=np.asarray(rewards, np.float32),
         continues=np.asarray(continues, np.float32),
         is_first=np.asarray(is_first, bool),
+        plan=np.stack(plan),
     )

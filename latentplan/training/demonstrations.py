@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from latentplan.models import Gaussian, State, WorldModel
-from latentplan.planning import CEMPlanner
+from latentplan.planning import CEMPlanner, Plan
 
 
 def plan_actions(
@@ -37,10 +37,23 @@ def plan_actions(
     for rows in zip(*(part.split(rows_per_call) for part in states), strict=True):
         with model.trunk_precision():
             plan = planner.plan(model, State(*rows), generator=generator)
-        parts.append(plan.action_distribution(planner.min_std))
+        parts.append(first_actions(plan, planner.min_std))
         report(sum(len(mean) for mean, _ in parts))
     means, stds = zip(*parts, strict=True)
     return Gaussian(torch.cat(means), torch.cat(stds))
+
+
+def first_actions(plan: Plan, min_std: float) -> Gaussian:
+    """Mean and std of a plan's first actions, (batch, action) each; std at least `min_std`.
+
+    Raises:
+        FloatingPointError: The search found nothing finite somewhere.
+    """
+    mean, std = plan.action_distribution(min_std)
+    num_failed = int(torch.isnan(mean).any(-1).sum())
+    if num_failed:
+        raise FloatingPointError(f"the planner found no finite return at {num_failed} of {len(mean)} states")
+    return Gaussian(mean, std)
 
 
 class Demonstrations:

@@ -25,7 +25,7 @@ from latentplan.models import Gaussian, State
 from latentplan.rollout import OnStep, Step, episode_seed, iterate_episodes
 from latentplan.training.collector import EnvFactory
 from latentplan.training.comparison import describe_distillation, describe_mean
-from latentplan.training.demonstrations import Demonstrations, plan_actions
+from latentplan.training.demonstrations import Demonstrations, first_actions, plan_actions
 from latentplan.training.progress import StatusLine
 from latentplan.training.run import Result
 from latentplan.training.standing import START, STATE_FILE, Standing, load_distillation, save_distillation
@@ -180,7 +180,7 @@ class _Distillation:
                 states.append(agent.state)
                 plan = self.planning.controller.plan
                 if agent is self.planning and plan is not None:
-                    plans.append(Gaussian(*plan.action_distribution(self.planner_config.min_std)))
+                    plans.append(first_actions(plan, self.planner_config.min_std))
 
         self._play(agent, "drive", "driving", round_index, settings.episodes, remember)
         num_stale = int(settings.relabel_share * len(self.demonstrations))

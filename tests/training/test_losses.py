@@ -31,6 +31,7 @@ def batch():
         rewards=torch.as_tensor(rng.uniform(-1, 1, (4, 5)).astype(np.float32)),
         continues=torch.ones(4, 5),
         rows=torch.arange(24).reshape(4, 6),
+        plan=torch.zeros(4, 5, 2),
     )
 
 
