@@ -54,9 +54,8 @@ def program(checkpoint, tmp_path_factory):
     return path
 
 
-@pytest.mark.parametrize("batch", [1, 3])
-def test_a_process_without_the_package_gets_the_agents_actions(batch, checkpoint, program, run_python, tmp_path):
-    film = np.random.default_rng(batch).integers(0, 256, (8, batch, 64, 64, 3), dtype=np.uint8)
+def test_a_process_without_the_package_gets_the_agents_actions(checkpoint, program, run_python, tmp_path):
+    film = np.random.default_rng(3).integers(0, 256, (8, 3, 64, 64, 3), dtype=np.uint8)
     np.save(tmp_path / "film.npy", film)
     result = run_python("-c", RUNNER, program, tmp_path / "film.npy", cwd=tmp_path)
     assert result.returncode == 0, result.stderr
@@ -68,6 +67,24 @@ def test_a_process_without_the_package_gets_the_agents_actions(batch, checkpoint
     actions = np.load(tmp_path / "film.npy")
     assert np.ptp(expected) > 0.1
     assert np.allclose(actions, np.stack(expected), atol=1e-4)
+
+
+def test_the_documented_runner_gets_the_agents_actions(checkpoint, program, run_python, tmp_path, root):
+    text = (root / "docs" / "distillation.md").read_text()
+    runner = next(part for part in text.split("```python\n")[1:] if "torch.export.load" in part).split("```")[0]
+    film = np.random.default_rng(0).integers(0, 256, (6, 64, 64, 3), dtype=np.uint8)
+    np.save(program.parent / "film.npy", film)
+    before = (
+        "import sys; sys.modules['latentplan'] = None\nimport numpy as np\nactions = []\n"
+        "def play():\n"
+        "    for frame in np.load('film.npy'):\n        yield frame\n        actions.append(action.detach().numpy())\n"
+        "frames = play()\n"
+    )
+    result = run_python("-c", f"{before}{runner}np.save('actions.npy', actions)", cwd=program.parent)
+    assert result.returncode == 0, result.stderr
+    agent = load_agent(checkpoint, mode="actor")
+    expected = np.stack([agent.act(frame) for frame in film])
+    assert np.allclose(np.load(program.parent / "actions.npy")[:, 0], expected, atol=1e-4)
 
 
 def test_an_episode_begins_alone(program):

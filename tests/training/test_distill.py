@@ -142,7 +142,7 @@ class Interrupting:
 
 
 # Steps: 6 episodes of 20 to begin with; then in each round 2 driven and 2 judged.
-@pytest.mark.parametrize("at_step", [50, 130, 180, 250])
+@pytest.mark.parametrize("at_step", [50, 180])
 def test_an_interrupted_distillation_ends_as_if_nothing_had_happened(
     at_step, finished, checkpoint, push, tmp_path, capsys
 ):
