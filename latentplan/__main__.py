@@ -1,4 +1,4 @@
-"""`python -m latentplan`: train, eval, doctor and --version."""
+"""`python -m latentplan`: train, eval, distill, export, doctor and --version."""
 
 from __future__ import annotations
 

@@ -14,7 +14,7 @@ from latentplan.goals.expression import Expression
 from latentplan.goals.image import read_goal
 from latentplan.goals.objective import plan_constraint, plan_objective, require_labels
 from latentplan.goals.parser import parse_constraints, parse_objective
-from latentplan.models import State, WorldModel
+from latentplan.models import State, WorldModel, reflex
 from latentplan.models.heads import sample_action
 from latentplan.planning import CEMPlanner, ModelPredictiveController
 from latentplan.planning.objectives import Constraint, Term, predicted_return
@@ -46,6 +46,7 @@ class ModelAgent:
         self.state: State | None = None
         self._action: Tensor | None = None
         self._forget: Tensor | None = None
+        self._weights = reflex.lay_out(model)
         self.seed(seed)
 
     def seed(self, seed: int) -> None:
@@ -100,17 +101,19 @@ class ModelAgent:
         return self.model.decoder.picture(last.features.float())[0].cpu().numpy()
 
     def _believe(self, frames: Tensor) -> State:
+        if self.state is None or self.model.device.type != "cpu":  # elsewhere the weights do not follow the model's
+            self._weights = reflex.lay_out(self.model)
         if self.state is None or self._action is None:
             return self._see(self.model.dynamics.initial(len(frames)).deter, frames)
         if len(self.state.deter) != len(frames):
             raise ValueError(f"got {len(frames)} frames after {len(self.state.deter)}: call reset() between batches")
-        deter = self.model.dynamics.advance(self.state, self._action)
+        deter = reflex.advance(self._weights, self.state, self._action)
         if self._forget is not None:
             deter = torch.where(self._forget[:, None], 0.0, deter)
         return self._see(deter, frames)
 
     def _see(self, deter: Tensor, frames: Tensor) -> State:
-        return self.model.see(deter, frames)
+        return reflex.see(self._weights, deter, frames)
 
     def _check(self, frames: np.ndarray) -> Tensor:
         if frames.dtype != np.uint8 or frames.shape[1:] != (64, 64, 3):
@@ -187,6 +190,17 @@ class PlanningAgent(ModelAgent):
     def _encode_goal(self, path: str) -> Tensor:
         return torch.as_tensor(self.encode(read_goal(path)), device=self.model.device)
 
+    def planned_action(self) -> np.ndarray | None:
+        """Mean and std of the last plan's first action side by side, float32 (batch, 2 action); None without a plan.
+
+        Zeros where the search found nothing finite.
+        """
+        plan = self.controller.plan
+        if plan is None:
+            return None
+        planned = torch.cat(plan.action_distribution(self.controller.planner.min_std), -1)
+        return planned.masked_fill(plan.info["is_fallback"][:, None], 0.0).float().cpu().numpy()
+
     def _choose(self, state: State) -> Tensor:
         with self.model.planning():
             return self.controller.act(state)
@@ -206,8 +220,17 @@ class ActorAgent(ModelAgent):
         super().__init__(model, config, seed=seed)
         self.explore = explore
 
+    @torch.inference_mode()
+    def act(self, frame: np.ndarray) -> np.ndarray:
+        """The action in [-1, 1], float32 (action,) or (batch, action), for uint8 frame(s).
+
+        Raises:
+            ValueError: The frame has another shape or dtype, or the batch changed without a reset.
+        """
+        return super().act(frame)
+
     def _choose(self, state: State) -> Tensor:
-        mean, std = self.model.actor(state.features)
+        mean, std = reflex.act(self._weights, state)
         if not self.explore:
             return mean
         noise = torch.randn(mean.shape, generator=self.generator, device=mean.device)

@@ -27,7 +27,7 @@ from latentplan.compose import (
 )
 from latentplan.config import Config, UserError
 
-COMMANDS = ("train", "eval", "doctor")
+COMMANDS = ("train", "eval", "distill", "export", "doctor")
 RESUMABLE = ("--frames", "--minutes", "--device")
 SHORT_FLAGS = {
     "--domain": ("env.domain", "domain of dm_control.suite (short for --env.domain)"),
@@ -42,6 +42,11 @@ OTHER_FLAGS = {
     "--preset": "machine class: auto, cpu or gpu; auto takes gpu where CUDA is usable",
     "--config": "YAML file of settings, laid over the preset",
     "--resume": f"continue the run in this folder; only {', '.join(RESUMABLE)} may be given besides",
+}
+EXPORT_FLAGS = {
+    "--checkpoint": ("DIR", "folder of a trained agent, or of a run (its best checkpoint)"),
+    "--out": ("FILE", "the file to write"),
+    "--format": ("pt2|onnx", "program of torch.export, or ONNX where onnx and onnxscript are installed (pt2)"),
 }
 METAVARS = {"--frames": "N", "--minutes": "M", "--run-dir": "DIR", "--resume": "DIR", "--config": "FILE"}
 
@@ -61,19 +66,21 @@ class TrainCommand(NamedTuple):
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run `latentplan train | eval | doctor` and return the exit code."""
+    """Run `latentplan train | eval | distill | export | doctor` and return the exit code."""
     arguments = list(sys.argv[1:] if argv is None else argv)
     command = arguments[0] if arguments else "--help"
     if command == "--version":
         print(f"latentplan {__version__}")
         return 0
     if command in ("-h", "--help"):
-        print("usage: latentplan [--version] {train,eval,doctor} ...\n")
+        print(f"usage: latentplan [--version] {{{','.join(COMMANDS)}}} ...\n")
         print("  train    learn to control a body from pixels (train --help lists every setting)")
         print("  eval     run a trained agent in closed loop and film it")
+        print("  distill  teach a trained agent's actor what its planner does")
+        print("  export   write the actor as a program that runs without this package")
         print("  doctor   report versions, device and renderer, and what to do about what is wrong")
         return 0
-    commands = {"train": _train, "eval": _evaluate, "doctor": _doctor}
+    commands = {"train": _train, "eval": _evaluate, "distill": _distill, "export": _export, "doctor": _doctor}
     return run_guarded(commands.get(command, lambda _: raise_unknown("command", command, COMMANDS)), arguments[1:])
 
 
@@ -161,6 +168,33 @@ def _evaluate(argv: Sequence[str]) -> int:
     from latentplan.evaluate import main as evaluate_main
 
     return evaluate_main(argv)
+
+
+def _distill(argv: Sequence[str]) -> int:
+    from latentplan.distill import main as distill_main
+
+    return distill_main(argv)
+
+
+def _export(argv: Sequence[str]) -> int:
+    if "-h" in argv or "--help" in argv:
+        print("usage: latentplan export --checkpoint DIR --out FILE [--format pt2|onnx]\n")
+        print("Write the actor as a program: frame, belief and last action in, action and belief out.\n")
+        for flag, (metavar, meaning) in EXPORT_FLAGS.items():
+            print(f"  {flag + ' ' + metavar:<18}  {meaning}")
+        return 0
+    flags = read_flags(argv, EXPORT_FLAGS)
+    missing = [flag for flag in ("--checkpoint", "--out") if flag not in flags]
+    if missing:
+        raise UserError(f"flag {missing[0]} is missing; give {EXPORT_FLAGS[missing[0]][1]}")
+    from latentplan.export import FORMATS, export_actor
+
+    file_format = flags.get("--format", "pt2")
+    if file_format not in FORMATS:
+        raise_unknown("format", file_format, FORMATS)
+    path = export_actor(flags["--checkpoint"], flags["--out"], file_format)
+    print(f"wrote {path} ({path.stat().st_size / 2**20:.1f} MiB)")
+    return 0
 
 
 def _doctor(argv: Sequence[str]) -> int:

@@ -9,81 +9,28 @@ import contextlib
 import json
 import os
 import sys
-import tempfile
-from argparse import SUPPRESS
 from collections.abc import Sequence
-from dataclasses import dataclass
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from latentplan.cli import read_flags, run_guarded
-from latentplan.compose import build_config, field_names, raise_unknown
-from latentplan.config import DEVICES, EnvConfig, PlannerConfig, UserError, from_dict, to_dict
+from latentplan.cli import run_guarded
+from latentplan.compose import build_config
+from latentplan.config import EnvConfig, PlannerConfig, UserError, from_dict, to_dict
+from latentplan.evaluation_request import (
+    GOAL_MODES,
+    PLANNING_MODES,
+    EvaluationRequest,
+    help_text,
+    parse_arguments,
+)
 
 if TYPE_CHECKING:
     import gymnasium
 
     from latentplan.envs.suite import SuiteEnv
-    from latentplan.latency import Latency
     from latentplan.rollout import Agent, OnStep
+    from latentplan.scoring import ScoredEnv
     from latentplan.timed_rollout import TimedEpisode
     from latentplan.virtual_clock import VirtualClock
-
-PLANNING_MODES = ("planner", "gated", "background")
-GOAL_MODES = ("planner", "gated")  # who pursues an objective; the others are scored on it
-MODES = (*PLANNING_MODES, "actor", "random")
-FLAGS = {
-    "--checkpoint": ("DIR", "folder of a trained agent, or of a run (its best checkpoint)"),
-    "--episodes": ("N", "episodes to play (10)"),
-    "--objective": (
-        "TEXT",
-        "what counts instead of the task, such as 'speed -> 2.0 and height > 1.1' (docs/zero-shot.md)",
-    ),
-    "--constraint": ("TEXT", "what must hold at every moment, such as 'cart < 0.5'; may be repeated"),
-    "--mode": ("|".join(MODES), "who acts (planner)"),
-    "--video": ("FILE", "film of the first episode, .mp4 or .webm"),
-    "--json": ("FILE", "result as JSON"),
-    "--control-hz": ("F", "decisions per second of a world that goes on while the agent thinks (it waits)"),
-    "--latency": ("measured|FILE", "what thinking costs there: as measured, or drawn from a file of ms (measured)"),
-    "--seed": ("S", "episode i starts from a state that depends only on S and i (0)"),
-    "--device": ("|".join(DEVICES), "where the agent computes (auto: cuda where usable)"),
-    "--threads": ("N", "CPU threads (torch's own choice)"),
-}
-
-
-@dataclass(frozen=True)
-class EvaluationRequest:
-    """What the command line asks for.
-
-    Attributes:
-        checkpoint: Folder of the agent.
-        episodes: Episodes to play.
-        objective: What counts instead of the task, or None.
-        constraint: What must hold at every moment, or None.
-        mode: One of `MODES`.
-        planner: Planner settings that replace the agent's, as they were typed.
-        video: Where the film goes, or None.
-        json: Where the result goes, or None.
-        control_hz: Decisions per second of a world that does not wait, or None for one that does.
-        latency: What thinking costs there.
-        seed: Seed of the starts.
-        device: `auto`, `cpu` or `cuda`.
-        threads: CPU threads, or None to leave it to torch.
-    """
-
-    checkpoint: Path
-    episodes: int
-    objective: str | None
-    constraint: str | None
-    mode: str
-    planner: dict[str, str]
-    video: Path | None
-    json: Path | None
-    control_hz: float | None
-    latency: Latency
-    seed: int
-    device: str
-    threads: int | None
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -108,49 +55,9 @@ def evaluate_agent(
     return {"seed": seed, **summarize(run_episodes(env, agent, seeds, on_step=on_step))}
 
 
-def parse_arguments(argv: Sequence[str]) -> EvaluationRequest:
-    """Read the command line.
-
-    Raises:
-        UserError: A flag or value is wrong, or an output path cannot be written; the message says what to give.
-    """
-    settings = [f"--planner.{name}" for name in field_names("planner")]
-    flags = read_flags(argv, [*FLAGS, *settings], {"--constraint": "; "})
-    if "--checkpoint" not in flags:
-        raise UserError("flag --checkpoint is missing; give the folder of a trained agent or of a run")
-    mode, device = flags.get("--mode", "planner"), flags.get("--device", "auto")
-    if mode not in MODES:
-        raise_unknown("mode", mode, MODES)
-    if device not in DEVICES:
-        raise_unknown("device", device, DEVICES)
-    planner = {name.removeprefix("--planner."): value for name, value in flags.items() if name in settings}
-    if planner and mode not in PLANNING_MODES:
-        raise UserError(f"--planner.{next(iter(planner))} has no effect in mode {mode}; use --mode planner")
-    from latentplan.latency import read_clock_flags
-
-    control_hz, latency = read_clock_flags(flags)
-    if mode == "background" and ("--objective" in flags or "--constraint" in flags):
-        raise UserError("mode background plans for the learned return alone; give goals to --mode planner or gated")
-    return EvaluationRequest(
-        checkpoint=Path(flags["--checkpoint"]),
-        episodes=_whole_number(flags, "--episodes", 10, 1),
-        objective=flags.get("--objective"),
-        constraint=flags.get("--constraint"),
-        mode=mode,
-        planner=planner,
-        video=_output_path(flags, "--video"),
-        json=_output_path(flags, "--json"),
-        control_hz=control_hz,
-        latency=latency,
-        seed=_whole_number(flags, "--seed", 0, 0),
-        device=device,
-        threads=_whole_number(flags, "--threads", 1, 1) if "--threads" in flags else None,
-    )
-
-
 def _evaluate(argv: Sequence[str]) -> int:
     if "-h" in argv or "--help" in argv:
-        print(_help())
+        print(help_text())
         return 0
     request = parse_arguments(argv)
     from latentplan.checkpoint import read_info
@@ -187,7 +94,12 @@ def _evaluate(argv: Sequence[str]) -> int:
 
 
 def _play_and_report(
-    request: EvaluationRequest, env: SuiteEnv, agent: Any, about: dict[str, Any], horizon: int, clock: VirtualClock
+    request: EvaluationRequest,
+    env: SuiteEnv | ScoredEnv,
+    agent: Any,
+    about: dict[str, Any],
+    horizon: int,
+    clock: VirtualClock,
 ) -> int:
     """Plays, prints, writes; an interrupt reports the episodes that were finished."""
     from latentplan.rollout import episode_seed
@@ -262,47 +174,3 @@ def _choose_device(request: EvaluationRequest) -> str:
     if request.device == "cuda" and not torch.cuda.is_available():
         raise UserError("device 'cuda' is not usable here; give --device cpu")
     return "cuda" if request.device == "auto" and torch.cuda.is_available() else request.device.replace("auto", "cpu")
-
-
-def _whole_number(flags: dict[str, str], name: str, default: int, least: int) -> int:
-    text = flags.get(name, str(default))
-    if not text.isascii() or not text.isdigit() or int(text) < least:
-        raise UserError(f"{name} must be a whole number of at least {least}, got {text!r}")
-    return int(text)
-
-
-def _output_path(flags: dict[str, str], name: str) -> Path | None:
-    """The path of an output, tried before any work is spent on what goes there."""
-    if name not in flags:
-        return None
-    path = Path(flags[name])
-    if name == "--video":
-        from latentplan.reporting.video import check_video_path
-
-        check_video_path(path)
-    if path.is_dir():
-        raise UserError(f"{name} {str(path)!r} is a folder; give a file in it")
-    folder = path.parent
-    if not folder.is_dir():
-        existing = next(parent for parent in folder.parents if parent.is_dir())
-        raise UserError(f"{name}: there is no folder {str(folder)!r}; the nearest that exists is {str(existing)!r}")
-    try:
-        tempfile.TemporaryFile(dir=folder).close()
-    except OSError as error:
-        raise UserError(f"{name}: cannot write in {str(folder)!r}: {error.strerror}; choose another folder") from None
-    return path
-
-
-def _help() -> str:
-    from jsonargparse import ArgumentParser
-
-    parser = ArgumentParser(prog="eval.py", usage="%(prog)s --checkpoint DIR [--name value ...]")
-    parser.description = "Play a trained agent in closed loop: return, decision latency, film."
-    parser.epilog = (
-        "Planner defaults shown are the program's; a checkpoint brings its own, which hold unless given here."
-    )
-    for flag, (metavar, meaning) in FLAGS.items():
-        parser.add_argument(flag, metavar=metavar, default=SUPPRESS, help=meaning)
-    parser.add_argument("--planner", type=PlannerConfig)
-    parser._option_string_actions["--planner"].help = SUPPRESS
-    return parser.format_help()

@@ -23,7 +23,7 @@ FRAME_SHAPE = (64, 64, 3)
 FRAME_BYTES = 64 * 64 * 3
 MEMORY_SHARE = 0.9
 SAMPLING_ROUNDS = 1000
-COLUMNS = ("deter", "actions", "rewards", "continues", "labels")
+COLUMNS = ("deter", "actions", "rewards", "continues", "labels", "plan")
 LOADED_AT_ONCE = 1024
 MEMORY_FACTS = Path("/proc/meminfo")
 
@@ -40,6 +40,8 @@ class Rows:
         continues: 1 unless the episode ended in a terminal state with the next frame, float32 (n,).
         is_first: Whether an episode starts at this row, bool (n,).
         labels: True quantities at each frame, float32 (n, label); none of them without a simulator that tells.
+        plan: Mean and std of the planner's first action there, float32 (n, 2 action); zeros where it did not act.
+            None stands for zeros everywhere.
     """
 
     frames: np.ndarray
@@ -49,6 +51,11 @@ class Rows:
     continues: np.ndarray
     is_first: np.ndarray
     labels: np.ndarray
+    plan: np.ndarray | None = None
+
+    def __post_init__(self) -> None:
+        if self.plan is None:
+            self.plan = np.zeros((len(self.frames), 2 * self.actions.shape[-1]), np.float32)
 
 
 class Batch(NamedTuple):
@@ -62,6 +69,7 @@ class Batch(NamedTuple):
         continues: Whether the episode went on at frames[t + 1], (batch, time).
         labels: True quantities at each frame, (batch, time + 1, label).
         rows: Where each frame lives in replay, (batch, time + 1), for `Replay.refresh`.
+        plan: Mean and std of the planner's action at frames[t], (batch, time, 2 action); zeros where it did not act.
     """
 
     frames: Tensor
@@ -71,6 +79,7 @@ class Batch(NamedTuple):
     continues: Tensor
     labels: Tensor
     rows: Tensor
+    plan: Tensor
 
 
 class Replay:
@@ -108,6 +117,7 @@ class Replay:
         self.rewards = torch.zeros(total, device=device)
         self.continues = torch.ones(total, device=device)
         self.labels = torch.zeros(total, num_labels, device=device)
+        self.plan = torch.zeros(total, 2 * action_dim, device=device)
         self.episode = np.full((num_lanes, self.lane_size), -1, dtype=np.int64)
         self.written = np.zeros(num_lanes, dtype=np.int64)
         self._saved = np.zeros(num_lanes, dtype=np.int64)
@@ -148,6 +158,7 @@ class Replay:
             continues=self.continues[acted],
             labels=self.labels[rows],
             rows=rows,
+            plan=self.plan[acted],
         )
 
     def refresh(self, rows: Tensor, deter: Tensor) -> None:
@@ -202,7 +213,7 @@ class Replay:
             self._saved[lane] = self.written[lane] if np.array_equal(old, new) else 0
             self.episode[lane, new] = state["episode"].numpy()[lane, old]
             index = torch.from_numpy(new + lane * self.lane_size).to(self.device)
-            for name in COLUMNS:
+            for name in [name for name in COLUMNS if name in state]:  # older runs kept no plans
                 store = getattr(self, name)
                 store[index] = state[name][old + lane * saved_size].to(self.device)
             self._load_frames(folder / f"frames_{lane}.u8", min(written, saved_size), old, index)
@@ -240,7 +251,7 @@ class Replay:
 
 def replay_bytes(num_rows: int, action_dim: int, deter_dim: int, num_labels: int = 0) -> int:
     """Memory that a replay of `num_rows` rows takes, in bytes."""
-    return num_rows * (FRAME_BYTES + 2 * deter_dim + 4 * (action_dim + num_labels) + 4 + 4 + 8)
+    return num_rows * (FRAME_BYTES + 2 * deter_dim + 4 * (3 * action_dim + num_labels) + 4 + 4 + 8)
 
 
 def _check_memory(num_bytes: int, device: torch.device) -> None:

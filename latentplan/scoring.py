@@ -88,6 +88,7 @@ class ScoredEnv(gymnasium.Wrapper[Any, Any, Any, Any]):
     Attributes:
         scores: Of the episodes that ended, in order.
         worth: Worth of the objective at each env frame of the present episode.
+        substeps_per_decision: Steps of the simulator per decision.
         clauses: The text of every clause of the present objective, then of every constraint, each with whether it was
             met at the last env frame; empty before the first.
     """
@@ -101,7 +102,7 @@ class ScoredEnv(gymnasium.Wrapper[Any, Any, Any, Any]):
             on_objective: Called with the objective when an episode begins and when another takes its place.
         """
         super().__init__(env)
-        self._suite_env = env
+        self._suite_env, self.substeps_per_decision = env, env.substeps_per_decision
         env.record_quantities = True
         self.goals, self.scores = goals, list[Score]()
         self.worth: list[float] = []
@@ -118,11 +119,6 @@ class ScoredEnv(gymnasium.Wrapper[Any, Any, Any, Any]):
         self.worth, self.clauses, self._present = [], [], None
         self._announce()
         return self.env.reset(seed=seed, options=options)
-
-    @property
-    def substeps_per_decision(self) -> int:
-        """Steps of the simulator per decision."""
-        return self._suite_env.substeps_per_decision
 
     def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
         """Steps the environment and scores each of its control steps."""

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 
-from latentplan import evaluate
+from latentplan import evaluate, evaluation_request
 from latentplan.agent import RandomAgent
 from latentplan.checkpoint import save_checkpoint
 from latentplan.config import Config, EnvConfig, ModelConfig, PlannerConfig, UserError
@@ -192,7 +192,7 @@ def test_output_paths_are_tried_before_anything_is_played(capsys, tmp_path, chec
 
 def test_a_folder_that_cannot_be_written_is_named(tmp_path):
     with pytest.raises(UserError, match="cannot write in '/proc'"):
-        evaluate.parse_arguments(["--checkpoint", str(tmp_path), "--json", "/proc/result.json"])
+        evaluation_request.parse_arguments(["--checkpoint", str(tmp_path), "--json", "/proc/result.json"])
 
 
 def test_help_lists_the_flags_without_torch_or_simulator(run_python, root):
@@ -207,7 +207,7 @@ def test_help_lists_the_flags_without_torch_or_simulator(run_python, root):
     result = run_python("-c", f"import sys; sys.path.append({str(script)!r})\n{code}")
     assert "code 0" in result.stdout, result.stderr
     assert "loaded []" in result.stdout
-    for flag in (*evaluate.FLAGS, "--planner.horizon", "--planner.num_policy_samples"):
+    for flag in (*evaluation_request.FLAGS, "--planner.horizon", "--planner.num_policy_samples"):
         assert flag in result.stdout
 
 

@@ -50,6 +50,7 @@ LAYERS = {
         ("config", "agent", "background", "rollout", "checkpoint", "virtual_clock"),
         {"numpy"},
     ),
+    "export": (("config", "models", "agent", "checkpoint"), {"torch"}),
     "training": (
         (*ALL, "compose"),
         {"lightning", "torch", "numpy", "einops", "rich", "tensorboard", "gymnasium", "yaml"},
@@ -58,6 +59,8 @@ LAYERS = {
     "cli": None,
     "doctor": None,
     "evaluate": None,
+    "evaluation_request": None,
+    "distill": None,
     "__init__": None,
     "__main__": None,
 }

@@ -11,11 +11,13 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from latentplan.config.checks import UserError, above_zero, at_least, derive_seed, one_of, within
+from latentplan.config.distill import DistillConfig
 from latentplan.config.planner import PlannerConfig
 
 __all__ = [
     "Config",
     "CollectionConfig",
+    "DistillConfig",
     "EnvConfig",
     "EvaluationConfig",
     "LearningConfig",
@@ -110,6 +112,7 @@ class LearningConfig:
         discount: Discount per decision; None derives 1 - 5 / (decisions per episode).
         replay_value_scale: Weight of the value loss on replayed rewards beside the imagined one.
         entropy_scale: Weight of the actor's entropy, in units of the normalised return.
+        imitation_scale: Weight of the actor's KL to the plans it was collected with; 0 leaves it out.
         target_rate: Share of the value network that its slow target takes over at each update.
     """
 
@@ -131,6 +134,7 @@ class LearningConfig:
     discount: float | None = None
     replay_value_scale: float = 0.3
     entropy_scale: float = 3e-4
+    imitation_scale: float = 0.0
     target_rate: float = 0.02
 
     def __post_init__(self) -> None:
@@ -139,6 +143,7 @@ class LearningConfig:
         )
         at_least(self, reconstruction_scale=0.0, dynamics_scale=0.0, representation_scale=0.0, free_nats=0.0)
         at_least(self, overshooting_scale=0.0, reward_scale=0.0, replay_value_scale=0.0, entropy_scale=0.0)
+        at_least(self, imitation_scale=0.0)
         above_zero(self, "model_learning_rate", "behaviour_learning_rate", "max_grad_norm", "target_rate")
         within(self, lambda_=(0.0, 1.0), target_rate=(0.0, 1.0))
         if self.discount is not None and not 0.0 < self.discount <= 1.0:

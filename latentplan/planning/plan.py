@@ -41,6 +41,15 @@ class Plan:
         """The first action of the chosen sequence, (batch, action)."""
         return self.actions[:, 0]
 
+    def action_distribution(self, min_std: float) -> tuple[Tensor, Tensor]:
+        """Mean and std of the search distribution over the first action, (batch, action) each; std at least `min_std`.
+
+        NaN where no candidate had a finite return: nothing was searched there.
+        """
+        failed = self.info["is_fallback"][:, None]
+        std = self.var[:, 0].sqrt().clamp_min(min_std)
+        return self.mean[:, 0].masked_fill(failed, torch.nan), std.masked_fill(failed, torch.nan)
+
     def forget(self, mask: Tensor) -> Plan:
         """The same plan, except that environments in mask (batch,) bool start their next search cold."""
         return replace(self, is_warm=self.is_warm & ~mask.to("cpu", torch.bool))

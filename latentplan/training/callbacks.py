@@ -38,7 +38,7 @@ COLUMNS = (
         "overshooting",
         "probe",
     ),
-    *("actor", "value", "imagined_return", "entropy", "model_grad_norm", "behaviour_grad_norm"),
+    *("actor", "imitation", "value", "imagined_return", "entropy", "model_grad_norm", "behaviour_grad_norm"),
 )
 
 

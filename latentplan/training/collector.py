@@ -186,6 +186,7 @@ class Collector:
         actions = agent.act(frames)
         state = agent.state if isinstance(agent, ModelAgent) else None
         deter = None if state is None else state.deter.float().cpu().numpy()
+        plan = agent.planned_action() if isinstance(agent, PlanningAgent) else None
         self._frames, rewards, terminated, truncated, info = self.envs.step(actions)
         if not np.isfinite(rewards).all():
             raise UserError(f"the environment gave rewards that are not finite: {rewards.tolist()}")
@@ -193,7 +194,7 @@ class Collector:
         self._returns += rewards
         if self.labels:
             self._labels = np.array(info["labels"], np.float32)
-        log.append(frames, deter, actions, rewards, ~terminated, first, labels, np.asarray(info["env_frames"]))
+        log.append(frames, deter, actions, rewards, ~terminated, first, labels, np.asarray(info["env_frames"]), plan)
         for lane in np.flatnonzero(self._ended):
             log.finish(int(lane), self._frames[lane].copy(), self._labels[lane], float(self._returns[lane]))
 
@@ -210,6 +211,7 @@ class _Log:
         self._lanes: list[list[tuple[Any, ...]]] = [[] for _ in range(lanes)]
         self._no_deter = np.zeros((lanes, deter_dim), np.float32)
         self._no_action = np.zeros(action_dim, np.float32)
+        self._no_plan = np.zeros((lanes, 2 * action_dim), np.float32)
         self.returns: list[float] = []
         self.env_frames = 0
 
@@ -223,15 +225,19 @@ class _Log:
         first: np.ndarray,
         labels: np.ndarray,
         env_frames: np.ndarray,
+        plan: np.ndarray | None,
     ) -> None:
         beliefs = self._no_deter if deter is None else deter
+        plans = self._no_plan if plan is None else plan
         for lane, entries in enumerate(self._lanes):
-            row = (frames, beliefs, actions, rewards, continues.astype(np.float32), first, labels)
+            row = (frames, beliefs, actions, rewards, continues.astype(np.float32), first, labels, plans)
             entries.append(tuple(part[lane] for part in row))
         self.env_frames += int(env_frames.sum())
 
     def finish(self, lane: int, frame: np.ndarray, labels: np.ndarray, total_return: float) -> None:
-        self._lanes[lane].append((frame, self._no_deter[lane], self._no_action, 0.0, 1.0, False, labels))
+        self._lanes[lane].append(
+            (frame, self._no_deter[lane], self._no_action, 0.0, 1.0, False, labels, self._no_plan[lane])
+        )
         self.returns.append(total_return)
 
     def rows(self) -> list[Rows]:
@@ -239,7 +245,7 @@ class _Log:
 
 
 def _stack(entries: list[tuple[Any, ...]]) -> Rows:
-    frames, deter, actions, rewards, continues, is_first, labels = zip(*entries, strict=True)
+    frames, deter, actions, rewards, continues, is_first, labels, plan = zip(*entries, strict=True)
     return Rows(
         frames=np.stack(frames),
         deter=np.stack(deter),
@@ -248,4 +254,5 @@ def _stack(entries: list[tuple[Any, ...]]) -> Rows:
         continues=np.asarray(continues, np.float32),
         is_first=np.asarray(is_first, bool),
         labels=np.stack(labels),
+        plan=np.stack(plan),
     )

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from latentplan.config import LearningConfig
 from latentplan.models import Gaussian, State, WorldModel, kl_divergence
-from latentplan.models.heads import ScalarHead, sample_action
+from latentplan.models.heads import MAX_ACTION_STD, MIN_ACTION_STD, Actor, ScalarHead, sample_action
 from latentplan.replay import Batch
 
 HALF_LOG_2_PI_E = 1.4189385  # entropy of a Gaussian is log std + this, in nats
@@ -147,6 +147,22 @@ def value_loss(head: ScalarHead, features: Tensor, returns: Tensor, weights: Ten
     """Weighted cross-entropy of a value head on detached features (..., feature) to returns (...)."""
     logits = head(features.detach())
     return (weights * head.loss(logits, returns.detach())).mean()
+
+
+def imitation_loss(actor: Actor, features: Tensor, mean: Tensor, std: Tensor) -> Tensor:
+    """KL(planner || actor) in nats, summed over the action: (...).
+
+    This direction makes the actor cover what the planner would do. A std that the actor cannot have becomes the nearest
+    that it can: asked for less than its floor, it would push its output out to where the gradient vanishes.
+
+    Args:
+        actor: What learns; no gradient reaches further than its own weights.
+        features: Of the beliefs, (..., feature).
+        mean: Of the planner's first action, in [-1, 1], (..., action).
+        std: Of the planner's first action, (..., action).
+    """
+    planned = Gaussian(mean, std.clamp(MIN_ACTION_STD, MAX_ACTION_STD))
+    return kl_divergence(planned, Gaussian(*actor(features.detach())))
 
 
 def _predict_open_loop(

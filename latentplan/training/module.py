@@ -13,7 +13,7 @@ from torch import Tensor
 from latentplan.config import LearningConfig, derive_seed
 from latentplan.models import State, WorldModel
 from latentplan.replay import Batch, Replay
-from latentplan.training.losses import Learned, imagine, lambda_return, value_loss, world_model_loss
+from latentplan.training.losses import Learned, imagine, imitation_loss, lambda_return, value_loss, world_model_loss
 from latentplan.training.snapshot import Snapshot
 
 RETURN_RANGE_RATE = 0.01
@@ -132,13 +132,25 @@ class Learner(lightning.LightningModule):
         with self.model.trunk_precision(cache=False):
             imagined = value_loss(self.model.value_head, dream.features[:-1], returns, reach)
             replayed = self._replayed_value_loss(learned, batch)
+            imitation = self._imitation(states, batch)
         parts = {
             "actor": actor.detach(),
+            "imitation": imitation.detach(),
             "value": imagined.detach(),
             "imagined_return": returns[0].detach().mean(),
             "entropy": dream.entropies.detach().mean(),
         }
-        return actor + imagined + config.replay_value_scale * replayed, parts
+        loss = actor + imagined + config.replay_value_scale * replayed
+        return loss + config.imitation_scale * imitation, parts
+
+    def _imitation(self, states: State, batch: Batch) -> Tensor:
+        """Divergence of the actor from the plans stored with the frames, in nats; over the rows that have one."""
+        if self.config.imitation_scale == 0.0:
+            return batch.rewards.new_zeros(())
+        mean, std = batch.plan.chunk(2, -1)
+        has_plan = (std > 0.0).all(-1)
+        divergence = imitation_loss(self.model.actor, states.features[:, :-1], mean, std)
+        return (has_plan * divergence).sum() / has_plan.sum().clamp_min(1)
 
     def _replayed_value_loss(self, learned: Learned, batch: Batch) -> Tensor:
         """The value against replayed rewards, at what was seen and at what had been predicted of it without looking.

@@ -72,3 +72,33 @@ class Progress:
             f"{max(min(left), 0.0):.0f} min left" if left else "",
         ]
         return " | ".join(part for part in parts if part)
+
+
+class StatusLine:
+    """One live line on a terminal, one line every half minute in a log, and lasting lines between them."""
+
+    def __init__(self) -> None:
+        self.console = Console(highlight=False)
+        self._last_time = time.monotonic()
+        self._live = self.console.status("starting") if self.console.is_terminal else None
+
+    def __enter__(self) -> StatusLine:
+        if self._live is not None:
+            self._live.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self._live is not None:
+            self._live.stop()
+
+    def update(self, line: str) -> None:
+        """Show what is being done, if it is time to."""
+        if self._live is not None:
+            self._live.update(line)
+        elif time.monotonic() - self._last_time >= SECONDS_IN_A_LOG:
+            self._last_time = time.monotonic()
+            self.console.print(line, soft_wrap=True)
+
+    def print(self, line: str) -> None:
+        """Show a line that stays."""
+        self.console.print(line, soft_wrap=True)

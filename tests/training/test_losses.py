@@ -6,7 +6,7 @@ import torch
 
 from latentplan.models import Gaussian, State, WorldModel, kl_divergence
 from latentplan.replay import Batch, Replay
-from latentplan.training.losses import imagine, lambda_return, world_model_loss
+from latentplan.training.losses import imagine, imitation_loss, lambda_return, world_model_loss
 from latentplan.training.module import Learner
 
 
@@ -32,6 +32,7 @@ def batch():
         continues=torch.ones(4, 5),
         labels=torch.zeros(4, 6, 0),
         rows=torch.arange(24).reshape(4, 6),
+        plan=torch.zeros(4, 5, 2),
     )
 
 
@@ -273,3 +274,29 @@ def test_what_fails_in_behaviour_is_raised_in_the_update(batch, tiny):
         learner.model.value_head.mlp.output.bias.fill_(float("nan"))
     with pytest.raises(FloatingPointError, match="not finite"):
         learner.catch_up()
+
+
+def planned(mean, std):
+    return torch.full((40, 1), mean), torch.full((40, 1), std)
+
+
+def test_imitation_is_the_divergence_of_the_actor_from_the_planner(model):
+    features = torch.randn(40, 48)
+    mean, std = planned(0.4, 0.25)
+    normal = torch.distributions.Normal
+    expected = torch.distributions.kl_divergence(normal(mean, std), normal(*model.actor(features))).sum(-1)
+    assert torch.allclose(imitation_loss(model.actor, features, mean, std), expected, atol=1e-5)
+
+
+def test_imitation_asks_for_no_std_that_the_actor_cannot_have(model):
+    features = torch.randn(40, 48)
+    narrow, floor = (imitation_loss(model.actor, features, *planned(0.4, std)) for std in (0.01, 0.1))
+    assert torch.equal(narrow, floor)
+    assert torch.equal(*(imitation_loss(model.actor, features, *planned(0.4, std)) for std in (1.0, 3.0)))
+
+
+def test_imitation_moves_the_actor_alone(model):
+    features = torch.randn(40, 48, requires_grad=True)
+    imitation_loss(model.actor, features, *planned(0.4, 0.2)).mean().backward()
+    assert features.grad is None
+    assert all(parameter.grad is not None for parameter in model.actor.parameters())

@@ -65,7 +65,7 @@ class Problem:
 class FullPrecisionModel(WorldModel):
     """The world model with its trunk in float32."""
 
-    def trunk_precision(self) -> AbstractContextManager[None]:
+    def trunk_precision(self, *, cache: bool = True) -> AbstractContextManager[None]:
         """No autocast."""
         return torch.autocast(self.device.type, enabled=False)
 

@@ -1,0 +1,188 @@
+"""`scripts/distill.py`: a trained agent's actor, taught what its planner does.
+
+Torch and the simulator are imported when they are needed, so that `--help` and bad input answer at once.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import sys
+import typing
+from collections.abc import Sequence
+from dataclasses import dataclass
+from datetime import datetime
+from pathlib import Path
+from typing import Any
+
+from latentplan.cli import read_flags, run_guarded
+from latentplan.compose import build_config, field_names, raise_unknown
+from latentplan.config import DEVICES, DistillConfig, PlannerConfig, UserError, from_dict, to_dict
+
+FLAGS = {
+    "--checkpoint": ("DIR", "folder of a trained agent, or of a run (its best checkpoint)"),
+    "--out": ("DIR", "folder of the distilled agent (runs/distilled-<domain>-<task>-<date>)"),
+    "--resume": ("DIR", "continue the distillation in this folder"),
+    "--device": ("|".join(DEVICES), "where the agent computes (auto: cuda where usable)"),
+    "--threads": ("N", "CPU threads (torch's own choice)"),
+}
+RESUMABLE = ("--rounds", "--minutes", "--device", "--threads")
+
+
+@dataclass(frozen=True)
+class DistillRequest:
+    """What the command line asks for.
+
+    Attributes:
+        checkpoint: Folder of the agent to begin with; None when a distillation resumes.
+        out: Where the distilled agent goes, or None for a folder of its own under `runs`.
+        resume: Folder of the distillation to continue, or None.
+        settings: Fields of `DistillConfig` that were given.
+        planner: Planner settings that replace the agent's, as they were typed.
+        device: `auto`, `cpu` or `cuda`.
+        threads: CPU threads, or None to leave it to torch.
+    """
+
+    checkpoint: Path | None
+    out: Path | None
+    resume: Path | None
+    settings: dict[str, Any]
+    planner: dict[str, str]
+    device: str
+    threads: int | None
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run `scripts/distill.py` and return the exit code: 0, 2 for bad input, 130 when interrupted."""
+    return run_guarded(_distill, sys.argv[1:] if argv is None else argv)
+
+
+def parse_arguments(argv: Sequence[str]) -> DistillRequest:
+    """Read the command line.
+
+    Raises:
+        UserError: A flag or value is wrong; the message says what to give.
+    """
+    kinds = _setting_kinds()
+    searches = [f"--planner.{name}" for name in field_names("planner")]
+    flags = read_flags(argv, [*FLAGS, *kinds, *searches])
+    if "--resume" in flags:
+        for flag in flags:
+            if flag not in ("--resume", *RESUMABLE):
+                raise UserError(f"{flag} cannot be given with --resume; only {', '.join(RESUMABLE)} can")
+    elif "--checkpoint" not in flags:
+        raise UserError("flag --checkpoint is missing; give the folder of a trained agent or of a run")
+    device = flags.get("--device", "auto")
+    if device not in DEVICES:
+        raise_unknown("device", device, DEVICES)
+    settings: dict[str, Any] = {
+        _field(flag): _number(flag, flags[flag], kind) for flag, kind in kinds.items() if flag in flags
+    }
+    try:
+        DistillConfig(**settings)
+    except ValueError as error:
+        raise UserError(f"--{error}".replace("_", "-")) from None
+    paths = {
+        name: Path(flags[f"--{name}"]) if f"--{name}" in flags else None for name in ("checkpoint", "out", "resume")
+    }
+    return DistillRequest(
+        **paths,
+        settings=settings,
+        planner={flag.removeprefix("--planner."): flags[flag] for flag in searches if flag in flags},
+        device=device,
+        threads=_threads(flags),
+    )
+
+
+def _distill(argv: Sequence[str]) -> int:
+    if "-h" in argv or "--help" in argv:
+        print(_help())
+        return 0
+    request = parse_arguments(argv)
+    from latentplan.checkpoint import read_info
+
+    info = read_info(request.checkpoint) if request.checkpoint is not None else {}
+    planner = _planner(request, info) if request.planner else None
+    device = _choose_device(request)
+    from latentplan.training import distill, resume_distillation
+
+    if request.resume is not None:
+        return resume_distillation(request.resume, device=device, **request.settings).exit_code
+    assert request.checkpoint is not None
+    stamp = datetime.now().strftime("%Y%m%d-%H%M%S")
+    out = request.out or Path("runs") / f"distilled-{info['domain']}-{info['task']}-{stamp}"
+    settings = DistillConfig(**request.settings)
+    return distill(request.checkpoint, out, settings, planner=planner, device=device).exit_code
+
+
+def _planner(request: DistillRequest, info: dict[str, Any]) -> PlannerConfig:
+    """The agent's search, with what was given in its place."""
+    try:
+        trained = to_dict(from_dict(info["config"]).planner)
+    except ValueError as error:
+        raise UserError(f"{request.checkpoint} has settings of another version: {error}") from None
+    return build_config({"planner": {**trained, **request.planner}}).planner
+
+
+def _choose_device(request: DistillRequest) -> str:
+    import torch
+
+    if request.threads is not None:
+        torch.set_num_threads(request.threads)
+    if request.device == "cuda" and not torch.cuda.is_available():
+        raise UserError("device 'cuda' is not usable here; give --device cpu")
+    return "cuda" if request.device == "auto" and torch.cuda.is_available() else request.device.replace("auto", "cpu")
+
+
+def _setting_kinds() -> dict[str, type]:
+    """The flags that are fields of `DistillConfig`, and whether each is whole."""
+    hints = typing.get_type_hints(DistillConfig)
+    names = [field.name for field in dataclasses.fields(DistillConfig)]
+    return {f"--{name.replace('_', '-')}": int if hints[name] is int else float for name in names}
+
+
+def _field(flag: str) -> str:
+    return flag.removeprefix("--").replace("-", "_")
+
+
+def _number(flag: str, text: str, kind: type) -> int | float:
+    try:
+        number = float(text)
+        if (
+            number not in (float("inf"), float("-inf"))
+            and (kind is float or number == int(number))
+            and number == number
+        ):
+            return kind(number)
+    except ValueError:
+        pass
+    raise UserError(f"{flag} must be a {'whole ' if kind is int else ''}number, got {text!r}")
+
+
+def _threads(flags: dict[str, str]) -> int | None:
+    if "--threads" not in flags:
+        return None
+    threads = int(_number("--threads", flags["--threads"], int))
+    if threads < 1:
+        raise UserError(f"--threads must be at least 1, got {threads}")
+    return threads
+
+
+def _help() -> str:
+    """Flags with their meanings; those of the settings come from the docstring of `DistillConfig`."""
+    rows = [(f"{flag} {metavar}", meaning) for flag, (metavar, meaning) in FLAGS.items()]
+    meanings = dict(
+        line.strip().split(": ", 1)
+        for line in (DistillConfig.__doc__ or "").partition("Attributes:")[2].splitlines()
+        if ": " in line
+    )
+    for flag in _setting_kinds():
+        default = getattr(DistillConfig, _field(flag))
+        shown = "" if default is None else f" ({default:g})"
+        rows.append((f"{flag} N", meanings[_field(flag)].rstrip(".") + shown))
+    rows.append(("--planner.NAME V", "setting of the search that labels, in place of the agent's; see eval.py --help"))
+    lines = "\n".join(f"  {flag:<24}{meaning}" for flag, meaning in rows)
+    return (
+        "usage: distill.py --checkpoint DIR [--name value ...]\n\n"
+        "Teach a trained agent's actor what its planner does; the world model stays as it is.\n"
+        f"With --resume only {', '.join(RESUMABLE)} may be given.\n\n{lines}"
+    )

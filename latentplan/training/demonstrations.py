@@ -1,0 +1,102 @@
+"""What a planner does at beliefs: labels in large batches, and a store of them that is kept fresh."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from latentplan.models import Gaussian, State, WorldModel
+from latentplan.planning import CEMPlanner, Plan
+
+
+def plan_actions(
+    planner: CEMPlanner,
+    model: WorldModel,
+    states: State,
+    generator: torch.Generator,
+    rows_per_call: int,
+    report: Callable[[int], None],
+) -> Gaussian:
+    """Mean and std of the planner's first action at beliefs (rows, ...), (rows, action) each, by fresh searches.
+
+    Args:
+        planner: What searches.
+        model: What it searches in.
+        states: Where to plan.
+        generator: Of the sampling noise.
+        rows_per_call: Beliefs planned at once.
+        report: Called after each of these with the number of beliefs done.
+
+    Raises:
+        FloatingPointError: A search found nothing finite.
+    """
+    parts = []
+    for rows in zip(*(part.split(rows_per_call) for part in states), strict=True):
+        with model.trunk_precision():
+            plan = planner.plan(model, State(*rows), generator=generator)
+        parts.append(first_actions(plan, planner.min_std))
+        report(sum(len(mean) for mean, _ in parts))
+    means, stds = zip(*parts, strict=True)
+    return Gaussian(torch.cat(means), torch.cat(stds))
+
+
+def first_actions(plan: Plan, min_std: float) -> Gaussian:
+    """Mean and std of a plan's first actions, (batch, action) each; std at least `min_std`.
+
+    Raises:
+        FloatingPointError: The search found nothing finite somewhere.
+    """
+    mean, std = plan.action_distribution(min_std)
+    num_failed = int(torch.isnan(mean).any(-1).sum())
+    if num_failed:
+        raise FloatingPointError(f"the planner found no finite return at {num_failed} of {len(mean)} states")
+    return Gaussian(mean, std)
+
+
+class Demonstrations:
+    """Beliefs, the planner's first action at each, and the round in which it was planned; float32, in main memory."""
+
+    def __init__(self) -> None:
+        self.columns: dict[str, Tensor] = {}
+
+    def __len__(self) -> int:
+        """Beliefs held."""
+        return len(self.columns["round"]) if self.columns else 0
+
+    def add(self, states: State, actions: Gaussian, round_index: int) -> None:
+        """Store beliefs (rows, ...) with the planner's first actions (rows, action)."""
+        rounds = torch.full((len(states.deter),), round_index)
+        floats = {**states._asdict(), **actions._asdict()}
+        new = {**{name: value.float() for name, value in floats.items()}, "round": rounds}
+        for name, value in new.items():
+            held = [self.columns[name]] if name in self.columns else []
+            self.columns[name] = torch.cat([*held, value.detach().cpu()])
+
+    def oldest(self, count: int) -> Tensor:
+        """Where the `count` beliefs whose labels are oldest lie, (count,)."""
+        return self.columns["round"].argsort(stable=True)[:count]
+
+    def states(self, rows: Tensor) -> State:
+        """The beliefs at rows (count,)."""
+        return State(self.columns["deter"][rows], self.columns["stoch"][rows])
+
+    def actions(self, rows: Tensor) -> Gaussian:
+        """The planner's first actions at rows (count,)."""
+        return Gaussian(self.columns["mean"][rows], self.columns["std"][rows])
+
+    def replace(self, rows: Tensor, actions: Gaussian, round_index: int) -> None:
+        """Exchange the labels at rows (count,) for newer ones."""
+        self.columns["mean"][rows] = actions.mean.float().cpu()
+        self.columns["std"][rows] = actions.std.float().cpu()
+        self.columns["round"][rows] = round_index
+
+    def state_dict(self) -> dict[str, Any]:
+        """Everything held."""
+        return dict(self.columns)
+
+    def load_state_dict(self, columns: dict[str, Any]) -> None:
+        """Hold what `state_dict` gave."""
+        self.columns = dict(columns)
