@@ -99,15 +99,13 @@ def world_model_loss(model: WorldModel, batch: Batch, config: LearningConfig, ge
 def imagine(model: WorldModel, start: State, horizon: int, generator: torch.Generator) -> Imagination:
     """Roll the actor out in the model for `horizon` steps from rows of states, with gradients through the dynamics.
 
-    Every other row follows the mean of the prior instead of a sample, so that the value learns on the states a planner
-    asks about. The actor reads its state without a gradient, so that each action is credited along the dynamics alone
+    The actor reads its state without a gradient, so that each action is credited along the dynamics alone
     (Hafner et al. 2020, section 3).
     """
     state, features, stds = start, [start.features], []
     rows, device = len(start.deter), start.deter.device
     draws = torch.randn(horizon, rows, model.action_dim + model.config.latent_dim, generator=generator, device=device)
     action_noise, noise = draws.split([model.action_dim, model.config.latent_dim], -1)
-    noise = noise * (torch.arange(rows, device=device) % 2).unsqueeze(-1)
     for step in range(horizon):
         mean, std = model.actor(features[-1].detach())
         action = sample_action(mean, std, action_noise[step])

@@ -225,57 +225,6 @@ def test_a_model_without_labels_refuses_to_be_probed(model):
         model.probe(torch.zeros(2, 48))
 
 
-class Standalone(Learner):
-    """A learner that holds its own optimizers, so that it updates without a Trainer."""
-
-    def optimizers(self, use_pl_optimizer=True):
-        self.__dict__.setdefault("own", self.configure_optimizers())
-        return self.own
-
-
-def standalone(tiny):
-    torch.manual_seed(0)
-    model = WorldModel(tiny("").model, action_dim=1)
-    return Standalone(model, tiny("").learning, 0.9, Replay(24, 1, 16, 1, torch.device("cpu")), seed=0)
-
-
-def test_behaviour_learns_each_batch_from_the_model_as_the_same_batch_left_it(batch, tiny):
-    """Side by side the two halves give exactly what they give one after the other."""
-    overlapped, in_turn = standalone(tiny), standalone(tiny)
-    for _ in range(4):
-        overlapped.training_step(batch, 0)
-        in_turn.training_step(batch, 0)
-        in_turn.catch_up()
-    overlapped.catch_up()
-    weights, expected = overlapped.model.state_dict(), in_turn.model.state_dict()
-    assert all(torch.equal(weights[name], expected[name]) for name in expected)
-    assert overlapped.metrics.keys() == in_turn.metrics.keys() >= {"actor", "reconstruction"}
-
-
-def test_an_update_changes_model_and_behaviour_and_their_snapshot(batch, tiny):
-    learner = standalone(tiny)
-    before = {name: value.clone() for name, value in learner.model.state_dict().items()}
-    learner.training_step(batch, 0)
-    moved = {name for name, value in learner.model.state_dict().items() if not torch.equal(value, before[name])}
-    assert any(name.startswith("dynamics") for name in moved)
-    assert not any(name.startswith(("actor", "value_head")) for name in moved)
-    learner.catch_up()
-    assert not torch.equal(learner.model.actor.mlp.output.weight, before["actor.mlp.output.weight"])
-    frozen, own = learner.snapshot.model, learner.model
-    assert torch.equal(frozen.dynamics.gates.weight, own.dynamics.gates.weight.bfloat16())
-    assert torch.equal(frozen.reward_head.mlp.output.weight, own.reward_head.mlp.output.weight)
-    assert frozen.actor is own.actor and not frozen.dynamics.gates.weight.requires_grad
-
-
-def test_what_fails_in_behaviour_is_raised_in_the_update(batch, tiny):
-    learner = standalone(tiny)
-    learner.training_step(batch, 0)
-    with torch.no_grad():
-        learner.model.value_head.mlp.output.bias.fill_(float("nan"))
-    with pytest.raises(FloatingPointError, match="not finite"):
-        learner.catch_up()
-
-
 def planned(mean, std):
     return torch.full((40, 1), mean), torch.full((40, 1), std)
 
