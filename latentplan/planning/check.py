@@ -12,7 +12,7 @@ from torch.utils._pytree import tree_leaves, tree_map, tree_structure
 from latentplan.planning.model import Model, State, action_dtype, count_rows, repeat_rows, state_device, supports
 
 _ROWS, _HORIZON = 4, 3
-_OPTIONAL = ("value", "policy", "continues", "uncertainty", "rollout", "particles")
+_OPTIONAL = ("value", "policy", "continues", "uncertainty", "rollout", "propose", "particles")
 
 
 @torch.no_grad()
@@ -84,6 +84,10 @@ def _optional_problems(model: Any, state: State, actions: Tensor) -> Iterator[st
         generator = torch.Generator(actions.device).manual_seed(0)
         for name, argument in (("policy()'s mode", None), ("policy()'s sample", generator)):
             yield from _vector_problems(name, model.policy(state, argument), tuple(actions[:, 0].shape))
+    if supports(model, "propose"):
+        generators = [torch.Generator(actions.device).manual_seed(row) for row in range(_ROWS)]
+        proposed = model.propose(state, 2, actions.shape[1], generators)
+        yield from _vector_problems("propose()", proposed, (2 * _ROWS, *actions.shape[1:]))
     if supports(model, "particles") and count_rows(model.particles(state, 2)) != 2 * _ROWS:
         yield f"particles() must return {2 * _ROWS} rows for {_ROWS} states and 2 particles"
 

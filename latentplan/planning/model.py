@@ -8,6 +8,8 @@ A model needs one method, `step`. What else it has is detected by name:
     continues(state) -> (rows,)                      probability that the episode goes on from this state
     uncertainty(state, action) -> (rows,)            doubt of the model about that step
     rollout(state, actions (rows, horizon, action)) -> (rewards (rows, horizon), last_state)     fused fast path
+    propose(state, num, horizon, generators) -> actions (batch num, horizon, action)    fused: what the policy would do,
+                                                     its mode first, then samples, one generator per row of state
     particles(state, num) -> state                   several versions of each row, batch-major: (batch num) rows
 
 Every output must depend on its own row only.

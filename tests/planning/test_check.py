@@ -29,6 +29,7 @@ def test_a_good_model_passes_and_its_abilities_are_listed(point):
         ({"continues": lambda state: state[:, 0] * float("inf")}, r"continues\(\) is NaN"),
         ({"uncertainty": lambda state, action: state}, r"uncertainty\(\) must have shape"),
         ({"rollout": lambda state, actions: (actions[:, :, 0], state)}, "does not agree with step"),
+        ({"propose": lambda state, num, horizon, generators: state}, r"propose\(\) must have shape"),
         ({"rollout": lambda state, actions: (actions, state)}, r"rollout\(\)'s rewards must have shape"),
         ({"particles": lambda state, num: state}, r"particles\(\) must return 8 rows"),
     ],
