@@ -95,7 +95,7 @@ class ModelAgent:
         raise AssertionError("an agent defines how it chooses")
 
     def _picture(self, state: State, actions: Tensor) -> np.ndarray:
-        """The decoded end of a plan (batch, horizon, action), uint8 (64, 64, 3), of the first environment."""
+        """The decoded end of a plan (batch, horizon, action), uint8 (32, 32, 3), of the first environment."""
         first = State(*(part[:1] for part in state))
         _, last = self.model.rollout(first, actions[:1].to(first.deter.dtype))
         return self.model.decoder.picture(last.features.float())[0].cpu().numpy()

@@ -84,7 +84,7 @@ class BackgroundAgent(ModelAgent):
 
     @torch.no_grad()
     def imagine(self) -> np.ndarray | None:
-        """The decoded last state of the plan in use, uint8 (64, 64, 3), of the first environment; None without one."""
+        """The decoded last state of the plan in use, uint8 (32, 32, 3), of the first environment; None without one."""
         remaining = self.scheduler.buffer.remaining(self.scheduler.tick - 1)
         if remaining is None or self.state is None:
             return None

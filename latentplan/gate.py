@@ -87,7 +87,7 @@ class GatedAgent(PlanningAgent):
 
     @torch.no_grad()
     def imagine(self) -> np.ndarray | None:
-        """The picture that the present plan leads to, uint8 (64, 64, 3), of the first environment; None without one."""
+        """The picture that the present plan leads to, uint8 (32, 32, 3), of the first environment; None without one."""
         source = self.last_source if isinstance(self.last_source, str) else self.last_source[0]
         return super().imagine() if source == "plan" else None
 

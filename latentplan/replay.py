@@ -213,7 +213,7 @@ class Replay:
             self._saved[lane] = self.written[lane] if np.array_equal(old, new) else 0
             self.episode[lane, new] = state["episode"].numpy()[lane, old]
             index = torch.from_numpy(new + lane * self.lane_size).to(self.device)
-            for name in [name for name in COLUMNS if name in state]:  # older runs kept no plans
+            for name in COLUMNS:
                 store = getattr(self, name)
                 store[index] = state[name][old + lane * saved_size].to(self.device)
             self._load_frames(folder / f"frames_{lane}.u8", min(written, saved_size), old, index)

@@ -110,7 +110,7 @@ def test_the_picture_is_of_the_plan_in_use(model, film):
     for frames in film[1:5]:
         agent.act(frames[0])
     picture = agent.imagine()
-    assert picture.shape == (64, 64, 3) and picture.dtype == np.uint8
+    assert picture.shape == (32, 32, 3) and picture.dtype == np.uint8
     assert agent.encode(film[0, 0]).shape == (32,)
 
 
