@@ -99,7 +99,7 @@ class LearningConfig:
         model_learning_rate: Adam step of encoder, dynamics, decoder, reward and continue heads.
         behaviour_learning_rate: Adam step of actor and value.
         max_grad_norm: Gradient norm at which each optimizer clips.
-        reconstruction_scale: Weight of the squared error summed over the picture.
+        reconstruction_scale: Weight of the squared error summed over the 32 x 32 picture.
         dynamics_scale: Weight of the KL that pulls the prior to the posterior.
         representation_scale: Weight of the KL that pulls the posterior to the prior.
         free_nats: KL below which neither is pulled.
@@ -121,7 +121,7 @@ class LearningConfig:
     model_learning_rate: float = 1e-3
     behaviour_learning_rate: float = 3e-4
     max_grad_norm: float = 100.0
-    reconstruction_scale: float = 1.0
+    reconstruction_scale: float = 4.0
     dynamics_scale: float = 1.0
     representation_scale: float = 0.1
     free_nats: float = 1.0

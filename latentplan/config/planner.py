@@ -33,9 +33,9 @@ class PlannerConfig:
         deadline_ms: Milliseconds that a search may take; null lets it do all its iterations.
     """
 
-    horizon: int = 6
-    num_samples: int = 192
-    num_elites: int = 24
+    horizon: int = 8
+    num_samples: int = 128
+    num_elites: int = 16
     num_iterations: int = 4
     warm_start_iterations: int = 2
     smoothing: float = 0.9
