@@ -15,6 +15,8 @@ from latentplan.models.encoder import Encoder
 from latentplan.models.heads import Actor, Mlp, ScalarHead, sample_action
 from latentplan.models.imagination import Weights, follow_actor, imagine, lay_out
 
+PROBE_SHARE = 3  # quantities lie near the surface of the latent: a narrow head reads them
+
 
 class WorldModel(nn.Module):
     """Everything an agent needs to see, imagine, judge and act.
@@ -44,7 +46,7 @@ class WorldModel(nn.Module):
         self._laid_out: Weights | None = None
         self.register_buffer("label_scales", torch.tensor(list(self.labels.values())), persistent=False)
         if self.labels:
-            self.probe_head = Mlp(features, config.hidden_dim, len(self.labels))
+            self.probe_head = Mlp(features, max(1, config.hidden_dim // PROBE_SHARE), len(self.labels))
 
     def trunk_precision(self, *, cache: bool = True) -> AbstractContextManager[None]:
         """Autocast to bfloat16 for the products in the trunk; heads leave it by themselves.
