@@ -25,7 +25,7 @@ class LatentPlanner:
 
     def plan(self, model: WorldModel, state: State, previous: Plan | None = None, **options: Any) -> Plan:
         """See `CEMPlanner.plan`."""
-        with model.trunk_precision():
+        with model.planning():
             return self.search.plan(model, state, previous, **options)
 
 

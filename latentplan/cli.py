@@ -234,3 +234,18 @@ def _flag_layer(flags: dict[str, str]) -> Layer:
             section, name = SHORT_FLAGS.get(flag, (flag[2:],))[0].split(".")
             layer.setdefault(section, {})[name] = value
     return layer
+
+
+def use_device(name: str, threads: int | None) -> str:
+    """`cpu` or `cuda`, as `--device` means it; sets `--threads` on the way, where it was given.
+
+    Raises:
+        UserError: The device cannot be used.
+    """
+    import torch
+
+    if threads is not None:
+        torch.set_num_threads(threads)
+    if name == "cuda" and not torch.cuda.is_available():
+        raise UserError("device 'cuda' is not usable here; give --device cpu")
+    return ("cuda" if torch.cuda.is_available() else "cpu") if name == "auto" else name

@@ -14,7 +14,7 @@ from datetime import datetime
 from pathlib import Path
 from typing import Any
 
-from latentplan.cli import read_flags, run_guarded
+from latentplan.cli import read_flags, run_guarded, use_device
 from latentplan.compose import build_config, field_names, raise_unknown
 from latentplan.config import DEVICES, DistillConfig, PlannerConfig, UserError, from_dict, to_dict
 
@@ -102,7 +102,7 @@ def _distill(argv: Sequence[str]) -> int:
 
     info = read_info(request.checkpoint) if request.checkpoint is not None else {}
     planner = _planner(request, info) if request.planner else None
-    device = _choose_device(request)
+    device = use_device(request.device, request.threads)
     from latentplan.training import distill, resume_distillation
 
     if request.resume is not None:
@@ -121,16 +121,6 @@ def _planner(request: DistillRequest, info: dict[str, Any]) -> PlannerConfig:
     except ValueError as error:
         raise UserError(f"{request.checkpoint} has settings of another version: {error}") from None
     return build_config({"planner": {**trained, **request.planner}}).planner
-
-
-def _choose_device(request: DistillRequest) -> str:
-    import torch
-
-    if request.threads is not None:
-        torch.set_num_threads(request.threads)
-    if request.device == "cuda" and not torch.cuda.is_available():
-        raise UserError("device 'cuda' is not usable here; give --device cpu")
-    return "cuda" if request.device == "auto" and torch.cuda.is_available() else request.device.replace("auto", "cpu")
 
 
 def _setting_kinds() -> dict[str, type]:

@@ -12,7 +12,7 @@ import sys
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
-from latentplan.cli import run_guarded
+from latentplan.cli import run_guarded, use_device
 from latentplan.compose import build_config
 from latentplan.config import EnvConfig, PlannerConfig, UserError, from_dict, to_dict
 from latentplan.evaluation_request import (
@@ -71,7 +71,7 @@ def _evaluate(argv: Sequence[str]) -> int:
         raise UserError(f"{request.checkpoint} has settings of another version: {error}") from None
     planner = build_config({"planner": {**to_dict(config.planner), **request.planner}}).planner
     overrides = {name: getattr(planner, name) for name in request.planner}
-    device = _choose_device(request)
+    device = use_device(request.device, request.threads)
     from latentplan.envs import make_env
     from latentplan.scoring import read_goals, score_env
 
@@ -164,13 +164,3 @@ def _report(request: EvaluationRequest, result: dict[str, Any]) -> None:
         partial = request.json.with_name(f".{request.json.name}.{os.getpid()}")
         partial.write_text(json.dumps(result, indent=2) + "\n")
         partial.replace(request.json)
-
-
-def _choose_device(request: EvaluationRequest) -> str:
-    import torch
-
-    if request.threads is not None:
-        torch.set_num_threads(request.threads)
-    if request.device == "cuda" and not torch.cuda.is_available():
-        raise UserError("device 'cuda' is not usable here; give --device cpu")
-    return "cuda" if request.device == "auto" and torch.cuda.is_available() else request.device.replace("auto", "cpu")

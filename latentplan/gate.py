@@ -116,7 +116,7 @@ class GatedAgent(PlanningAgent):
         action, _ = self.model.actor(state.features)
         is_planned = self._is_doubtful(state, action, self._is_first) | self._is_first
         if bool(is_planned.any()):
-            with self.model.trunk_precision():
+            with self.model.planning():
                 planned = self.controller.act_where(state, is_planned)
             action[is_planned.to(action.device)] = planned.to(action.dtype)
         else:

@@ -178,16 +178,16 @@ def _predict_open_loop(
         return sequence.unfold(1, horizon, horizon).movedim(-1, 2).flatten(0, 1)
 
     starts = [part[:, :-1].detach()[:, ::horizon][:, : length // horizon].flatten(0, 1) for part in states]
-    state, deters, stochs = State(*starts), [], []
+    state, deters, priors = State(*starts), [], []
     for action in windows(batch.actions).unbind(1):
         deter = model.dynamics.advance(state, action)
-        state = State(deter, model.dynamics.prior(deter).mean)
+        priors.append(model.dynamics.prior(deter))
+        state = State(deter, priors[-1].mean)
         deters.append(deter)
-        stochs.append(state.stoch)
-    deter = torch.stack(deters, 1)
+    prior = Gaussian(*(torch.stack(part, 1) for part in zip(*priors, strict=True)))
     seen = Gaussian(*(windows(part[:, 1:].detach()) for part in posterior))
-    divergence = _free_kl(seen, model.dynamics.prior(deter), config.free_nats)
-    features = State(deter, torch.stack(stochs, 1)).features
+    divergence = _free_kl(seen, prior, config.free_nats)
+    features = State(torch.stack(deters, 1), prior.mean).features
     return divergence, rearrange(
         features, "(batch window) time ... -> batch (window time) ...", batch=len(batch.actions)
     )

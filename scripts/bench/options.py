@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from latentplan.cli import use_device
 from latentplan.compose import PRESETS, Layer, compose, raise_unknown
 from latentplan.config import DEVICES, Config, UserError
 
@@ -152,8 +153,4 @@ def choose_device(flags: Flags) -> torch.device:
     threads = whole_number(flags, "--threads", 1) if "--threads" in flags else None
     import torch
 
-    if threads is not None:
-        torch.set_num_threads(threads)
-    if name == "cuda" and not torch.cuda.is_available():
-        raise UserError("device 'cuda' is not usable here; give --device cpu")
-    return torch.device(("cuda" if torch.cuda.is_available() else "cpu") if name == "auto" else name)
+    return torch.device(use_device(name, threads))

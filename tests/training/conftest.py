@@ -5,6 +5,7 @@ from dataclasses import replace
 import gymnasium
 import numpy as np
 import pytest
+import torch
 
 from latentplan.config import (
     CollectionConfig,
@@ -16,6 +17,7 @@ from latentplan.config import (
     PlannerConfig,
     RunConfig,
 )
+from latentplan.replay import Batch
 
 TINY = Config(
     env=EnvConfig(action_repeat=1),
@@ -68,3 +70,18 @@ def tiny():
         return replace(config, run=replace(config.run, run_dir=str(folder)))
 
     return make
+
+
+@pytest.fixture
+def batch():
+    rng = np.random.default_rng(0)
+    return Batch(
+        frames=torch.as_tensor(rng.integers(0, 256, (4, 6, 64, 64, 3), dtype=np.uint8)),
+        deter=torch.zeros(4, 16),
+        actions=torch.as_tensor(rng.uniform(-1, 1, (4, 5, 1)).astype(np.float32)),
+        rewards=torch.as_tensor(rng.uniform(-1, 1, (4, 5)).astype(np.float32)),
+        continues=torch.ones(4, 5),
+        labels=torch.zeros(4, 6, 0),
+        rows=torch.arange(24).reshape(4, 6),
+        plan=torch.zeros(4, 5, 2),
+    )

@@ -1,11 +1,10 @@
 """What is learned, and what must not be learned from it."""
 
-import numpy as np
 import pytest
 import torch
 
 from latentplan.models import Gaussian, State, WorldModel, kl_divergence
-from latentplan.replay import Batch, Replay
+from latentplan.replay import Replay
 from latentplan.training.losses import imagine, imitation_loss, lambda_return, world_model_loss
 from latentplan.training.module import Learner
 
@@ -19,21 +18,6 @@ def model(tiny):
             head.mlp.output.weight.normal_(std=0.3)
         model.continue_head.output.weight.normal_(std=0.3)
     return model
-
-
-@pytest.fixture
-def batch():
-    rng = np.random.default_rng(0)
-    return Batch(
-        frames=torch.as_tensor(rng.integers(0, 256, (4, 6, 64, 64, 3), dtype=np.uint8)),
-        deter=torch.zeros(4, 16),
-        actions=torch.as_tensor(rng.uniform(-1, 1, (4, 5, 1)).astype(np.float32)),
-        rewards=torch.as_tensor(rng.uniform(-1, 1, (4, 5)).astype(np.float32)),
-        continues=torch.ones(4, 5),
-        labels=torch.zeros(4, 6, 0),
-        rows=torch.arange(24).reshape(4, 6),
-        plan=torch.zeros(4, 5, 2),
-    )
 
 
 @pytest.fixture

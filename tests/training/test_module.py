@@ -1,27 +1,11 @@
 """The learner: model and behaviour side by side, as if one after the other."""
 
-import numpy as np
 import pytest
 import torch
 
 from latentplan.models import WorldModel
-from latentplan.replay import Batch, Replay
+from latentplan.replay import Replay
 from latentplan.training.module import Learner
-
-
-@pytest.fixture
-def batch():
-    rng = np.random.default_rng(0)
-    return Batch(
-        frames=torch.as_tensor(rng.integers(0, 256, (4, 6, 64, 64, 3), dtype=np.uint8)),
-        deter=torch.zeros(4, 16),
-        actions=torch.as_tensor(rng.uniform(-1, 1, (4, 5, 1)).astype(np.float32)),
-        rewards=torch.as_tensor(rng.uniform(-1, 1, (4, 5)).astype(np.float32)),
-        continues=torch.ones(4, 5),
-        labels=torch.zeros(4, 6, 0),
-        rows=torch.arange(24).reshape(4, 6),
-        plan=torch.zeros(4, 5, 2),
-    )
 
 
 class Standalone(Learner):
