@@ -34,18 +34,29 @@ class ModelAgent:
         model: The world model; put into evaluation mode and never changed.
         config: Settings it was trained with.
         noise_std: Standard deviation of Gaussian noise added to each action, for exploration.
+        noise_correlation: Of that noise between one decision and the next, in [0, 1).
         seed: Of the agent's own random stream.
     """
 
     last_source: str | list[str] = "actor"
 
-    def __init__(self, model: WorldModel, config: Config, *, noise_std: float = 0.0, seed: int = 0) -> None:
-        self.model, self.config, self.noise_std = model.eval(), config, noise_std
+    def __init__(
+        self,
+        model: WorldModel,
+        config: Config,
+        *,
+        noise_std: float = 0.0,
+        noise_correlation: float = 0.0,
+        seed: int = 0,
+    ) -> None:
+        self.model, self.config = model.eval(), config
+        self.noise_std, self.noise_correlation = noise_std, noise_correlation
         self.num_actions = model.action_dim
         self.generator = torch.Generator(model.device)
         self.state: State | None = None
         self._action: Tensor | None = None
         self._forget: Tensor | None = None
+        self._noise: Tensor | None = None
         self._weights = reflex.lay_out(model)
         self.seed(seed)
 
@@ -56,7 +67,7 @@ class ModelAgent:
     def reset(self, mask: np.ndarray | None = None) -> None:
         """Forget the past, everywhere or in the environments where mask (batch,) is true."""
         if mask is None or self.state is None:
-            self.state = self._action = self._forget = None
+            self.state = self._action = self._forget = self._noise = None
         else:
             forget = torch.tensor(mask, dtype=torch.bool, device=self.model.device)
             self._forget = forget if self._forget is None else self._forget | forget
@@ -73,8 +84,7 @@ class ModelAgent:
         state = self._believe(frames)
         action = self._choose(state)
         if self.noise_std > 0.0:
-            noise = torch.randn(action.shape, generator=self.generator, device=action.device)
-            action = (action + self.noise_std * noise).clamp(-1.0, 1.0)
+            action = (action + self.noise_std * self._explore(action)).clamp(-1.0, 1.0)
         self.state, self._action, self._forget = state, action, None
         result = action.float().cpu().numpy()
         return result[0] if single else result
@@ -90,6 +100,20 @@ class ModelAgent:
     def imagine(self) -> np.ndarray | None:
         """The picture an agent looks forward to, uint8 (32, 32, 3); None without a plan."""
         return None
+
+    def _explore(self, action: Tensor) -> Tensor:
+        """Standard normal noise of the action's shape, correlated with that of the decision before (an AR(1) process).
+
+        White noise hardly moves a heavy body: what it pushes now it takes back at the next decision.
+        """
+        fresh = torch.randn(action.shape, generator=self.generator, device=action.device)
+        if self._noise is None or self.noise_correlation == 0.0:
+            self._noise = fresh
+            return fresh
+        kept = self.noise_correlation
+        noise = kept * self._noise + (1.0 - kept**2) ** 0.5 * fresh
+        self._noise = noise if self._forget is None else torch.where(self._forget[:, None], fresh, noise)
+        return self._noise
 
     def _choose(self, state: State) -> Tensor:
         raise AssertionError("an agent defines how it chooses")
@@ -130,6 +154,7 @@ class PlanningAgent(ModelAgent):
         discount: Per decision, as learned.
         planner: Settings of the search; None takes those of `config`.
         noise_std: Of exploration noise.
+        noise_correlation: Of exploration noise, between decisions.
         seed: Of the agent's own random stream.
     """
 
@@ -143,9 +168,10 @@ class PlanningAgent(ModelAgent):
         *,
         planner: PlannerConfig | None = None,
         noise_std: float = 0.0,
+        noise_correlation: float = 0.0,
         seed: int = 0,
     ) -> None:
-        super().__init__(model, config, noise_std=noise_std, seed=seed)
+        super().__init__(model, config, noise_std=noise_std, noise_correlation=noise_correlation, seed=seed)
         search = CEMPlanner.from_config(planner or config.planner, action_dim=model.action_dim, discount=discount)
         self.controller = ModelPredictiveController(search, model, generator=self.generator)
 
@@ -213,11 +239,20 @@ class ActorAgent(ModelAgent):
         model: The world model.
         config: Settings it was trained with.
         explore: Whether actions are sampled.
+        noise_correlation: Of the samples, between decisions.
         seed: Of the agent's own random stream.
     """
 
-    def __init__(self, model: WorldModel, config: Config, *, explore: bool = False, seed: int = 0) -> None:
-        super().__init__(model, config, seed=seed)
+    def __init__(
+        self,
+        model: WorldModel,
+        config: Config,
+        *,
+        explore: bool = False,
+        noise_correlation: float = 0.0,
+        seed: int = 0,
+    ) -> None:
+        super().__init__(model, config, noise_correlation=noise_correlation, seed=seed)
         self.explore = explore
 
     @torch.inference_mode()
@@ -233,8 +268,7 @@ class ActorAgent(ModelAgent):
         mean, std = reflex.act(self._weights, state)
         if not self.explore:
             return mean
-        noise = torch.randn(mean.shape, generator=self.generator, device=mean.device)
-        return sample_action(mean, std, noise)
+        return sample_action(mean, std, self._explore(mean))
 
 
 class RandomAgent:

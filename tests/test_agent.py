@@ -215,3 +215,28 @@ def test_random_actions_fill_the_bounds_and_repeat_with_their_seed(film):
     agent.seed(4)
     assert np.array_equal(agent.act(film[0]), actions[0])
     assert agent.act(film[0, 0]).shape == (2,) and agent.imagine() is None
+
+
+def _noises(agent, frames, decisions):
+    """The noise of each decision, (decision, batch, action), where the agent's own choice is known."""
+    return torch.stack([agent._explore(torch.zeros(frames, 2)) for _ in range(decisions)])
+
+
+@pytest.mark.parametrize("correlation", [0.0, 0.8])
+def test_noise_keeps_its_variance_and_has_the_correlation_asked_for(correlation, model):
+    noise = _noises(make_actor(model, explore=True, noise_correlation=correlation), 2000, 20)
+    assert noise.var() == pytest.approx(1.0, abs=0.03)
+    lags = [(noise[lag:] * noise[: 20 - lag]).mean().item() for lag in (1, 2)]
+    assert lags == pytest.approx([correlation, correlation**2], abs=0.03)
+
+
+def test_a_new_episode_forgets_the_noise_of_the_last(model, film):
+    kept, reset = (make_actor(model, explore=True, noise_correlation=0.99, seed=3) for _ in range(2))
+    for agent in (kept, reset):
+        agent.act(film[0])
+    first = reset._noise
+    reset.reset(np.array([True] + [False] * (len(film[0]) - 1)))
+    for agent in (kept, reset):
+        agent.act(film[1])
+    assert torch.equal(kept._noise[1:], reset._noise[1:])
+    assert not torch.allclose(first[0], reset._noise[0], atol=0.3)

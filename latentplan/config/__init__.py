@@ -157,6 +157,7 @@ class CollectionConfig:
     Attributes:
         behaviour: Who acts while collecting: `planner`, `actor`, or `both` in alternate rounds.
         noise_std: Standard deviation of the noise added to the planner's action.
+        noise_correlation: Of the planner's and the actor's noise between one decision and the next, in [0, 1).
         prefill_decisions: Random decisions before learning starts.
         round_decisions: Decisions per epoch: this many are collected, then learned from.
         updates_per_decision: Updates per collected decision (the replay ratio, in updates).
@@ -165,6 +166,7 @@ class CollectionConfig:
 
     behaviour: str = "planner"
     noise_std: float = 0.2
+    noise_correlation: float = 0.0
     prefill_decisions: int = 1000
     round_decisions: int = 250
     updates_per_decision: float = 0.5
@@ -173,6 +175,7 @@ class CollectionConfig:
     def __post_init__(self) -> None:
         one_of(self, behaviour=BEHAVIOURS)
         at_least(self, noise_std=0.0, prefill_decisions=1, round_decisions=1)
+        within(self, noise_correlation=(0.0, 0.99))
         above_zero(self, "updates_per_decision")
 
 

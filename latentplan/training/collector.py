@@ -83,10 +83,12 @@ class Collector:
         self.discount = discount = config.learning.discount or _discount_for(self._decisions)
         self.labels: dict[str, float] = getattr(self._eval_env.unwrapped, "labels", {})
         self.model = WorldModel(config.model, action_dim, self.labels).to(device)
-        noise = config.collection.noise_std
+        noise, correlation = config.collection.noise_std, config.collection.noise_correlation
         self._agents: dict[str, ModelAgent] = {
-            "planner": PlanningAgent(self.model, config, discount, noise_std=noise),
-            "actor": ActorAgent(self.model, config, explore=True),
+            "planner": PlanningAgent(
+                self.model, config, discount, noise_std=noise, noise_correlation=correlation
+            ),
+            "actor": ActorAgent(self.model, config, explore=True, noise_correlation=correlation),
         }
         self._judged: dict[str, ModelAgent] = {
             "planner": PlanningAgent(self.model, config, discount),
