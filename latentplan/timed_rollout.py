@@ -4,8 +4,8 @@ Time is counted, not slept. One decision of the environment lasts one period of 
 a thought of d milliseconds takes d of them from the world:
 
 - Decisions begin at the boundaries between periods, with the frame of that moment.
-- What was decided acts d milliseconds later, from the simulator's next substep on. Until then the last action holds,
-  and at an episode's start zeros, clamped into the bounds.
+- What was decided acts d milliseconds later, from the simulator's nearest substep on. Until then the last action
+  holds, and at an episode's start zeros, clamped into the bounds.
 - An agent that still thinks at a boundary misses it: it never sees that frame, the old action holds on, and it
   decides next at the first boundary at which it has finished. Each boundary missed is a deadline miss.
 - A plan made beside the decisions is there once it has been asked for and its own duration has passed; it takes
@@ -35,7 +35,7 @@ from latentplan.virtual_clock import VirtualClock, VirtualExecutor
 Action = NDArray[np.float32]
 
 WARM_UP_DECISIONS = 2
-_ROUNDING = 1e-9  # substeps; a thought that ends with a substep acts in the next one, whatever its last digit says
+_ROUNDING = 1e-9  # periods; a thought that ends with a period has not missed its end, whatever its last digit says
 
 
 class ScheduledEnv(Protocol):
@@ -80,11 +80,12 @@ class Motors:
         self.substeps = substeps
         self._held = self._coming = rest
         self._wait = 0  # substeps until what comes takes over
+        self._thought = 0.0  # periods until it is thought through
 
     @property
     def is_waiting(self) -> bool:
         """Whether an action is still being thought about."""
-        return self._wait > 0
+        return self._thought > _ROUNDING
 
     @property
     def latest(self) -> Action:
@@ -94,12 +95,12 @@ class Motors:
     def order(self, action: Action, late_periods: float) -> None:
         """Lets an action (action,) take over, so many periods from now."""
         self._held, self._coming = self._coming, action
-        self._wait = math.ceil(late_periods * self.substeps - _ROUNDING)
+        self._wait, self._thought = math.floor(late_periods * self.substeps + 0.5), late_periods
 
     def next_period(self) -> list[tuple[Action, int]]:
         """The actions of the coming period and their substeps."""
         before = min(self._wait, self.substeps)
-        self._wait -= before
+        self._wait, self._thought = self._wait - before, self._thought - 1.0
         parts = [(self._held, before), (self._coming, self.substeps - before)]
         return [(action, count) for action, count in parts if count > 0]
 

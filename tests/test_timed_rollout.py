@@ -76,8 +76,8 @@ def test_an_action_acts_as_late_as_its_decision_took():
     assert episode.deadline_misses == 0
 
 
-@pytest.mark.parametrize(("milliseconds", "late"), [(0.01, 1), (5.0, 1), (5.01, 2), (49.9, 10), (50.0, 10)])
-def test_an_action_waits_for_the_next_substep(milliseconds, late):
+@pytest.mark.parametrize(("milliseconds", "late"), [(0.4, 0), (2.4, 0), (2.6, 1), (5.0, 1), (48.0, 10), (50.0, 10)])
+def test_an_action_waits_for_the_nearest_substep(milliseconds, late):
     tape, _, episode = play(milliseconds)
     assert tape[0] == [0.0] * late + [1.0] * (SUBSTEPS - late)
     assert episode.deadline_misses == 0
@@ -89,6 +89,12 @@ def test_a_thought_of_exactly_one_period_misses_nothing(control_hz):
     assert seen == [0, 1, 2, 3]
     assert tape == [[float(action)] * SUBSTEPS for action in (0, 1, 2, 3)]
     assert episode.deadline_misses == 0
+
+
+def test_a_boundary_is_missed_by_any_part_of_a_substep():
+    tape, seen, episode = play(51.0)
+    assert (seen, episode.deadline_misses) == ([0, 2], 2)
+    assert tape == [[0.0] * 10, [1.0] * 10, [1.0] * 10, [2.0] * 10]
 
 
 def test_a_busy_agent_misses_boundaries_and_decides_at_the_next_one():
