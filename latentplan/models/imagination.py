@@ -2,8 +2,8 @@
 
 Equals `WorldModel.step` taken again and again, with the same arithmetic arranged for speed: weights are turned and cast
 once, the actions' share of the input is computed for all steps at once, the prior's std is left out, rows go through
-in blocks that stay in the cache, and the gates meet in float32, where the elementwise functions are fastest. Nothing is
-written in place, so that plans can be refined by gradients.
+in blocks that stay in the cache, and what stands between the products is fused (`latentplan.models.kernels`). Where
+gradients are asked for nothing is written in place, so that plans can be refined by them.
 """
 
 from __future__ import annotations
@@ -16,11 +16,10 @@ from torch.nn import functional
 
 from latentplan.models.dynamics import Rssm, State
 from latentplan.models.heads import Actor, Mlp, NormedLinear, ScalarHead, action_distribution
+from latentplan.models.kernels import Norm, expectation, gates, norm_silu
 
 ROWS_PER_THREAD = 1024  # what one step makes of more rows no longer fits a core's cache
 BIN_MULTIPLE = 16  # float32 products with another number of columns take half as long again
-
-Norm = tuple[Tensor, Tensor]  # scale and shift
 
 
 class Weights(NamedTuple):
@@ -55,7 +54,8 @@ def lay_out(dynamics: Rssm, head: ScalarHead, actor: Actor, dtype: torch.dtype) 
         return weight.to(dtype).t().contiguous()
 
     def norm(layer: nn.LayerNorm) -> Norm:
-        return layer.weight.to(dtype), layer.bias.to(dtype)
+        kind = torch.float32 if layer.weight.device.type == "cpu" else dtype  # only there the two may differ
+        return layer.weight.to(kind), layer.bias.to(kind)
 
     latent, deter = dynamics.latent_dim, dynamics.deter_dim
     input_weight, output = dynamics.input.linear.weight, head.mlp.output
@@ -149,20 +149,15 @@ def _step(
     weights: Weights, deter: Tensor, rounded: Tensor, stoch: Tensor, push: Tensor
 ) -> tuple[Tensor, Tensor, Tensor]:
     """The next deter, the same rounded to the products' dtype, and the mean of the prior there."""
-    deter = _advance(weights, deter, rounded, stoch, push)
-    rounded = deter.to(stoch.dtype)
+    deter, rounded = _advance(weights, deter, rounded, stoch, push)
     hidden = _layer(rounded, weights.prior, weights.prior_norm)
     return deter, rounded, torch.addmm(weights.mean_shift, hidden, weights.mean)
 
 
-def _advance(weights: Weights, deter: Tensor, rounded: Tensor, stoch: Tensor, push: Tensor) -> Tensor:
-    """The next deter (rows, deter), float32; `push` (rows, hidden) is the action's share of the input."""
-    hidden = _normed(torch.addmm(push, stoch, weights.stoch), weights.input_norm)
-    product = torch.cat([hidden, rounded], -1) @ weights.gates
-    gates = functional.layer_norm(product.float(), product.shape[-1:], *weights.gates_norm)
-    reset, candidate, update = gates.chunk(3, -1)
-    candidate = 2.0 * torch.sigmoid(torch.sigmoid(reset) * candidate) - 1.0
-    return torch.lerp(deter, candidate, torch.sigmoid(update))
+def _advance(weights: Weights, deter: Tensor, rounded: Tensor, stoch: Tensor, push: Tensor) -> tuple[Tensor, Tensor]:
+    """The next deter (rows, deter), float32 and rounded; `push` (rows, hidden) is the action's share of the input."""
+    hidden = norm_silu(torch.addmm(push, stoch, weights.stoch), weights.input_norm)
+    return gates(torch.cat([hidden, rounded], -1) @ weights.gates, weights.gates_norm, deter)
 
 
 def _rewards(weights: Weights, seen: list[Tensor]) -> Tensor:
@@ -171,12 +166,8 @@ def _rewards(weights: Weights, seen: list[Tensor]) -> Tensor:
     for weight, norm in weights.head:
         features = _layer(features, weight, norm)
     logits = torch.addmm(weights.logits_shift, features.float(), weights.logits)
-    return (logits.softmax(-1) @ weights.values).unflatten(0, (len(seen), -1)).t()
+    return expectation(logits, weights.values).unflatten(0, (len(seen), -1)).t()
 
 
 def _layer(features: Tensor, weight: Tensor, norm: Norm) -> Tensor:
-    return _normed(features @ weight, norm)
-
-
-def _normed(product: Tensor, norm: Norm) -> Tensor:
-    return functional.silu(functional.layer_norm(product, product.shape[-1:], *norm))
+    return norm_silu(features @ weight, norm)

@@ -85,9 +85,7 @@ class Collector:
         self.model = WorldModel(config.model, action_dim, self.labels).to(device)
         noise, correlation = config.collection.noise_std, config.collection.noise_correlation
         self._agents: dict[str, ModelAgent] = {
-            "planner": PlanningAgent(
-                self.model, config, discount, noise_std=noise, noise_correlation=correlation
-            ),
+            "planner": PlanningAgent(self.model, config, discount, noise_std=noise, noise_correlation=correlation),
             "actor": ActorAgent(self.model, config, explore=True, noise_correlation=correlation),
         }
         self._judged: dict[str, ModelAgent] = {

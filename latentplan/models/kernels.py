@@ -1,0 +1,140 @@
+"""What stands between the matrix products of imagination, fused: one pass over each row instead of many.
+
+The C source beside this file is compiled by the machine's own compiler when it is first needed (a second), and kept in
+the user's cache. Where there is no compiler, on devices other than the CPU, and where gradients are asked for, the same
+is done in torch; so it is when `LATENTPLAN_KERNELS=0`.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import functools
+import hashlib
+import os
+import platform
+import shutil
+import subprocess
+import tempfile
+from pathlib import Path
+
+import torch
+from torch import Tensor
+from torch.nn import functional
+
+SOURCE = Path(__file__).with_name("kernels.c")
+# Sums may be taken in any order, without which none would be a vector's; nothing else of IEEE 754 is given up.
+ARITHMETIC = ("-fassociative-math", "-fno-signed-zeros", "-fno-trapping-math", "-fno-math-errno")
+FLAGS = ("-O3", "-march=native", *ARITHMETIC, "-fopenmp", "-shared", "-fPIC")
+WIDE = "-mprefer-vector-width=512"  # x86 compilers know it
+LONGEST_ROW = 4096  # as in the source
+COMPILE_SECONDS = 60
+DTYPES = {torch.bfloat16: "bfloat16", torch.float32: "float32"}
+
+Norm = tuple[Tensor, Tensor]  # scale and shift
+
+
+def norm_silu(product: Tensor, norm: Norm) -> Tensor:
+    """SiLU of the layer norm of rows (..., size), in the product's dtype; may overwrite the product."""
+    library = _library_for(product, product.shape[-1])
+    if library is None:
+        return functional.silu(functional.layer_norm(product, product.shape[-1:], *norm))
+    rows, size = product.numel() // product.shape[-1], product.shape[-1]
+    kernel = getattr(library, f"norm_silu_{DTYPES[product.dtype]}")
+    kernel(product.data_ptr(), *_places(*norm), rows, size, torch.get_num_threads())
+    return product
+
+
+def gates(product: Tensor, norm: Norm, deter: Tensor) -> tuple[Tensor, Tensor]:
+    """The next deterministic state of a recurrence whose update gate moves it towards its candidate.
+
+    Args:
+        product: Reset, candidate and update gate before their norm, side by side, (rows, 3 deter).
+        norm: Of the gates, float32; a factor of 2 for the candidate, tanh(x) = 2 sigmoid(2 x) - 1, is included.
+        deter: The state before, float32 (rows, deter).
+
+    Returns:
+        The state, float32 (rows, deter), and the same in the product's dtype.
+    """
+    library = None if deter.requires_grad else _library_for(product, product.shape[-1])
+    if library is None:
+        normed = functional.layer_norm(product.float(), product.shape[-1:], *norm)
+        reset, candidate, update = normed.chunk(3, -1)
+        candidate = 2.0 * torch.sigmoid(torch.sigmoid(reset) * candidate) - 1.0
+        following = torch.lerp(deter, candidate, torch.sigmoid(update))
+        return following, following.to(product.dtype)
+    deter = deter.contiguous()
+    following, rounded = torch.empty_like(deter), torch.empty_like(deter, dtype=product.dtype)
+    kernel = getattr(library, f"gates_{DTYPES[product.dtype]}")
+    places = _places(product, *norm, deter, following, rounded)
+    kernel(*places, *deter.shape, torch.get_num_threads())
+    return following, rounded
+
+
+def expectation(logits: Tensor, values: Tensor) -> Tensor:
+    """The mean (rows,) of values (bin,) under the softmax of float32 logits (rows, bin)."""
+    library = _library_for(logits, logits.shape[-1])
+    if library is None:
+        return logits.softmax(-1) @ values
+    means = logits.new_empty(len(logits))
+    library.expectation(*_places(logits, values, means), *logits.shape, torch.get_num_threads())
+    return means
+
+
+def _library_for(rows: Tensor, size: int) -> ctypes.CDLL | None:
+    """The compiled kernels, if they can do what is asked for."""
+    known = rows.device.type == "cpu" and rows.dtype in DTYPES and size <= LONGEST_ROW and rows.is_contiguous()
+    return load() if known and not rows.requires_grad else None
+
+
+def _places(*tensors: Tensor) -> list[ctypes.c_void_p]:
+    return [ctypes.c_void_p(tensor.data_ptr()) for tensor in tensors]
+
+
+@functools.cache
+def load() -> ctypes.CDLL | None:
+    """The compiled kernels; None where they are switched off or cannot be made."""
+    if os.environ.get("LATENTPLAN_KERNELS") == "0":
+        return None
+    try:
+        library = ctypes.CDLL(str(_compiled()))
+    except (OSError, subprocess.SubprocessError):
+        return None
+    place, count, threads = ctypes.c_void_p, ctypes.c_long, ctypes.c_int
+    for dtype in DTYPES.values():
+        getattr(library, f"norm_silu_{dtype}").argtypes = [place] * 3 + [count, count, threads]
+        getattr(library, f"gates_{dtype}").argtypes = [place] * 6 + [count, count, threads]
+    library.expectation.argtypes = [place] * 3 + [count, count, threads]
+    return library
+
+
+def _compiled() -> Path:
+    """Where the compiled kernels are, after compiling them if this machine has not done so before.
+
+    Raises:
+        OSError: There is no compiler, or nowhere to write.
+        subprocess.SubprocessError: The compiler failed.
+    """
+    compiler = os.environ.get("CC") or next(filter(shutil.which, ("cc", "gcc", "clang")), None)
+    if compiler is None:
+        raise FileNotFoundError("no C compiler")
+    wide = [WIDE] if platform.machine() in ("x86_64", "AMD64") else []
+    command = [*compiler.split(), *FLAGS, *wide, str(SOURCE)]
+    key = hashlib.sha256("\n".join([*command, _processor(), SOURCE.read_text()]).encode()).hexdigest()[:16]
+    home = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "latentplan"
+    library = home / f"kernels-{key}.so"
+    if not library.exists():
+        home.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryDirectory(dir=home) as folder:  # another process may be at it too: the last one wins
+            fresh = Path(folder) / library.name
+            subprocess.run([*command, "-o", str(fresh)], check=True, capture_output=True, timeout=COMPILE_SECONDS)
+            os.replace(fresh, library)
+    return library
+
+
+def _processor() -> str:
+    """What code made for this processor depends on."""
+    try:
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+    except OSError:
+        return platform.processor()
+    return next((line for line in lines if line.startswith(("flags", "Features"))), "")
