@@ -23,10 +23,7 @@ BIN_MULTIPLE = 16  # float32 products with another number of columns take half a
 
 
 class Weights(NamedTuple):
-    """Recurrence, reward head and actor, laid out for products from the left: (in, out).
-
-    Into the gates' norm go the 1 that the update gate subtracts, and the factor 2 of tanh(x) = 2 sigmoid(2 x) - 1.
-    """
+    """Recurrence, reward head and actor, laid out for products from the left: (in, out)."""
 
     action: Tensor
     stoch: Tensor
@@ -57,12 +54,8 @@ def lay_out(dynamics: Rssm, head: ScalarHead, actor: Actor, dtype: torch.dtype) 
         kind = torch.float32 if layer.weight.device.type == "cpu" else dtype  # only there the two may differ
         return layer.weight.to(kind), layer.bias.to(kind)
 
-    latent, deter = dynamics.latent_dim, dynamics.deter_dim
+    latent = dynamics.latent_dim
     input_weight, output = dynamics.input.linear.weight, head.mlp.output
-    scale, shift = (part.float().clone() for part in (dynamics.gates_norm.weight, dynamics.gates_norm.bias))
-    scale[deter : 2 * deter] *= 2.0
-    shift[deter : 2 * deter] *= 2.0
-    shift[2 * deter :] -= 1.0
 
     def trunk(mlp: Mlp) -> tuple[tuple[Tensor, Norm], ...]:
         layers = [layer for layer in mlp.trunk if isinstance(layer, NormedLinear)]
@@ -74,7 +67,7 @@ def lay_out(dynamics: Rssm, head: ScalarHead, actor: Actor, dtype: torch.dtype) 
         stoch=turn(input_weight[:, :latent]),
         input_norm=norm(dynamics.input.norm),
         gates=turn(dynamics.gates.weight),
-        gates_norm=(scale, shift),
+        gates_norm=(dynamics.gates_norm.weight.float(), dynamics.gates_norm.bias.float()),
         prior=turn(dynamics.prior_hidden.linear.weight),
         prior_norm=norm(dynamics.prior_hidden.norm),
         mean=turn(dynamics.prior_output.weight[:latent]),

@@ -9,6 +9,10 @@
 #define NORM_EPS 1e-5f
 #define ROWS_PER_THREAD 16
 
+#define PRAGMA(TEXT) _Pragma(#TEXT)
+#define VECTOR(HOW) PRAGMA(omp simd HOW)
+#define PARALLEL PRAGMA(omp parallel for schedule(static) num_threads(threads) if (rows >= threads * ROWS_PER_THREAD))
+
 typedef uint16_t bfloat16;
 
 static inline float read_bfloat16(bfloat16 half) {
@@ -51,12 +55,12 @@ static inline float sigmoid(float x) { return 1.0f / (1.0f + exponential(-x)); }
 // Reads a row, and finds its mean and what its deviations are multiplied with to have a variance of 1.
 #define MOMENTS(READ)                                                                                          \
     float row[LONGEST_ROW], sum = 0.0f, squares = 0.0f;                                                        \
-    _Pragma("omp simd reduction(+ : sum)") for (long i = 0; i < length; i++) {                                 \
+    VECTOR(reduction(+ : sum)) for (long i = 0; i < length; i++) {                                             \
         row[i] = READ(place[i]);                                                                               \
         sum += row[i];                                                                                         \
     }                                                                                                          \
     float mean = sum / (float)length;                                                                          \
-    _Pragma("omp simd reduction(+ : squares)") for (long i = 0; i < length; i++) {                             \
+    VECTOR(reduction(+ : squares)) for (long i = 0; i < length; i++) {                                         \
         squares += (row[i] - mean) * (row[i] - mean);                                                          \
     }                                                                                                          \
     float factor = 1.0f / sqrtf(squares / (float)length + NORM_EPS);
@@ -65,11 +69,10 @@ static inline float sigmoid(float x) { return 1.0f / (1.0f + exponential(-x)); }
 
 #define NORM_SILU(NAME, TYPE, READ, WRITE)                                                                     \
     void NAME(TYPE *product, const float *scale, const float *shift, long rows, long length, int threads) {    \
-        _Pragma("omp parallel for num_threads(threads) if (rows >= threads * ROWS_PER_THREAD)")                \
-        for (long r = 0; r < rows; r++) {                                                                      \
+        PARALLEL for (long r = 0; r < rows; r++) {                                                             \
             TYPE *place = product + r * length;                                                                \
             MOMENTS(READ)                                                                                      \
-            _Pragma("omp simd") for (long i = 0; i < length; i++) {                                            \
+            VECTOR() for (long i = 0; i < length; i++) {                                                       \
                 float x = NORMED(i);                                                                           \
                 place[i] = WRITE(x * sigmoid(x));                                                              \
             }                                                                                                  \
@@ -79,19 +82,18 @@ static inline float sigmoid(float x) { return 1.0f / (1.0f + exponential(-x)); }
 NORM_SILU(norm_silu_bfloat16, bfloat16, read_bfloat16, write_bfloat16)
 NORM_SILU(norm_silu_float32, float, read_float, write_float)
 
-// The gates of the recurrence; in scale and shift the update gate's 1 and the candidate's factor 2 are included.
+// The gates of the recurrence: reset, candidate and update, side by side in a row.
 #define GATES(NAME, TYPE, READ, WRITE)                                                                         \
     void NAME(const TYPE *product, const float *scale, const float *shift, const float *deter, float *next,    \
               TYPE *rounded, long rows, long size, int threads) {                                              \
-        _Pragma("omp parallel for num_threads(threads) if (rows >= threads * ROWS_PER_THREAD)")                \
-        for (long r = 0; r < rows; r++) {                                                                      \
+        PARALLEL for (long r = 0; r < rows; r++) {                                                             \
             long length = 3 * size;                                                                            \
             const TYPE *place = product + r * length;                                                          \
             MOMENTS(READ)                                                                                      \
-            _Pragma("omp simd") for (long i = 0; i < size; i++) {                                              \
+            VECTOR() for (long i = 0; i < size; i++) {                                                         \
                 float reset = sigmoid(NORMED(i));                                                              \
-                float candidate = 2.0f * sigmoid(reset * NORMED(size + i)) - 1.0f;                             \
-                float update = sigmoid(NORMED(2 * size + i));                                                  \
+                float candidate = 2.0f * sigmoid(2.0f * reset * NORMED(size + i)) - 1.0f;                      \
+                float update = sigmoid(NORMED(2 * size + i) - 1.0f);                                           \
                 float before = deter[r * size + i];                                                            \
                 float after = before + update * (candidate - before);                                          \
                 next[r * size + i] = after;                                                                    \
@@ -105,14 +107,11 @@ GATES(gates_float32, float, read_float, write_float)
 
 // The mean under softmax(logits) of the bins' values, for each row.
 void expectation(const float *logits, const float *values, float *means, long rows, long size, int threads) {
-#pragma omp parallel for num_threads(threads) if (rows >= threads * ROWS_PER_THREAD)
-    for (long r = 0; r < rows; r++) {
+    PARALLEL for (long r = 0; r < rows; r++) {
         const float *row = logits + r * size;
         float highest = -INFINITY, sum = 0.0f, mean = 0.0f;
-#pragma omp simd reduction(max : highest)
-        for (long i = 0; i < size; i++) highest = row[i] > highest ? row[i] : highest;
-#pragma omp simd reduction(+ : sum, mean)
-        for (long i = 0; i < size; i++) {
+        VECTOR(reduction(max : highest)) for (long i = 0; i < size; i++) highest = row[i] > highest ? row[i] : highest;
+        VECTOR(reduction(+ : sum, mean)) for (long i = 0; i < size; i++) {
             float weight = exponential(row[i] - highest);
             sum += weight;
             mean += weight * values[i];

@@ -34,45 +34,46 @@ Norm = tuple[Tensor, Tensor]  # scale and shift
 
 
 def norm_silu(product: Tensor, norm: Norm) -> Tensor:
-    """SiLU of the layer norm of rows (..., size), in the product's dtype; may overwrite the product."""
-    library = _library_for(product, product.shape[-1])
+    """SiLU of the layer norm of rows (..., size), in the product's dtype; where no gradient is asked for, in place."""
+    scale, shift = norm
+    library = _library_for(product, scale, shift)
     if library is None:
-        return functional.silu(functional.layer_norm(product, product.shape[-1:], *norm))
+        return functional.silu(functional.layer_norm(product, product.shape[-1:], scale, shift))
     rows, size = product.numel() // product.shape[-1], product.shape[-1]
     kernel = getattr(library, f"norm_silu_{DTYPES[product.dtype]}")
-    kernel(product.data_ptr(), *_places(*norm), rows, size, torch.get_num_threads())
+    kernel(*_places(product, scale, shift), rows, size, torch.get_num_threads())
     return product
 
 
 def gates(product: Tensor, norm: Norm, deter: Tensor) -> tuple[Tensor, Tensor]:
-    """The next deterministic state of a recurrence whose update gate moves it towards its candidate.
+    """The next deterministic state of the recurrence: its update gate, less 1, moves it towards its candidate.
 
     Args:
         product: Reset, candidate and update gate before their norm, side by side, (rows, 3 deter).
-        norm: Of the gates, float32; a factor of 2 for the candidate, tanh(x) = 2 sigmoid(2 x) - 1, is included.
+        norm: Of the gates.
         deter: The state before, float32 (rows, deter).
 
     Returns:
         The state, float32 (rows, deter), and the same in the product's dtype.
     """
-    library = None if deter.requires_grad else _library_for(product, product.shape[-1])
+    scale, shift = norm
+    library = _library_for(product, scale, shift, deter)
     if library is None:
-        normed = functional.layer_norm(product.float(), product.shape[-1:], *norm)
+        normed = functional.layer_norm(product.to(scale.dtype), product.shape[-1:], scale, shift).to(deter.dtype)
         reset, candidate, update = normed.chunk(3, -1)
-        candidate = 2.0 * torch.sigmoid(torch.sigmoid(reset) * candidate) - 1.0
-        following = torch.lerp(deter, candidate, torch.sigmoid(update))
+        candidate = torch.tanh(torch.sigmoid(reset) * candidate)
+        following = torch.lerp(deter, candidate, torch.sigmoid(update - 1.0))
         return following, following.to(product.dtype)
     deter = deter.contiguous()
     following, rounded = torch.empty_like(deter), torch.empty_like(deter, dtype=product.dtype)
     kernel = getattr(library, f"gates_{DTYPES[product.dtype]}")
-    places = _places(product, *norm, deter, following, rounded)
-    kernel(*places, *deter.shape, torch.get_num_threads())
+    kernel(*_places(product, scale, shift, deter, following, rounded), *deter.shape, torch.get_num_threads())
     return following, rounded
 
 
 def expectation(logits: Tensor, values: Tensor) -> Tensor:
     """The mean (rows,) of values (bin,) under the softmax of float32 logits (rows, bin)."""
-    library = _library_for(logits, logits.shape[-1])
+    library = _library_for(logits, values)
     if library is None:
         return logits.softmax(-1) @ values
     means = logits.new_empty(len(logits))
@@ -80,14 +81,18 @@ def expectation(logits: Tensor, values: Tensor) -> Tensor:
     return means
 
 
-def _library_for(rows: Tensor, size: int) -> ctypes.CDLL | None:
+def _library_for(rows: Tensor, *others: Tensor) -> ctypes.CDLL | None:
     """The compiled kernels, if they can do what is asked for."""
-    known = rows.device.type == "cpu" and rows.dtype in DTYPES and size <= LONGEST_ROW and rows.is_contiguous()
-    return load() if known and not rows.requires_grad else None
+    tensors = (rows, *others)
+    if torch.is_grad_enabled() and any(tensor.requires_grad for tensor in tensors):
+        return None
+    known = rows.device.type == "cpu" and rows.dtype in DTYPES and rows.is_contiguous()
+    fit = rows.shape[-1] <= LONGEST_ROW and all(tensor.dtype == torch.float32 for tensor in others)
+    return load() if known and fit else None
 
 
-def _places(*tensors: Tensor) -> list[ctypes.c_void_p]:
-    return [ctypes.c_void_p(tensor.data_ptr()) for tensor in tensors]
+def _places(*tensors: Tensor) -> list[int]:
+    return [tensor.data_ptr() for tensor in tensors]
 
 
 @functools.cache

@@ -77,9 +77,11 @@ def test_extreme_inputs_saturate():
 
 def test_gradients_pass_where_they_are_asked_for():
     product, deter = draw(4, 6).requires_grad_(), draw(4, 2).requires_grad_()
+    before = product.detach().clone()
     following, _ = kernels.gates(product, norm(6), deter)
     (following.sum() + kernels.norm_silu(product, norm(6)).sum()).backward()
     assert product.grad.abs().sum() > 0.0 and deter.grad.abs().sum() > 0.0
+    assert torch.equal(product, before)
 
 
 @compiled
