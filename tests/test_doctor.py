@@ -52,3 +52,11 @@ def test_a_check_that_breaks_becomes_a_line_and_the_rest_goes_on(monkeypatch, ca
     assert "OSError: driver gone" in out and "first half" in out
     assert "cannot import latentplan_is_not_called_this" in out
     assert "video (VP9)" in out
+
+
+def test_a_machine_without_a_compiler_is_told_what_it_lacks(monkeypatch):
+    from latentplan.models import kernels
+
+    monkeypatch.setattr(kernels, "load", lambda: None)
+    (finding,) = doctor._kernels()
+    assert finding.value == "torch" and "compiler" in finding.problem and not finding.fatal
