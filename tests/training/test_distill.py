@@ -20,7 +20,7 @@ from latentplan.training.student import Student
 
 INFO = {"domain": "user", "task": "push", "env_frames": 7, "discount": 0.9, "metrics": [{"planner": 1.0}]}
 PLANNER = PlannerConfig(
-    horizon=2, num_samples=24, num_elites=4, num_iterations=2, num_policy_samples=2, terminal_value=False
+    horizon=2, num_samples=128, num_elites=16, num_iterations=3, num_policy_samples=2, terminal_value=False
 )
 SETTINGS = DistillConfig(rounds=3, episodes=2, updates=60, evaluation_episodes=8, plan_batch=16, learning_rate=3e-3)
 
@@ -76,8 +76,8 @@ def states_of(model, rows=40, seed=0):
 
 def test_an_untrained_actor_recovers_most_of_the_planners_return(finished):
     before, after, planner = (finished.summary[name] for name in ("before", "after", "planner"))
-    assert finished.exit_code == 0 and planner > before + 2.0
-    assert after > before + 0.6 * (planner - before)  # a few episodes of a toy
+    assert finished.exit_code == 0 and planner > before + 3.0
+    assert after > before + 0.75 * (planner - before)
 
 
 def test_only_the_actor_changes(finished, checkpoint):
