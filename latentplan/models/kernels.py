@@ -1,8 +1,8 @@
 """What stands between the matrix products of imagination, fused: one pass over each row instead of many.
 
-The C source beside this file is compiled by the machine's own compiler when it is first needed (a second), and kept in
-the user's cache. Where there is no compiler, on devices other than the CPU, and where gradients are asked for, the same
-is done in torch; so it is when `LATENTPLAN_KERNELS=0`.
+The C sources beside this file are compiled by the machine's own compiler when they are first needed (a second), and
+kept in the user's cache. Where there is no compiler, on devices other than the CPU, and where gradients are asked for,
+the same is done in torch; so it is when `LATENTPLAN_KERNELS=0`.
 """
 
 from __future__ import annotations
@@ -21,12 +21,12 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-SOURCE = Path(__file__).with_name("kernels.c")
+SOURCES = tuple(Path(__file__).with_name(name) for name in ("rows.h", "kernels.c", "imagine.c"))
 # Sums may be taken in any order, without which none would be a vector's; nothing else of IEEE 754 is given up.
 ARITHMETIC = ("-fassociative-math", "-fno-signed-zeros", "-fno-trapping-math", "-fno-math-errno")
 FLAGS = ("-O3", "-march=native", *ARITHMETIC, "-fopenmp", "-shared", "-fPIC")
 WIDE = "-mprefer-vector-width=512"  # x86 compilers know it
-LONGEST_ROW = 4096  # as in the source
+LONGEST_ROW = 4096  # as in kernels.c
 COMPILE_SECONDS = 60
 DTYPES = {torch.bfloat16: "bfloat16", torch.float32: "float32"}
 
@@ -73,7 +73,7 @@ def gates(product: Tensor, norm: Norm, deter: Tensor) -> tuple[Tensor, Tensor]:
 
 def expectation(logits: Tensor, values: Tensor) -> Tensor:
     """The mean (rows,) of values (bin,) under the softmax of float32 logits (rows, bin)."""
-    library = _library_for(logits, values)
+    library = _library_for(logits, values) if logits.dtype == torch.float32 else None
     if library is None:
         return logits.softmax(-1) @ values
     means = logits.new_empty(len(logits))
@@ -109,6 +109,7 @@ def load() -> ctypes.CDLL | None:
         getattr(library, f"norm_silu_{dtype}").argtypes = [place] * 3 + [count, count, threads]
         getattr(library, f"gates_{dtype}").argtypes = [place] * 6 + [count, count, threads]
     library.expectation.argtypes = [place] * 3 + [count, count, threads]
+    library.imagine.argtypes = [place] * 5 + [count, count, threads]
     return library
 
 
@@ -123,8 +124,9 @@ def _compiled() -> Path:
     if compiler is None:
         raise FileNotFoundError("no C compiler")
     wide = [WIDE] if platform.machine() in ("x86_64", "AMD64") else []
-    command = [*compiler.split(), *FLAGS, *wide, str(SOURCE)]
-    key = hashlib.sha256("\n".join([*command, _processor(), SOURCE.read_text()]).encode()).hexdigest()[:16]
+    command = [*compiler.split(), *FLAGS, *wide, *(str(source) for source in SOURCES if source.suffix == ".c")]
+    texts = [source.read_text() for source in SOURCES]
+    key = hashlib.sha256("\n".join([*command, _processor(), *texts]).encode()).hexdigest()[:16]
     home = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "latentplan"
     library = home / f"kernels-{key}.so"
     if not library.exists():

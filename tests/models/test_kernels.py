@@ -75,6 +75,13 @@ def test_extreme_inputs_saturate():
     assert following.isfinite().all()
 
 
+def test_only_float32_logits_reach_the_compiled_expectation():
+    logits, values = draw(3, 5, dtype=torch.bfloat16), draw(5, dtype=torch.bfloat16)
+    assert torch.equal(kernels.expectation(logits, values), logits.softmax(-1) @ values)
+    with pytest.raises(RuntimeError):
+        kernels.expectation(logits, values.float())  # as torch has it; the kernel would read beyond the end
+
+
 def test_gradients_pass_where_they_are_asked_for():
     product, deter = draw(4, 6).requires_grad_(), draw(4, 2).requires_grad_()
     before = product.detach().clone()

@@ -1,0 +1,261 @@
+// Following action sequences by the mean of the prior, many steps of 32 rows at a time, so that nothing but the weights
+// leaves a core's cache. Products are bfloat16 with float32 sums, everything between them is float32.
+
+#include <stdlib.h>
+
+#include "rows.h"
+
+#define BLOCK 32
+#define TILE 16
+#define ALIGNMENT 64
+
+// A product's weights lie in tiles of 16 columns x 32 rows, the rows in pairs side by side: (column tile, row tile,
+// row pair, column, 2). `inputs` and `outputs` are multiples of 32.
+typedef struct {
+    const bfloat16 *weights;
+    const float *scale, *shift;
+    long inputs, outputs;
+} Layer;
+
+typedef struct {
+    Layer first, second, output;
+} Mlp;
+
+typedef struct {
+    Layer input, gates, prior, mean;
+    Mlp head, actor;
+    const float *values;  // of the head's bins
+    long action, latent, deter, hidden, bins;
+} Model;
+
+// What each thread works on: up to BLOCK rows of [action, padded to 32 | stoch | deter | hidden], and beside them in
+// float32 the deter, and the last product.
+typedef struct {
+    bfloat16 *rows, *stoch, *rounded, *hidden;
+    float *deter, *product;
+    long width, count;
+} Desk;
+
+#if defined(__AMX_BF16__) && defined(__linux__)
+#include <immintrin.h>
+#include <sys/syscall.h>
+#include <unistd.h>
+#define ASK_FOR_TILES 0x1023
+#define TILE_DATA 18
+
+int can_imagine(void) { return syscall(SYS_arch_prctl, ASK_FOR_TILES, TILE_DATA) == 0; }
+
+static void set_up(void) {
+    struct {
+        uint8_t palette, start_row, reserved[14];
+        uint16_t bytes[16];
+        uint8_t rows[16];
+    } __attribute__((aligned(ALIGNMENT))) tiles = {.palette = 1};
+    for (int i = 0; i < 8; i++) {
+        tiles.bytes[i] = 64;
+        tiles.rows[i] = 16;
+    }
+    _tile_loadconfig(&tiles);
+}
+
+static void tear_down(void) { _tile_release(); }
+
+static void multiply(Desk *desk, const bfloat16 *rows, const Layer *layer) {
+    long width = desk->width;
+    for (long column = 0; column < layer->outputs; column += 2 * TILE) {
+        const bfloat16 *left = layer->weights + column * layer->inputs, *right = left + TILE * layer->inputs;
+        _tile_zero(0);
+        _tile_zero(1);
+        _tile_zero(2);
+        _tile_zero(3);
+        for (long k = 0; k < layer->inputs; k += 32) {
+            _tile_loadd(4, rows + k, width * 2);
+            _tile_loadd(6, left + k * TILE, 64);
+            _tile_loadd(5, rows + TILE * width + k, width * 2);
+            _tile_loadd(7, right + k * TILE, 64);
+            _tile_dpbf16ps(0, 4, 6);
+            _tile_dpbf16ps(1, 4, 7);
+            _tile_dpbf16ps(2, 5, 6);
+            _tile_dpbf16ps(3, 5, 7);
+        }
+        float *upper = desk->product + column, *lower = upper + TILE * layer->outputs;
+        _tile_stored(0, upper, layer->outputs * 4);
+        _tile_stored(1, upper + TILE, layer->outputs * 4);
+        _tile_stored(2, lower, layer->outputs * 4);
+        _tile_stored(3, lower + TILE, layer->outputs * 4);
+    }
+}
+
+#elif defined(__AVX512BF16__)
+#include <immintrin.h>
+
+int can_imagine(void) { return 1; }
+static void set_up(void) {}
+static void tear_down(void) {}
+
+static void multiply(Desk *desk, const bfloat16 *rows, const Layer *layer) {
+    long width = desk->width;
+    for (long top = 0; top < desk->count; top += TILE) {
+        for (long column = 0; column < layer->outputs; column += TILE) {
+            const bfloat16 *weights = layer->weights + column * layer->inputs;
+            __m512 sums[TILE];
+            for (int r = 0; r < TILE; r++) sums[r] = _mm512_setzero_ps();
+            for (long k = 0; k < layer->inputs; k += 2) {
+                __m512i pairs = _mm512_load_si512(weights + k * TILE);
+                for (int r = 0; r < TILE; r++) {
+                    int32_t pair;
+                    memcpy(&pair, rows + (top + r) * width + k, sizeof pair);
+                    sums[r] = _mm512_dpbf16_ps(sums[r], (__m512bh)_mm512_set1_epi32(pair), (__m512bh)pairs);
+                }
+            }
+            float *place = desk->product + top * layer->outputs + column;
+            for (int r = 0; r < TILE; r++) _mm512_storeu_ps(place + r * layer->outputs, sums[r]);
+        }
+    }
+}
+
+#else
+
+int can_imagine(void) { return 0; }
+static void set_up(void) {}
+static void tear_down(void) {}
+static void multiply(Desk *desk, const bfloat16 *rows, const Layer *layer) {
+    (void)desk, (void)rows, (void)layer;
+}
+
+#endif
+
+// One hidden layer of every row, written where hidden layers are.
+static void layer_of(Desk *desk, const bfloat16 *from, const Layer *layer) {
+    multiply(desk, from, layer);
+    for (long r = 0; r < desk->count; r++) {
+        bfloat16 *hidden = desk->hidden + r * desk->width;
+        Norm norm = norm_of(desk->product + r * layer->outputs, layer->scale, layer->shift, layer->outputs);
+        VECTOR() for (long i = 0; i < layer->outputs; i++) hidden[i] = write_bfloat16(silu(normed(&norm, i)));
+    }
+}
+
+// The output of an Mlp at every row. Its weights are the sum of two bfloat16 parts, side by side; so is the product.
+static void output_of(Desk *desk, const Mlp *mlp) {
+    const Layer *output = &mlp->output;
+    long half = output->outputs / 2;
+    layer_of(desk, desk->stoch, &mlp->first);
+    layer_of(desk, desk->hidden, &mlp->second);
+    multiply(desk, desk->hidden, output);
+    for (long r = 0; r < desk->count; r++) {
+        float *row = desk->product + r * output->outputs;
+        VECTOR() for (long i = 0; i < half; i++) row[i] += row[half + i] + output->shift[i];
+    }
+}
+
+static void advance(Desk *desk, const Model *model) {
+    layer_of(desk, desk->rows, &model->input);
+    multiply(desk, desk->rounded, &model->gates);
+    for (long r = 0; r < desk->count; r++) {
+        float *deter = desk->deter + r * model->deter;
+        bfloat16 *rounded = desk->rounded + r * desk->width;
+        const Layer *gates = &model->gates;
+        Norm norm = norm_of(desk->product + r * gates->outputs, gates->scale, gates->shift, gates->outputs);
+        VECTOR() for (long i = 0; i < model->deter; i++) {
+            deter[i] = gated(&norm, i, model->deter, deter[i]);
+            rounded[i] = write_bfloat16(deter[i]);
+        }
+    }
+    layer_of(desk, desk->rounded, &model->prior);
+    multiply(desk, desk->hidden, &model->mean);
+    for (long r = 0; r < desk->count; r++) {
+        const float *row = desk->product + r * model->latent;
+        bfloat16 *stoch = desk->stoch + r * desk->width;
+        VECTOR() for (long i = 0; i < model->latent; i++) stoch[i] = write_bfloat16(row[i] + model->mean.shift[i]);
+    }
+}
+
+static long padded(long size) { return (size + BLOCK - 1) / BLOCK * BLOCK; }
+
+static size_t desk_floats(const Model *model) {
+    long widest = 3 * model->deter;
+    widest = widest > model->hidden ? widest : model->hidden;
+    widest = widest > model->head.output.outputs ? widest : model->head.output.outputs;
+    widest = widest > model->actor.output.outputs ? widest : model->actor.output.outputs;
+    long width = padded(model->action) + model->latent + model->deter + model->hidden;
+    return (size_t)(BLOCK * (width / 2 + model->deter + widest));
+}
+
+// Lays the rows from `first` on where one thread works; rows that are none are zeros.
+static Desk lay(float *memory, const Model *model, const float *deter, const float *stoch, long rows) {
+    long width = padded(model->action) + model->latent + model->deter + model->hidden;
+    bfloat16 *halves = (bfloat16 *)memory, *stochs = halves + padded(model->action), *rounded = stochs + model->latent;
+    float *deters = memory + BLOCK * width / 2;
+    Desk desk = {halves, stochs, rounded, rounded + model->deter, deters, deters + BLOCK * model->deter, width, rows};
+    memset(memory, 0, desk_floats(model) * sizeof(float));
+    memcpy(desk.deter, deter, (size_t)(rows * model->deter) * sizeof(float));
+    for (long r = 0; r < rows; r++) {
+        for (long i = 0; i < model->latent; i++)
+            desk.stoch[r * width + i] = write_bfloat16(stoch[r * model->latent + i]);
+        for (long i = 0; i < model->deter; i++)
+            desk.rounded[r * width + i] = write_bfloat16(deter[r * model->deter + i]);
+    }
+    return desk;
+}
+
+static void take(Desk *desk, const Model *model, const float *actions, long time) {
+    for (long r = 0; r < desk->count; r++)
+        for (long i = 0; i < model->action; i++)
+            desk->rows[r * desk->width + i] = write_bfloat16(actions[r * time * model->action + i]);
+}
+
+// Where the actor decides: the mean of its distribution, and the std times what was drawn, which its action replaces.
+static void decide(Desk *desk, const Model *model, float *actions, long time) {
+    output_of(desk, &model->actor);
+    for (long r = 0; r < desk->count; r++) {
+        const float *raw = desk->product + r * model->actor.output.outputs;
+        float *action = actions + r * time * model->action;
+        for (long i = 0; i < model->action; i++) {
+            float std = 0.9f * sigmoid(raw[model->action + i] + 2.0f) + 0.1f;
+            float value = hyperbolic_tangent(raw[i]) + std * action[i];
+            action[i] = value > 1.0f ? 1.0f : value < -1.0f ? -1.0f : value;
+        }
+    }
+}
+
+// Rewards (rows, time) along actions (rows, time, action), and the states reached, which replace the first ones. With
+// no rewards to write to, the actor decides, and its actions replace the standard normal draws (rows, time, action).
+// Returns 0, or 1 when there was no memory.
+int imagine(const Model *model, float *deter, float *stoch, float *actions, float *rewards, long rows, long time,
+            int threads) {
+    int failed = 0;
+    long blocks = (rows + BLOCK - 1) / BLOCK;
+    size_t bytes = (desk_floats(model) * sizeof(float) + ALIGNMENT - 1) / ALIGNMENT * ALIGNMENT;
+#pragma omp parallel num_threads(threads < blocks ? threads : (int)blocks) reduction(| : failed)
+    {
+        float *memory = aligned_alloc(ALIGNMENT, bytes);
+        failed = memory == NULL;
+        set_up();
+#pragma omp for schedule(static)
+        for (long block = 0; block < blocks; block++) {
+            if (memory == NULL) continue;
+            long from = block * BLOCK, here = rows - from < BLOCK ? rows - from : BLOCK;
+            float *deters = deter + from * model->deter, *stochs = stoch + from * model->latent;
+            Desk desk = lay(memory, model, deters, stochs, here);
+            for (long step = 0; step < time; step++) {
+                float *action = actions + (from * time + step) * model->action;
+                if (rewards == NULL) decide(&desk, model, action, time);
+                take(&desk, model, action, time);
+                advance(&desk, model);
+                if (rewards == NULL) continue;
+                output_of(&desk, &model->head);
+                for (long r = 0; r < here; r++) {
+                    const float *logits = desk.product + r * model->head.output.outputs;
+                    rewards[(from + r) * time + step] = expected(logits, model->values, model->bins);
+                }
+            }
+            memcpy(deters, desk.deter, (size_t)(here * model->deter) * sizeof(float));
+            for (long r = 0; r < here; r++)
+                for (long i = 0; i < model->latent; i++)
+                    stochs[r * model->latent + i] = read_bfloat16(desk.stoch[r * desk.width + i]);
+        }
+        tear_down();
+        free(memory);
+    }
+    return failed;
+}
