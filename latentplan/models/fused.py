@@ -17,7 +17,7 @@ from torch.nn import functional
 from latentplan.models.kernels import load
 
 if TYPE_CHECKING:
-    from latentplan.models.imagination import Weights
+    from latentplan.models.imagination import Trunk, Weights
 
 TILE = 16  # columns of a tile of weights, and row pairs
 MULTIPLE = 2 * TILE  # what every size must be a multiple of
@@ -32,8 +32,11 @@ class _Layer(ctypes.Structure):
 
 class _Model(ctypes.Structure):
     _fields_ = (
-        ("layers", _Layer * 10),  # input, gates, prior, mean, and three of the head and of the actor
-        ("values", ctypes.c_void_p),
+        (
+            "layers",
+            _Layer * 13,
+        ),  # input, gates, prior, mean, and three of the reward head, of the actor and of the value head
+        ("bin_values", ctypes.c_void_p),
         *((name, ctypes.c_long) for name in ("action", "latent", "deter", "hidden", "bins")),
     )
 
@@ -45,12 +48,17 @@ class Packed(NamedTuple):
     tensors: tuple[Tensor, ...]
 
 
-def pack(weights: Weights) -> Packed | None:
-    """The weights as the compiled rollout reads them; None where it cannot: here, in this dtype, or in these sizes."""
+def pack(weights: Weights, critic: tuple[Trunk, Tensor, Tensor]) -> Packed | None:
+    """The weights as the compiled rollout reads them; None where it cannot: here, in this dtype, or in these sizes.
+
+    Args:
+        weights: Of what imagines.
+        critic: Trunk, logits and their shift of the value head, as `weights` has those of the reward head.
+    """
     library = load()
     (action, hidden), latent, deter = weights.action.shape, len(weights.stoch), len(weights.prior)
     known = weights.gates.device.type == "cpu" and weights.gates.dtype == torch.bfloat16
-    fit = all(size % MULTIPLE == 0 for size in (latent, deter, hidden)) and len(weights.head) == len(weights.actor) == 2
+    fit = all(size % MULTIPLE == 0 for size in (latent, deter, hidden))
     if library is None or not (known and fit and library.can_imagine()):
         return None
 
@@ -64,18 +72,18 @@ def pack(weights: Weights) -> Packed | None:
         rounded = matrix.bfloat16()
         return torch.cat([rounded, (matrix - rounded.float()).bfloat16()], 1), None, shift
 
-    head, actor = weights.head, weights.actor
+    def mlp(trunk: Trunk, matrix: Tensor, shift: Tensor) -> list[tuple[Tensor, Tensor | None, Tensor]]:
+        (first, first_norm), (second, second_norm) = trunk
+        return [(turned(first, deter), *first_norm), (second, *second_norm), output(matrix, shift)]
+
     layers = [
         (torch.cat([_padded(weights.action, 0), weights.stoch]), *weights.input_norm),
         (turned(weights.gates, hidden), *weights.gates_norm),
         (weights.prior, *weights.prior_norm),
         (weights.mean, None, weights.mean_shift.float()),
-        (turned(head[0][0], deter), *head[0][1]),
-        (head[1][0], *head[1][1]),
-        output(weights.logits, weights.logits_shift),
-        (turned(actor[0][0], deter), *actor[0][1]),
-        (actor[1][0], *actor[1][1]),
-        output(weights.actor_output, weights.actor_shift),
+        *mlp(weights.head, weights.logits, weights.logits_shift),
+        *mlp(weights.actor, weights.actor_output, weights.actor_shift),
+        *mlp(*critic),
     ]
     return _lay_out(layers, weights.values, (action, latent, deter, hidden))
 
@@ -93,6 +101,17 @@ def follow(packed: Packed, deter: Tensor, stoch: Tensor, noise: Tensor) -> Tenso
     actions = _own(noise)
     _call(packed, _own(deter), _own(stoch), actions, None)
     return actions
+
+
+def judge(packed: Packed, deter: Tensor, stoch: Tensor) -> Tensor:
+    """The value of states, float32 (rows,)."""
+    library, values = load(), torch.empty(len(deter))
+    assert library is not None
+    deter, stoch = deter.float().contiguous(), stoch.float().contiguous()
+    places = [tensor.data_ptr() for tensor in (deter, stoch, values)]
+    if library.judge(ctypes.addressof(packed.model), *places, len(values), torch.get_num_threads()):
+        raise MemoryError("no memory for the value of a state")
+    return values
 
 
 def _own(tensor: Tensor) -> Tensor:

@@ -24,6 +24,9 @@ ROWS_PER_THREAD = 1024  # what one step makes of more rows no longer fits a core
 BIN_MULTIPLE = 16  # float32 products with another number of columns take half as long again
 
 
+Trunk = tuple[tuple[Tensor, Norm], ...]  # of an Mlp: a product and a norm for each hidden layer
+
+
 class Weights(NamedTuple):
     """Recurrence, reward head and actor, laid out for products from the left: (in, out)."""
 
@@ -36,19 +39,27 @@ class Weights(NamedTuple):
     prior_norm: Norm
     mean: Tensor
     mean_shift: Tensor
-    head: tuple[tuple[Tensor, Norm], ...]
+    head: Trunk
     logits: Tensor
     logits_shift: Tensor
     values: Tensor
-    actor: tuple[tuple[Tensor, Norm], ...]
+    actor: Trunk
     actor_output: Tensor
     actor_shift: Tensor
     packed: fused.Packed | None = None
 
 
 @torch.no_grad()
-def lay_out(dynamics: Rssm, head: ScalarHead, actor: Actor, dtype: torch.dtype) -> Weights:
-    """The weights of what imagines, products in `dtype`; gates' norm and the heads' outputs in float32."""
+def lay_out(dynamics: Rssm, head: ScalarHead, critic: ScalarHead, actor: Actor, dtype: torch.dtype) -> Weights:
+    """The weights of what imagines, products in `dtype`; gates' norm and the heads' outputs in float32.
+
+    Args:
+        dynamics: What rollouts follow.
+        head: Of the reward.
+        critic: The value head, with the same bins.
+        actor: What proposes.
+        dtype: Of the products.
+    """
 
     def turn(weight: Tensor) -> Tensor:
         return weight.to(dtype).t().contiguous()
@@ -57,14 +68,16 @@ def lay_out(dynamics: Rssm, head: ScalarHead, actor: Actor, dtype: torch.dtype) 
         kind = torch.float32 if layer.weight.device.type == "cpu" else dtype  # only there the two may differ
         return layer.weight.to(kind), layer.bias.to(kind)
 
-    latent = dynamics.latent_dim
-    input_weight, output = dynamics.input.linear.weight, head.mlp.output
-
-    def trunk(mlp: Mlp) -> tuple[tuple[Tensor, Norm], ...]:
+    def trunk(mlp: Mlp) -> Trunk:
         layers = [layer for layer in mlp.trunk if isinstance(layer, NormedLinear)]
         return tuple((turn(layer.linear.weight), norm(layer.norm)) for layer in layers)
 
-    padding = -output.out_features % BIN_MULTIPLE
+    def logits(head: ScalarHead) -> tuple[Tensor, Tensor]:
+        output, padding = head.mlp.output, (0, -len(head.values) % BIN_MULTIPLE)
+        return functional.pad(output.weight.t(), padding), functional.pad(output.bias, padding, value=float("-inf"))
+
+    latent, input_weight = dynamics.latent_dim, dynamics.input.linear.weight
+    reward_logits, reward_shift = logits(head)
     weights = Weights(
         action=turn(input_weight[:, latent:]),
         stoch=turn(input_weight[:, :latent]),
@@ -76,14 +89,14 @@ def lay_out(dynamics: Rssm, head: ScalarHead, actor: Actor, dtype: torch.dtype) 
         mean=turn(dynamics.prior_output.weight[:latent]),
         mean_shift=dynamics.prior_output.bias[:latent].to(dtype),
         head=trunk(head.mlp),
-        logits=functional.pad(output.weight.t(), (0, padding)),
-        logits_shift=functional.pad(output.bias, (0, padding), value=float("-inf")),
-        values=functional.pad(head.values, (0, padding)),
+        logits=reward_logits,
+        logits_shift=reward_shift,
+        values=functional.pad(head.values, (0, -len(head.values) % BIN_MULTIPLE)),
         actor=trunk(actor.mlp),
         actor_output=actor.mlp.output.weight.t().contiguous(),
         actor_shift=actor.mlp.output.bias.clone(),
     )
-    return weights._replace(packed=fused.pack(weights))
+    return weights._replace(packed=fused.pack(weights, (trunk(critic.mlp), *logits(critic))))
 
 
 def imagine(weights: Weights, state: State, actions: Tensor) -> tuple[Tensor, State]:
@@ -94,7 +107,7 @@ def imagine(weights: Weights, state: State, actions: Tensor) -> tuple[Tensor, St
         state: Where every sequence starts, (rows, ...).
         actions: In [-1, 1], (rows, time, action).
     """
-    if weights.packed is not None and not _asks_for_gradients(*state, actions):
+    if weights.packed is not None and not asks_for_gradients(*state, actions):
         rewards, *last = fused.rollout(weights.packed, *state, actions)
         return rewards, State(*last)
     block = ROWS_PER_THREAD * torch.get_num_threads() if actions.device.type == "cpu" else len(actions)
@@ -113,7 +126,7 @@ def follow_actor(weights: Weights, state: State, noise: Tensor) -> Tensor:
         state: Where every sequence starts, (rows, ...).
         noise: Standard normal draws for its samples, zeros for its mode, (rows, time, action).
     """
-    if weights.packed is not None and not _asks_for_gradients(*state, noise):
+    if weights.packed is not None and not asks_for_gradients(*state, noise):
         return fused.follow(weights.packed, *state, noise)
     deter, stoch = state.deter.float(), state.stoch.to(weights.gates.dtype)
     rounded, actions = deter.to(stoch.dtype), []
@@ -129,7 +142,8 @@ def follow_actor(weights: Weights, state: State, noise: Tensor) -> Tensor:
     return torch.stack(actions, 1)
 
 
-def _asks_for_gradients(*tensors: Tensor) -> bool:
+def asks_for_gradients(*tensors: Tensor) -> bool:
+    """Whether what is computed from these tensors would record how."""
     return torch.is_grad_enabled() and any(tensor.requires_grad for tensor in tensors)
 
 

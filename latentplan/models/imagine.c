@@ -23,8 +23,8 @@ typedef struct {
 
 typedef struct {
     Layer input, gates, prior, mean;
-    Mlp head, actor;
-    const float *values;  // of the head's bins
+    Mlp head, actor, value;
+    const float *bin_values;  // of the reward head and of the value head
     long action, latent, deter, hidden, bins;
 } Model;
 
@@ -170,6 +170,13 @@ static void advance(Desk *desk, const Model *model) {
     }
 }
 
+// The scalar that a head reads at every row, one every `apart`.
+static void read_bins(Desk *desk, const Model *model, const Mlp *head, float *scalars, long apart) {
+    output_of(desk, head);
+    for (long r = 0; r < desk->count; r++)
+        scalars[r * apart] = expected(desk->product + r * head->output.outputs, model->bin_values, model->bins);
+}
+
 static long padded(long size) { return (size + BLOCK - 1) / BLOCK * BLOCK; }
 
 static size_t desk_floats(const Model *model) {
@@ -179,6 +186,16 @@ static size_t desk_floats(const Model *model) {
     widest = widest > model->actor.output.outputs ? widest : model->actor.output.outputs;
     long width = padded(model->action) + model->latent + model->deter + model->hidden;
     return (size_t)(BLOCK * (width / 2 + model->deter + widest));
+}
+
+static float *open_desk(const Model *model) {
+    set_up();
+    return aligned_alloc(ALIGNMENT, (desk_floats(model) * sizeof(float) + ALIGNMENT - 1) / ALIGNMENT * ALIGNMENT);
+}
+
+static void close_desk(float *memory) {
+    free(memory);
+    tear_down();
 }
 
 // Lays the rows from `first` on where one thread works; rows that are none are zeros.
@@ -218,6 +235,26 @@ static void decide(Desk *desk, const Model *model, float *actions, long time) {
     }
 }
 
+// The value (rows,) of states. Returns 0, or 1 when there was no memory.
+int judge(const Model *model, const float *deter, const float *stoch, float *values, long rows, int threads) {
+    int failed = 0;
+    long blocks = (rows + BLOCK - 1) / BLOCK;
+#pragma omp parallel num_threads(threads < blocks ? threads : (int)blocks) reduction(| : failed)
+    {
+        float *memory = open_desk(model);
+        failed = memory == NULL;
+#pragma omp for schedule(static)
+        for (long block = 0; block < blocks; block++) {
+            if (memory == NULL) continue;
+            long from = block * BLOCK, here = rows - from < BLOCK ? rows - from : BLOCK;
+            Desk desk = lay(memory, model, deter + from * model->deter, stoch + from * model->latent, here);
+            read_bins(&desk, model, &model->value, values + from, 1);
+        }
+        close_desk(memory);
+    }
+    return failed;
+}
+
 // Rewards (rows, time) along actions (rows, time, action), and the states reached, which replace the first ones. With
 // no rewards to write to, the actor decides, and its actions replace the standard normal draws (rows, time, action).
 // Returns 0, or 1 when there was no memory.
@@ -225,12 +262,10 @@ int imagine(const Model *model, float *deter, float *stoch, float *actions, floa
             int threads) {
     int failed = 0;
     long blocks = (rows + BLOCK - 1) / BLOCK;
-    size_t bytes = (desk_floats(model) * sizeof(float) + ALIGNMENT - 1) / ALIGNMENT * ALIGNMENT;
 #pragma omp parallel num_threads(threads < blocks ? threads : (int)blocks) reduction(| : failed)
     {
-        float *memory = aligned_alloc(ALIGNMENT, bytes);
+        float *memory = open_desk(model);
         failed = memory == NULL;
-        set_up();
 #pragma omp for schedule(static)
         for (long block = 0; block < blocks; block++) {
             if (memory == NULL) continue;
@@ -242,20 +277,14 @@ int imagine(const Model *model, float *deter, float *stoch, float *actions, floa
                 if (rewards == NULL) decide(&desk, model, action, time);
                 take(&desk, model, action, time);
                 advance(&desk, model);
-                if (rewards == NULL) continue;
-                output_of(&desk, &model->head);
-                for (long r = 0; r < here; r++) {
-                    const float *logits = desk.product + r * model->head.output.outputs;
-                    rewards[(from + r) * time + step] = expected(logits, model->values, model->bins);
-                }
+                if (rewards != NULL) read_bins(&desk, model, &model->head, rewards + from * time + step, time);
             }
             memcpy(deters, desk.deter, (size_t)(here * model->deter) * sizeof(float));
             for (long r = 0; r < here; r++)
                 for (long i = 0; i < model->latent; i++)
                     stochs[r * model->latent + i] = read_bfloat16(desk.stoch[r * desk.width + i]);
         }
-        tear_down();
-        free(memory);
+        close_desk(memory);
     }
     return failed;
 }

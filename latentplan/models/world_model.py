@@ -2,18 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Hashable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager
+from typing import Any
 
 import torch
 from torch import Tensor, nn
 
 from latentplan.config import ModelConfig
+from latentplan.models import fused
 from latentplan.models.decoder import Decoder
 from latentplan.models.dynamics import Rssm, State
 from latentplan.models.encoder import Encoder
 from latentplan.models.heads import Actor, Mlp, ScalarHead, sample_action
-from latentplan.models.imagination import Weights, follow_actor, imagine, lay_out
+from latentplan.models.imagination import Weights, asks_for_gradients, follow_actor, imagine, lay_out
 
 PROBE_SHARE = 3  # quantities lie near the surface of the latent: a narrow head reads them
 
@@ -44,6 +46,7 @@ class WorldModel(nn.Module):
         self.value_head = ScalarHead(features, config.hidden_dim, config.num_bins)
         self.actor = Actor(features, config.hidden_dim, action_dim)
         self._laid_out: Weights | None = None
+        self._kept: tuple[Hashable, Weights] | None = None
         self.register_buffer("label_scales", torch.tensor(list(self.labels.values())), persistent=False)
         if self.labels:
             self.probe_head = Mlp(features, max(1, config.hidden_dim // PROBE_SHARE), len(self.labels))
@@ -59,9 +62,16 @@ class WorldModel(nn.Module):
 
     @contextmanager
     def planning(self) -> Iterator[None]:
-        """For one search: the trunk's precision, every weight converted once; none may change meanwhile."""
+        """For one search: the trunk's precision, and weights laid out for it; none may change meanwhile.
+
+        Weights are laid out anew when one was written to in place or replaced since the last search. Writing through
+        `parameter.data` goes unseen.
+        """
         with self.trunk_precision():
-            self._laid_out = self._weights()
+            key = self._planned_with()
+            if self._kept is None or key is None or self._kept[0] != key:
+                self._kept = (key, self._weights())
+            self._laid_out = self._kept[1]
             try:
                 yield
             finally:
@@ -131,6 +141,9 @@ class WorldModel(nn.Module):
 
     def value(self, state: State) -> Tensor:
         """Expected discounted return from a state on, (rows,)."""
+        packed = None if self._laid_out is None else self._laid_out.packed
+        if packed is not None and not asks_for_gradients(*state):
+            return fused.judge(packed, *state)
         with self.trunk_precision():
             return self.value_head.mean(self.value_head(state.features))
 
@@ -147,6 +160,17 @@ class WorldModel(nn.Module):
         with self.trunk_precision():
             return torch.sigmoid(self.continue_head(state.features)).squeeze(-1)
 
+    def __getstate__(self) -> dict[str, Any]:
+        return {**self.__dict__, "_kept": None}  # it points into memory
+
+    def _planned_with(self) -> Hashable:
+        """What the weights that searches use are known by; None where torch does not count their changes."""
+        parameters = [*self.dynamics.parameters(), *self.reward_head.parameters(), *self.value_head.parameters()]
+        parameters += self.actor.parameters()
+        if any(parameter.is_inference() for parameter in parameters):
+            return None
+        return tuple((parameter.data_ptr(), parameter._version) for parameter in parameters)
+
     def _weights(self) -> Weights:
         """Weights laid out for imagination; gradients do not pass through them."""
         if self._laid_out is not None:
@@ -154,7 +178,7 @@ class WorldModel(nn.Module):
         kind = self.device.type
         with self.trunk_precision():
             dtype = torch.get_autocast_dtype(kind) if torch.is_autocast_enabled(kind) else torch.float32
-        return lay_out(self.dynamics, self.reward_head, self.actor, dtype)
+        return lay_out(self.dynamics, self.reward_head, self.value_head, self.actor, dtype)
 
     def _advance_mean(self, state: State, action: Tensor) -> State:
         deter = self.dynamics.advance(state, action)

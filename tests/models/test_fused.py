@@ -56,7 +56,7 @@ def asked(name):
 def test_the_compiled_rollout_is_as_near_to_float32_as_torch_in_bfloat16(name):
     model, ask = build(), asked(name)
     with torch.no_grad(), torch.autocast("cpu", enabled=False):
-        exact = ask(lay_out(model.dynamics, model.reward_head, model.actor, torch.float32))
+        exact = ask(lay_out(model.dynamics, model.reward_head, model.value_head, model.actor, torch.float32))
     for truth, compiled_part, torch_part in zip(exact, ask(WEIGHTS), ask(WEIGHTS._replace(packed=None)), strict=True):
         assert compiled_part.shape == truth.shape and compiled_part.dtype == torch.float32
         error, torch_error = ((part - truth).square().mean().sqrt() for part in (compiled_part, torch_part))
@@ -70,6 +70,20 @@ def test_a_row_does_not_depend_on_who_shares_the_call(name):
     for whole, part, alone in zip(ask(WEIGHTS), ask(WEIGHTS, slice(30, 68)), ask(WEIGHTS, slice(40, 41)), strict=True):
         assert torch.equal(whole[30:68], part)
         assert torch.equal(whole[40:41], alone)
+
+
+@compiled
+def test_values_are_those_of_the_value_head_and_rows_are_judged_alone():
+    model, state = build(), start()
+    with torch.no_grad(), torch.autocast("cpu", enabled=False):
+        exact = model.value_head.mean(model.value_head(state.features))
+    with torch.no_grad():
+        rounded = model.value(state)
+        with model.planning():
+            values, alone = model.value(state), model.value(State(*(part[40:41] for part in state)))
+    errors = [(found - exact).square().mean().sqrt() for found in (values, rounded)]
+    assert 0.0 < errors[0] < 1.2 * errors[1]
+    assert torch.equal(values[40:41], alone)
 
 
 @compiled
@@ -114,13 +128,18 @@ def test_actions_may_be_views_and_need_not_be_float32():
 
 @compiled
 def test_gradients_pass_where_they_are_asked_for():
-    actions = draw(ROWS, TIME, ACTION).clamp(-1.0, 1.0).requires_grad_()
-    rewards, _ = imagine(WEIGHTS, start(), actions)
-    rewards.sum().backward()
-    assert actions.grad.abs().sum() > 0.0
+    model, actions = build(), draw(ROWS, TIME, ACTION).clamp(-1.0, 1.0).requires_grad_()
+    with model.planning():
+        rewards, last = model.rollout(start(), actions)
+        (by_reward,) = torch.autograd.grad(rewards.sum(), actions, retain_graph=True)
+        (by_value,) = torch.autograd.grad(model.value(last).sum(), actions)
+    assert by_reward.abs().sum() > 0.0 and by_value.abs().sum() > 0.0
 
 
 def test_other_sizes_and_other_precisions_are_left_to_torch():
     odd = ModelConfig(deter_dim=64, hidden_dim=40, latent_dim=32, num_bins=31)
     assert weights_of(build(odd)).packed is None
-    assert fused.pack(WEIGHTS._replace(gates=WEIGHTS.gates.float())) is None
+    assert (
+        fused.pack(WEIGHTS._replace(gates=WEIGHTS.gates.float()), (WEIGHTS.head, WEIGHTS.logits, WEIGHTS.logits_shift))
+        is None
+    )

@@ -1,5 +1,8 @@
 """The planner's view of the world model."""
 
+import copy
+import pickle
+
 import pytest
 import torch
 
@@ -146,3 +149,40 @@ def test_weights_laid_out_for_a_search_are_laid_out_anew_for_the_next(model, sta
         after, _ = model.rollout(state, actions)
     assert not torch.allclose(before, after, atol=0.05)
     assert torch.equal(after, model.rollout(state, actions)[0])
+
+
+def test_searches_see_weights_that_changed_in_place_or_were_replaced(model, state, actions):
+    def planned():
+        with torch.no_grad(), model.planning():
+            return model.rollout(state, actions)[0]
+
+    first = planned()
+    assert torch.equal(planned(), first)
+    with torch.no_grad():
+        model.dynamics.gates.weight.mul_(0.5)
+    second = planned()
+    assert not torch.equal(second, first)
+    model.load_state_dict({name: 2.0 * value for name, value in model.state_dict().items()})
+    third = planned()
+    assert not torch.equal(third, second)
+    output = model.reward_head.mlp.output
+    output.bias = torch.nn.Parameter(torch.linspace(-1.0, 1.0, len(output.bias)))
+    assert not torch.equal(planned(), third)
+
+
+def test_a_model_that_has_planned_can_be_copied_and_pickled(model, state, actions):
+    with torch.no_grad(), model.planning():
+        expected = model.rollout(state, actions)[0]
+    for twin in (copy.deepcopy(model), pickle.loads(pickle.dumps(model))):
+        with torch.no_grad(), twin.planning():
+            assert torch.equal(twin.rollout(state, actions)[0], expected)
+
+
+def test_weights_made_for_inference_only_are_laid_out_for_every_search(model, state, actions):
+    with torch.inference_mode():
+        twin = copy.deepcopy(model)
+        with twin.planning():
+            before = twin.rollout(state, actions)[0]
+        twin.dynamics.gates.weight.mul_(0.5)
+        with twin.planning():
+            assert not torch.equal(twin.rollout(state, actions)[0], before)
