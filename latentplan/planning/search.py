@@ -59,6 +59,8 @@ class Search:
         self.high = self._constant(options.action_high, "action_high")
         half_range = (self.high - self.low) / 2
         self.init_std = half_range if options.init_std is None else self._constant(options.init_std, "init_std")
+        # Only what the policy was trained for is its business.
+        self.may_follow_policy = options.num_policy_samples > 0 and objective is None and not constraints
         self.streams = Streams(generator, self.batch, self.device)
         discounts = options.discount ** torch.arange(options.horizon + 1, dtype=self.dtype, device=self.device)
         self.scorer = Scorer.build(
@@ -82,11 +84,7 @@ class Search:
         if not self.budget.allows("propose", "iteration", "choose"):
             return self._fall_back(last)
         self.budget.lap()
-        proposals: Tensor | None = None
-        if options.num_policy_samples:
-            generators, bounds = self.streams.policy_generators(), (self.low, self.high)
-            proposals = self.scorer.propose(self.state, options.num_policy_samples, generators, bounds)
-            self.budget.lap("propose")
+        proposals = self._propose() if options.num_policy_samples else None
         progress, history, stopped = self._iterate(start, proposals)
         # Where nothing finite was found: the last plan's tail, or zeros clamped into the bounds.
         mean = torch.where(progress.is_found[:, None, None], progress.mean, last.mean).clamp(self.low, self.high)
@@ -113,14 +111,28 @@ class Search:
         ones = torch.ones(self.batch, dtype=torch.long)
         return Plan(actions, mean, progress.var, expected, info, kept, ones.bool(), ones)
 
+    def _propose(self) -> Tensor:
+        generators, bounds = self.streams.policy_generators(), (self.low, self.high)
+        proposals = self.scorer.propose(self.state, self.options.num_policy_samples, generators, bounds)
+        self.budget.lap("propose")
+        return proposals
+
     def _fall_back(self, last: WarmStart) -> Plan:
-        """The shifted last plan, or zeros, where there is no time to search; what is cold stays cold."""
+        """Where there is no time to search: the policy's mode if that fits, else the shifted last plan, or zeros.
+
+        Searches go on from the last plan in any case, and what is cold stays cold.
+        """
+        actions = last.mean
+        if self.may_follow_policy and self.budget.allows("propose"):
+            self.budget.lap()
+            mode = self._propose()[:, 0]
+            actions = torch.where(torch.isfinite(mode), mode, actions)
         progress, _, _ = self._begin(last, None, 1)
         info = progress.describe([], "deadline")
         if self.scorer.constraints:
             info["violation"] = torch.full_like(progress.expected_return, float("nan"))
         ones = torch.ones(self.batch, dtype=torch.long)
-        return Plan(last.mean, last.mean, last.var, progress.expected_return, info, last.elites, last.is_warm, ones)
+        return Plan(actions, last.mean, last.var, progress.expected_return, info, last.elites, last.is_warm, ones)
 
     def _iterate(self, start: WarmStart, proposals: Tensor | None) -> tuple[Progress, list[tuple[Tensor, Tensor]], str]:
         """The refits; after each, the elites' mean return and the mean sampling std, both (batch,); what ended them."""

@@ -1,0 +1,84 @@
+"""What a planner does that has no time to plan."""
+
+import pytest
+import torch
+
+from latentplan.planning import CEMPlanner
+
+HORIZON = 4
+
+
+class SlowModel:
+    """A pull to the origin; a rollout takes 10 ms of its own time, a decision of its policy 1 ms."""
+
+    def __init__(self):
+        self.seconds = 100.0
+
+    def step(self, state, action):
+        following = state + 0.3 * action
+        return following, -following.square().sum(dim=1)
+
+    def rollout(self, state, actions):
+        self.seconds += 0.01
+        rewards = []
+        for action in actions.unbind(1):
+            state, reward = self.step(state, action)
+            rewards.append(reward)
+        return torch.stack(rewards, dim=1), state
+
+    def policy(self, state, generator=None):
+        self.seconds += 0.001
+        return 0.25 + 0.1 * state
+
+
+def first_reward(rollout):
+    return rollout.rewards[:, 0]
+
+
+@pytest.fixture
+def model():
+    return SlowModel()
+
+
+@pytest.fixture
+def state():
+    return torch.tensor([[1.0, -1.0], [0.5, 2.0]])
+
+
+@pytest.fixture
+def planner(model):
+    sizes = {"horizon": HORIZON, "num_samples": 32, "num_elites": 4, "num_policy_samples": 1}
+    return CEMPlanner(action_dim=2, **sizes, clock=lambda: model.seconds)
+
+
+@pytest.fixture
+def last(planner, model, state):
+    """The last plan of a planner that knows what it takes: 4 ms for the policy's proposals, 10 ms for an iteration."""
+    planner.plan(model, state)
+    return planner.plan(model, state)
+
+
+def test_the_policy_acts_where_it_fits(planner, model, state, last):
+    before = model.seconds
+    plan = planner.plan(model, state, last, deadline_ms=9)
+    assert 1000 * (model.seconds - before) <= 9
+    assert plan.info["is_fallback"].all() and plan.info["stopped"] == "deadline"
+    assert torch.allclose(plan.action, (0.25 + 0.1 * state).clamp(-1.0, 1.0))
+
+
+def test_else_the_last_plan_goes_on_and_searches_start_from_it_in_any_case(planner, model, state, last):
+    shifted = planner.plan(model, state, last, deadline_ms=3)
+    assert torch.equal(shifted.actions[:, :-1], last.actions[:, 1:])
+    assert torch.equal(planner.plan(model, state, last, deadline_ms=9).mean, shifted.mean)
+
+
+@pytest.mark.parametrize("wanted", [{"objective": first_reward}, {"constraints": [first_reward]}])
+def test_a_policy_is_not_asked_for_what_it_was_not_trained_for(planner, model, state, last, wanted):
+    plan = planner.plan(model, state, last, deadline_ms=9, **wanted)
+    assert torch.equal(plan.actions[:, :-1], last.actions[:, 1:])
+
+
+def test_a_policy_that_fails_leaves_the_last_plan(planner, model, state, last):
+    model.policy = lambda state, generator=None: torch.full_like(state, float("nan"))
+    plan = planner.plan(model, state, last, deadline_ms=9)
+    assert torch.equal(plan.actions[:, :-1], last.actions[:, 1:])
