@@ -158,8 +158,6 @@ class PlanningAgent(ModelAgent):
         seed: Of the agent's own random stream.
     """
 
-    last_source: str | list[str] = "plan"
-
     def __init__(
         self,
         model: WorldModel,
@@ -229,7 +227,9 @@ class PlanningAgent(ModelAgent):
 
     def _choose(self, state: State) -> Tensor:
         with self.model.planning():
-            return self.controller.act(state)
+            action = self.controller.act(state)
+        self.last_source = self.controller.source
+        return action
 
 
 class ActorAgent(ModelAgent):

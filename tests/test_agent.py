@@ -1,5 +1,7 @@
 """Agents: frames in, bounded actions out, and a past that belongs to each environment alone."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 import torch
@@ -240,3 +242,17 @@ def test_a_new_episode_forgets_the_noise_of_the_last(model, film):
         agent.act(film[1])
     assert torch.equal(kept._noise[1:], reset._noise[1:])
     assert not torch.allclose(first[0], reset._noise[0], atol=0.3)
+
+
+def test_a_planner_without_time_acts_by_its_actor_and_says_so(model, film):
+    settings = dataclasses.replace(CONFIG.planner, deadline_ms=1e5)
+    agent, actor = make_planner(model, planner=settings), make_actor(model)
+    for frame in film[:3, 0]:
+        agent.act(frame)
+    assert agent.last_source == "plan"
+    agent.reset()
+    pace = agent.controller.planner.pace
+    size = next(key[1] for key in pace._durations)
+    for _ in range(33):
+        pace.record(("iteration", size), 1e3)  # seconds
+    assert np.allclose(agent.act(film[0, 0]), actor.act(film[0, 0]), atol=0.02) and agent.last_source == "actor"

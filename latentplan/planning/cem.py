@@ -156,10 +156,10 @@ class CEMPlanner:
         Returns:
             The plan. Its `info`: `elite_return` and `std` (batch, iteration), `iterations`, `num_nonfinite` and
             `is_fallback` (batch,) (nothing finite was found, or there was no time for one iteration, so the last
-            plan's tail or zeros stand in, or, where only time was short, proposals are asked for and nothing but the
-            model's own return is wanted, the policy's mode), `violation` (batch,) of the chosen sequence when there
-            are constraints, and `stopped`, what ended the search: "iterations", "agreement" (of the elites: `stop_std`)
-            or "deadline".
+            plan's tail or zeros stand in), `is_policy` (batch,) (only time was short, so the policy's mode stands in;
+            proposals must be asked for, and nothing but the model's own return be wanted), `violation` (batch,) of the
+            chosen sequence when there are constraints, and `stopped`, what ended the search: "iterations", "agreement"
+            (of the elites: `stop_std`) or "deadline".
 
         Raises:
             ValueError: The model lacks what a setting asks for, something returned a wrong shape, or the deadline is

@@ -148,6 +148,11 @@ class ModelPredictiveController:
         self._is_stale = True  # what was planned for the old objective is not executed further
 
     @property
+    def source(self) -> str:
+        """What the last action is in the first environment: see `Plan.source`; "plan" before the first."""
+        return "plan" if self.plan is None else self.plan.source
+
+    @property
     def latency(self) -> dict[str, float]:
         """Milliseconds from state to action over the last 10,000 decisions: `mean_ms`, `p50_ms`, `p95_ms`, `p99_ms`.
 

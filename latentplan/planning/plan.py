@@ -50,6 +50,13 @@ class Plan:
         std = self.var[:, 0].sqrt().clamp_min(min_std)
         return self.mean[:, 0].masked_fill(failed, torch.nan), std.masked_fill(failed, torch.nan)
 
+    @property
+    def source(self) -> str:
+        """Whose the first environment's actions are: "plan", or, without a search, "tail" (of an older one) or "actor"."""
+        if not bool(self.info["is_fallback"][0]):
+            return "plan"
+        return "actor" if bool(self.info["is_policy"][0]) else "tail"
+
     def forget(self, mask: Tensor) -> Plan:
         """The same plan, except that environments in mask (batch,) bool start their next search cold."""
         return replace(self, is_warm=self.is_warm & ~mask.to("cpu", torch.bool))

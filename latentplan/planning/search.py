@@ -102,7 +102,7 @@ class Search:
                 bounds=(self.low, self.high),
             )
             self.budget.lap("gradient")
-        info = progress.describe(history, stopped)
+        info = {**progress.describe(history, stopped), "is_policy": torch.zeros_like(progress.is_found)}
         if violation is not None:
             info["violation"] = violation
         kept = None
@@ -120,15 +120,16 @@ class Search:
     def _fall_back(self, last: WarmStart) -> Plan:
         """Where there is no time to search: the policy's mode if that fits, else the shifted last plan, or zeros.
 
-        Searches go on from the last plan in any case, and what is cold stays cold.
+        What is cold stays cold.
         """
-        actions = last.mean
+        actions, is_policy = last.mean, torch.zeros(self.batch, dtype=torch.bool, device=self.device)
         if self.may_follow_policy and self.budget.allows("propose"):
             self.budget.lap()
             mode = self._propose()[:, 0]
-            actions = torch.where(torch.isfinite(mode), mode, actions)
+            is_policy = torch.isfinite(mode).flatten(1).all(1)
+            actions = torch.where(is_policy[:, None, None], mode, actions)
         progress, _, _ = self._begin(last, None, 1)
-        info = progress.describe([], "deadline")
+        info = {**progress.describe([], "deadline"), "is_policy": is_policy}
         if self.scorer.constraints:
             info["violation"] = torch.full_like(progress.expected_return, float("nan"))
         ones = torch.ones(self.batch, dtype=torch.long)
