@@ -52,7 +52,7 @@ class Plan:
 
     @property
     def source(self) -> str:
-        """Whose the first environment's actions are: "plan", or, without a search, "tail" (of an older one) or "actor"."""
+        """Whose the first environment's actions are: "plan"; or, without a search, "tail" (of the last) or "actor"."""
         if not bool(self.info["is_fallback"][0]):
             return "plan"
         return "actor" if bool(self.info["is_policy"][0]) else "tail"
