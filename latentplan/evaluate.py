@@ -126,7 +126,10 @@ def _play_and_report(
             print(f"\ninterrupted after {len(episodes)} of {len(seeds)} episodes", flush=True)
         if episodes:
             scores = {} if scored is None else scored.summarize(len(episodes))
-            _report(request, {**about, **summarize_timed(episodes, clock), **scores})
+            result = {**about, **summarize_timed(episodes, clock), **scores}
+            if request.mode == "gated":  # where a plan goes on none was made
+                result["planned_fraction"] = result["action_source"]["plan"] / sum(result["action_source"].values())
+            _report(request, result)
     return 130 if interrupted else 0
 
 

@@ -37,10 +37,13 @@ class GatedAgent(PlanningAgent):
     belongs to the agent, not to an episode. A signal that is not finite plans.
 
     While the actor acts the last plan ages: the next search starts from it shifted by the decisions in between, and
-    cold when it has run out. Environments of a batch are gated one by one, and share the threshold.
+    cold when it has run out. An actor knows nothing of an objective or a constraint that was set since: then the last
+    plan goes on where none is made, and where it has run out one is made. Environments of a batch are gated one by
+    one, and share the threshold.
 
     Attributes:
-        last_source: "plan" or "actor", of the most recent decision; a list of these for several frames.
+        last_source: "plan", "tail" (of an older plan) or "actor", of the most recent decision; a list of these for
+            several frames.
         planned_fraction: Share of planned decisions so far, 0 before the first.
 
     Args:
@@ -115,13 +118,18 @@ class GatedAgent(PlanningAgent):
         assert self._is_first is not None
         action, _ = self.model.actor(state.features)
         is_planned = self._is_doubtful(state, action, self._is_first) | self._is_first
+        is_tail = torch.zeros_like(is_planned)
+        if self.controller.objective is not None or self.controller.constraints:
+            planned, is_tail = self.controller.follow() or (action, is_tail)
+            is_planned = is_planned | ~is_tail
+            action = torch.where(is_tail[:, None].to(action.device), planned.to(action.dtype), action)
         if bool(is_planned.any()):
             with self.model.planning():
                 planned = self.controller.act_where(state, is_planned)
             action[is_planned.to(action.device)] = planned.to(action.dtype)
         else:
             self.controller.skip()
-        self._count(is_planned)
+        self._count(is_planned, is_tail)
         return action
 
     def _is_doubtful(self, state: State, action: Tensor, is_first: Tensor) -> Tensor:
@@ -156,12 +164,15 @@ class GatedAgent(PlanningAgent):
                 gap, weight = gap + weight * reward, weight * self.discount
             return (gap + weight * self.model.value(state)).abs()
 
-    def _count(self, is_planned: Tensor) -> None:
+    def _count(self, is_planned: Tensor, is_tail: Tensor) -> None:
         num_planned, num = int(is_planned.sum()), len(is_planned)
         self._num_planned += num_planned
         self._num_decisions += num
         self.threshold += GAIN * (num_planned - num * self.planning_budget)
-        self.last_source = ["plan" if planned else "actor" for planned in is_planned.tolist()]
+        self.last_source = [
+            "plan" if planned else "tail" if tail else "actor"
+            for planned, tail in zip(is_planned.tolist(), is_tail.tolist(), strict=True)
+        ]
 
 
 class RunningScale:

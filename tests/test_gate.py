@@ -222,3 +222,29 @@ def test_running_moments_are_those_of_all_values():
 def test_what_cannot_be_is_refused(model, options, words):
     with pytest.raises(ValueError, match=words):
         make(model, **options)
+
+
+def test_with_another_goal_the_plan_goes_on_where_none_is_made_and_the_actor_never_acts(model, film):
+    agent, sources = make(model, planning_budget=0.3, signal="random"), []
+    agent.set_objective(lambda rollout: -rollout.actions[:, 0, 0])
+    for frames in film:
+        expected = agent.controller.follow()
+        action = agent.act(frames[0])
+        sources.append(agent.last_source)
+        if agent.last_source == "tail":
+            assert expected is not None and np.allclose(action, expected[0][0].numpy())
+    horizon = agent.controller.planner.horizon
+    assert set(sources) == {"plan", "tail"} and sources[0] == "plan"
+    longest = max(len(run) for run in "".join(source[0] for source in sources).split("p"))
+    assert 1 <= longest <= horizon - 1  # a plan that has run out is followed by a search
+
+
+def test_a_goal_that_was_just_set_is_planned_for_at_once(model, film):
+    agent = make(model, planning_budget=0.0)
+    for goal in (lambda rollout: rollout.actions[:, 0, 0], lambda rollout: -rollout.actions[:, 0, 0]):
+        agent.set_objective(goal)
+        agent.act(film[1, 0])
+        assert agent.last_source == "plan"
+    agent.set_objective()
+    agent.act(film[2, 0])
+    assert agent.last_source == "actor"

@@ -105,6 +105,18 @@ class ModelPredictiveController:
         if self.plan is not None:
             self.plan = self.plan.aged()
 
+    def follow(self) -> tuple[Tensor, Tensor] | None:
+        """What the present plans would do next, (batch, action), and where they still say it, (batch,) bool.
+
+        None without a plan. Nothing is said by plans that have run out, or were made for another objective.
+        """
+        if self.plan is None:
+            return None
+        batch, horizon = self.plan.actions.shape[:2]
+        index = self.plan.elapsed.clamp_max(horizon - 1)
+        is_left = self.plan.is_warm & (self.plan.elapsed < horizon) & (not self._is_stale)
+        return self.plan.actions[torch.arange(batch), index], is_left
+
     def _act(self, state: State, generator: Generators) -> Tensor:
         started = time.perf_counter()
         if self.plan is None or self.plan.mean.shape[0] != count_rows(state):

@@ -23,8 +23,9 @@ FLAGS = {
     "--json": ("FILE", "result as JSON"),
 }
 SETTINGS = ("planner",)
-OBJECTIVE_PLAYERS = ("planner", "actor", "random")
-CONSTRAINT_PLAYERS = ("planner", "unconstrained", "actor", "random")
+GATED = {"gated": "both", "random gate": "random"}  # players, and what makes them plan
+OBJECTIVE_PLAYERS = ("planner", *GATED, "actor", "random")
+CONSTRAINT_PLAYERS = ("planner", *GATED, "unconstrained", "actor", "random")
 
 
 class Job(NamedTuple):
@@ -33,7 +34,8 @@ class Job(NamedTuple):
     Attributes:
         objective: What is scored, or None.
         constraint: What is scored, or None.
-        player: `planner`, `actor`, `random`, or `unconstrained`: a planner that does not know of the constraint.
+        player: `planner`, `gated`, `random gate` (which plans as often, anywhere), `actor`, `random`, or
+            `unconstrained`: a planner that does not know of the constraint.
     """
 
     objective: str | None
@@ -101,7 +103,7 @@ def play_job(
     Returns:
         The row: `goal`, `kind` (`objective` or `constraint`), `player`, the score of each episode in `scores`
         (objective return, or violation rate), their `mean` and `ci95`, the task's `returns` and `mean_return` with
-        `return_ci95`, and `decision_ms`.
+        `return_ci95`, `planned_fraction` and `decision_ms`.
     """
     import torch
 
@@ -113,13 +115,15 @@ def play_job(
 
     torch.set_num_threads(threads)
     _, config, _ = load_model(checkpoint)
-    mode = "planner" if job.player == "unconstrained" else job.player
-    agent: Any = load_agent(checkpoint, mode=mode, device=device, **(overrides if mode == "planner" else {}))
+    pursues = job.player == "planner" or job.player in GATED
+    mode = "gated" if job.player in GATED else "planner" if job.player == "unconstrained" else job.player
+    settings = {**overrides, "signal": GATED[job.player]} if mode == "gated" else overrides
+    agent: Any = load_agent(checkpoint, mode=mode, device=device, **(settings if mode in ("planner", "gated") else {}))
     goals = read_goals(job.objective, job.constraint, config.env.domain)
     assert goals is not None, "a job names an objective or a constraint"
     env = make_env(config.env)
     try:
-        scored = score_env(env, goals, agent if job.player == "planner" else None)
+        scored = score_env(env, goals, agent if pursues else None)
         result = summarize(run_episodes(scored, agent, seeds))
     finally:
         env.close()
@@ -137,13 +141,14 @@ def play_job(
         "returns": result["returns"],
         "mean_return": result["mean_return"],
         "return_ci95": result["ci95"],
+        "planned_fraction": result["action_source"]["plan"] / sum(result["action_source"].values()),
         "decision_ms": result["decision_ms"],
     }
 
 
 def summary_table(rows: Sequence[dict[str, Any]]) -> str:
     """The rows for people: scores are objective returns, or for constraints violation rates."""
-    header = ["goal", "player", "score", "95 %", "task return", "95 %", "ms p50"]
+    header = ["goal", "player", "score", "95 %", "task return", "95 %", "planned", "ms p50"]
     lines = [
         [
             f"{row['goal']} ({row['kind']})",
@@ -152,6 +157,7 @@ def summary_table(rows: Sequence[dict[str, Any]]) -> str:
             interval(row["ci95"], row["digits"]),
             number(row["mean_return"]),
             interval(row["return_ci95"]),
+            f"{100.0 * row['planned_fraction']:.0f} %",
             number(row["decision_ms"]["p50"], 2),
         ]
         for row in rows
