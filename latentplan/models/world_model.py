@@ -113,6 +113,9 @@ class WorldModel(nn.Module):
 
     def step(self, state: State, action: Tensor) -> tuple[State, Tensor]:
         """Imagine one decision: the next state, and the reward (rows,) that arrives with it."""
+        if self._packed_for(*state, action) is not None:
+            rewards, following = self.rollout(state, action.unsqueeze(1))
+            return following, rewards.squeeze(1)
         with self.trunk_precision():
             following = self._advance_mean(state, action)
             return following, self.reward_head.mean(self.reward_head(following.features))
@@ -141,8 +144,8 @@ class WorldModel(nn.Module):
 
     def value(self, state: State) -> Tensor:
         """Expected discounted return from a state on, (rows,)."""
-        packed = None if self._laid_out is None else self._laid_out.packed
-        if packed is not None and not asks_for_gradients(*state):
+        packed = self._packed_for(*state)
+        if packed is not None:
             return fused.judge(packed, *state)
         with self.trunk_precision():
             return self.value_head.mean(self.value_head(state.features))
@@ -170,6 +173,10 @@ class WorldModel(nn.Module):
         if any(parameter.is_inference() for parameter in parameters):
             return None
         return tuple((parameter.data_ptr(), parameter._version) for parameter in parameters)
+
+    def _packed_for(self, *tensors: Tensor) -> fused.Packed | None:
+        """What compiled rollouts read, while a search is on and no gradient is asked for."""
+        return None if self._laid_out is None or asks_for_gradients(*tensors) else self._laid_out.packed
 
     def _weights(self) -> Weights:
         """Weights laid out for imagination; gradients do not pass through them."""
