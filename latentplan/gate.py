@@ -155,7 +155,7 @@ class GatedAgent(PlanningAgent):
 
     def _value_gap(self, state: State, action: Tensor) -> Tensor:
         """What the critic says of a state, against what the model says of the actor's way from there: (batch,)."""
-        with self.model.trunk_precision():
+        with self.model.planning():
             gap, weight = -self.model.value(state), 1.0
             for step in range(GAP_STEPS):
                 if step > 0:
