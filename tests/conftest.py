@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-# Models here are tiny: threads gain nothing, and on a busy machine they wait for each other. Set before torch is imported.
+# Models here are tiny: threads gain nothing and wait for each other on a busy machine. Torch reads this at import.
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 ROOT = Path(__file__).resolve().parent.parent
