@@ -226,7 +226,7 @@ class PlanningAgent(ModelAgent):
         return planned.masked_fill(plan.info["is_fallback"][:, None], 0.0).float().cpu().numpy()
 
     def _choose(self, state: State) -> Tensor:
-        with self.model.planning():
+        with self.model.trunk_precision():
             action = self.controller.act(state)
         self.last_source = self.controller.source
         return action

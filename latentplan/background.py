@@ -25,7 +25,7 @@ class LatentPlanner:
 
     def plan(self, model: WorldModel, state: State, previous: Plan | None = None, **options: Any) -> Plan:
         """See `CEMPlanner.plan`."""
-        with model.planning():
+        with model.trunk_precision():
             return self.search.plan(model, state, previous, **options)
 
 
@@ -111,6 +111,7 @@ class BackgroundAgent(ModelAgent):
         self.close()
 
     def _choose(self, state: State) -> Tensor:
-        decision = self.scheduler.decide(state)
+        with self.model.trunk_precision():
+            decision = self.scheduler.decide(state)
         self.last_source, self.plan_age = decision.source, decision.age
         return decision.action

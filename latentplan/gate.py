@@ -124,7 +124,7 @@ class GatedAgent(PlanningAgent):
             is_planned = is_planned | ~is_tail
             action = torch.where(is_tail[:, None].to(action.device), planned.to(action.dtype), action)
         if bool(is_planned.any()):
-            with self.model.planning():
+            with self.model.trunk_precision():
                 planned = self.controller.act_where(state, is_planned)
             action[is_planned.to(action.device)] = planned.to(action.dtype)
         else:
@@ -155,7 +155,7 @@ class GatedAgent(PlanningAgent):
 
     def _value_gap(self, state: State, action: Tensor) -> Tensor:
         """What the critic says of a state, against what the model says of the actor's way from there: (batch,)."""
-        with self.model.planning():
+        with self.model.trunk_precision():
             gap, weight = -self.model.value(state), 1.0
             for step in range(GAP_STEPS):
                 if step > 0:

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Hashable, Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager, contextmanager
+from collections.abc import Hashable, Mapping, Sequence
+from contextlib import AbstractContextManager
 from typing import Any
 
 import torch
@@ -15,7 +15,7 @@ from latentplan.models.decoder import Decoder
 from latentplan.models.dynamics import Rssm, State
 from latentplan.models.encoder import Encoder
 from latentplan.models.heads import Actor, Mlp, ScalarHead, sample_action
-from latentplan.models.imagination import Weights, asks_for_gradients, follow_actor, imagine, lay_out
+from latentplan.models.imagination import Weights, follow_actor, imagine, lay_out
 
 PROBE_SHARE = 3  # quantities lie near the surface of the latent: a narrow head reads them
 
@@ -45,8 +45,11 @@ class WorldModel(nn.Module):
         self.continue_head = Mlp(features, config.hidden_dim, 1)
         self.value_head = ScalarHead(features, config.hidden_dim, config.num_bins)
         self.actor = Actor(features, config.hidden_dim, action_dim)
-        self._laid_out: Weights | None = None
         self._kept: tuple[Hashable, Weights] | None = None
+        parts = (self.dynamics, self.reward_head, self.value_head, self.actor)
+        self._places = [
+            (module._parameters, name) for part in parts for module in part.modules() for name in module._parameters
+        ]  # of the parameters that imagination reads: walking through the modules takes longer than a step
         self.register_buffer("label_scales", torch.tensor(list(self.labels.values())), persistent=False)
         if self.labels:
             self.probe_head = Mlp(features, max(1, config.hidden_dim // PROBE_SHARE), len(self.labels))
@@ -59,23 +62,6 @@ class WorldModel(nn.Module):
                 when it leaves: what learns in two threads must not use it, or rounding would depend on timing.
         """
         return torch.autocast(self.device.type, dtype=torch.bfloat16, cache_enabled=cache)
-
-    @contextmanager
-    def planning(self) -> Iterator[None]:
-        """For one search: the trunk's precision, and weights laid out for it; none may change meanwhile.
-
-        Weights are laid out anew when one was written to in place or replaced since the last search. Writing through
-        `parameter.data` goes unseen.
-        """
-        with self.trunk_precision():
-            key = self._planned_with()
-            if self._kept is None or key is None or self._kept[0] != key:
-                self._kept = (key, self._weights())
-            self._laid_out = self._kept[1]
-            try:
-                yield
-            finally:
-                self._laid_out = None
 
     @property
     def device(self) -> torch.device:
@@ -113,7 +99,7 @@ class WorldModel(nn.Module):
 
     def step(self, state: State, action: Tensor) -> tuple[State, Tensor]:
         """Imagine one decision: the next state, and the reward (rows,) that arrives with it."""
-        if self._packed_for(*state, action) is not None:
+        if self._packed() is not None:
             rewards, following = self.rollout(state, action.unsqueeze(1))
             return following, rewards.squeeze(1)
         with self.trunk_precision():
@@ -144,7 +130,7 @@ class WorldModel(nn.Module):
 
     def value(self, state: State) -> Tensor:
         """Expected discounted return from a state on, (rows,)."""
-        packed = self._packed_for(*state)
+        packed = self._packed()
         if packed is not None:
             return fused.judge(packed, *state)
         with self.trunk_precision():
@@ -166,26 +152,28 @@ class WorldModel(nn.Module):
     def __getstate__(self) -> dict[str, Any]:
         return {**self.__dict__, "_kept": None}  # it points into memory
 
-    def _planned_with(self) -> Hashable:
-        """What the weights that searches use are known by; None where torch does not count their changes."""
-        parameters = [*self.dynamics.parameters(), *self.reward_head.parameters(), *self.value_head.parameters()]
-        parameters += self.actor.parameters()
-        if any(parameter.is_inference() for parameter in parameters):
-            return None
-        return tuple((parameter.data_ptr(), parameter._version) for parameter in parameters)
-
-    def _packed_for(self, *tensors: Tensor) -> fused.Packed | None:
-        """What compiled rollouts read, while a search is on and no gradient is asked for."""
-        return None if self._laid_out is None or asks_for_gradients(*tensors) else self._laid_out.packed
+    def _packed(self) -> fused.Packed | None:
+        """What compiled steps and values read; None where torch has to do it, or gradients could be asked for."""
+        return None if torch.is_grad_enabled() else self._weights().packed
 
     def _weights(self) -> Weights:
-        """Weights laid out for imagination; gradients do not pass through them."""
-        if self._laid_out is not None:
-            return self._laid_out
-        kind = self.device.type
+        """Weights laid out for imagination; gradients do not pass through them.
+
+        They are laid out anew when one was written to in place or replaced. Writing through `parameter.data`, and
+        replacing whole modules, goes unseen.
+        """
+        kind, kept = self.device.type, self._kept
         with self.trunk_precision():
             dtype = torch.get_autocast_dtype(kind) if torch.is_autocast_enabled(kind) else torch.float32
-        return lay_out(self.dynamics, self.reward_head, self.value_head, self.actor, dtype)
+        parameters = [place[name] for place, name in self._places]
+        read = [parameter for parameter in parameters if parameter is not None]
+        if read[0].is_inference():  # torch does not count what changes these
+            return lay_out(self.dynamics, self.reward_head, self.value_head, self.actor, dtype)
+        key = (dtype, *((parameter.data_ptr(), parameter._version) for parameter in read))
+        if kept is None or kept[0] != key:
+            kept = (key, lay_out(self.dynamics, self.reward_head, self.value_head, self.actor, dtype))
+            self._kept = kept
+        return kept[1]
 
     def _advance_mean(self, state: State, action: Tensor) -> State:
         deter = self.dynamics.advance(state, action)

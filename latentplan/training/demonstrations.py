@@ -35,7 +35,7 @@ def plan_actions(
     """
     parts = []
     for rows in zip(*(part.split(rows_per_call) for part in states), strict=True):
-        with model.planning():
+        with model.trunk_precision():
             plan = planner.plan(model, State(*rows), generator=generator)
         parts.append(first_actions(plan, planner.min_std))
         report(sum(len(mean) for mean, _ in parts))

@@ -29,8 +29,8 @@ def start(rows=ROWS):
 
 
 def weights_of(model):
-    with torch.no_grad(), model.planning():
-        return model._laid_out
+    with torch.no_grad(), model.trunk_precision():
+        return model._weights()
 
 
 WEIGHTS = weights_of(build())
@@ -79,7 +79,7 @@ def test_values_are_those_of_the_value_head_and_rows_are_judged_alone():
         exact = model.value_head.mean(model.value_head(state.features))
     with torch.no_grad():
         rounded = model.value(state)
-        with model.planning():
+        with model.trunk_precision():
             values, alone = model.value(state), model.value(State(*(part[40:41] for part in state)))
     errors = [(found - exact).square().mean().sqrt() for found in (values, rounded)]
     assert 0.0 < errors[0] < 1.2 * errors[1]
@@ -89,7 +89,7 @@ def test_values_are_those_of_the_value_head_and_rows_are_judged_alone():
 @compiled
 def test_a_step_of_a_search_is_a_rollout_of_one():
     model, state, action = build(), start(), draw(ROWS, ACTION).clamp(-1.0, 1.0)
-    with torch.no_grad(), model.planning():
+    with torch.no_grad(), model.trunk_precision():
         following, reward = model.step(state, action)
         rewards, last = model.rollout(state, action.unsqueeze(1))
     assert torch.equal(reward, rewards[:, 0]) and all(map(torch.equal, following, last))
@@ -138,7 +138,7 @@ def test_actions_may_be_views_and_need_not_be_float32():
 @compiled
 def test_gradients_pass_where_they_are_asked_for():
     model, actions = build(), draw(ROWS, TIME, ACTION).clamp(-1.0, 1.0).requires_grad_()
-    with model.planning():
+    with model.trunk_precision():
         rewards, last = model.rollout(start(), actions)
         (by_reward,) = torch.autograd.grad(rewards.sum(), actions, retain_graph=True)
         (by_value,) = torch.autograd.grad(model.value(last).sum(), actions)

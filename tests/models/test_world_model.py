@@ -139,21 +139,9 @@ def test_proposals_are_what_the_actor_does_step_by_step(model, state):
     assert torch.allclose(alone, proposed[2], atol=0.03)
 
 
-def test_weights_laid_out_for_a_search_are_laid_out_anew_for_the_next(model, state, actions):
-    with model.planning():
-        before, _ = model.rollout(state, actions)
-        assert torch.equal(model.rollout(state, actions)[0], before)
-    with torch.no_grad():
-        model.reward_head.mlp.output.weight.mul_(1.5)
-    with model.planning():
-        after, _ = model.rollout(state, actions)
-    assert not torch.allclose(before, after, atol=0.05)
-    assert torch.equal(after, model.rollout(state, actions)[0])
-
-
 def test_searches_see_weights_that_changed_in_place_or_were_replaced(model, state, actions):
     def planned():
-        with torch.no_grad(), model.planning():
+        with torch.no_grad(), model.trunk_precision():
             return model.rollout(state, actions)[0]
 
     first = planned()
@@ -171,18 +159,18 @@ def test_searches_see_weights_that_changed_in_place_or_were_replaced(model, stat
 
 
 def test_a_model_that_has_planned_can_be_copied_and_pickled(model, state, actions):
-    with torch.no_grad(), model.planning():
+    with torch.no_grad(), model.trunk_precision():
         expected = model.rollout(state, actions)[0]
     for twin in (copy.deepcopy(model), pickle.loads(pickle.dumps(model))):
-        with torch.no_grad(), twin.planning():
+        with torch.no_grad(), twin.trunk_precision():
             assert torch.equal(twin.rollout(state, actions)[0], expected)
 
 
 def test_weights_made_for_inference_only_are_laid_out_for_every_search(model, state, actions):
     with torch.inference_mode():
         twin = copy.deepcopy(model)
-        with twin.planning():
+        with twin.trunk_precision():
             before = twin.rollout(state, actions)[0]
         twin.dynamics.gates.weight.mul_(0.5)
-        with twin.planning():
+        with twin.trunk_precision():
             assert not torch.equal(twin.rollout(state, actions)[0], before)
