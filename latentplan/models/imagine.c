@@ -1,9 +1,19 @@
 // Following action sequences by the mean of the prior, many steps of 32 rows at a time, so that nothing but the weights
 // leaves a core's cache. Products are bfloat16 with float32 sums, everything between them is float32.
 
+#include <stddef.h>
+
+#if !defined(__AVX512BF16__)
+
+int can_imagine(void) { return 0; }
+int imagine(void) { return 1; }
+int judge(void) { return 1; }
+
+#else
+
 #include <stdlib.h>
 
-#include "rows.h"
+#include "vectors.h"
 
 #define BLOCK 32
 #define TILE 16
@@ -37,7 +47,6 @@ typedef struct {
 } Desk;
 
 #if defined(__AMX_BF16__) && defined(__linux__)
-#include <immintrin.h>
 #include <sys/syscall.h>
 #include <unistd.h>
 #define ASK_FOR_TILES 0x1023
@@ -86,8 +95,7 @@ static void multiply(Desk *desk, const bfloat16 *rows, const Layer *layer) {
     }
 }
 
-#elif defined(__AVX512BF16__)
-#include <immintrin.h>
+#else
 
 int can_imagine(void) { return 1; }
 static void set_up(void) {}
@@ -114,24 +122,14 @@ static void multiply(Desk *desk, const bfloat16 *rows, const Layer *layer) {
     }
 }
 
-#else
-
-int can_imagine(void) { return 0; }
-static void set_up(void) {}
-static void tear_down(void) {}
-static void multiply(Desk *desk, const bfloat16 *rows, const Layer *layer) {
-    (void)desk, (void)rows, (void)layer;
-}
-
 #endif
 
 // One hidden layer of every row, written where hidden layers are.
 static void layer_of(Desk *desk, const bfloat16 *from, const Layer *layer) {
     multiply(desk, from, layer);
     for (long r = 0; r < desk->count; r++) {
-        bfloat16 *hidden = desk->hidden + r * desk->width;
-        Norm norm = norm_of(desk->product + r * layer->outputs, layer->scale, layer->shift, layer->outputs);
-        VECTOR() for (long i = 0; i < layer->outputs; i++) hidden[i] = write_bfloat16(silu(normed(&norm, i)));
+        const float *row = desk->product + r * layer->outputs;
+        silu_row(desk->hidden + r * desk->width, row, layer->scale, layer->shift, layer->outputs);
     }
 }
 
@@ -152,14 +150,9 @@ static void advance(Desk *desk, const Model *model) {
     layer_of(desk, desk->rows, &model->input);
     multiply(desk, desk->rounded, &model->gates);
     for (long r = 0; r < desk->count; r++) {
+        const float *row = desk->product + r * model->gates.outputs;
         float *deter = desk->deter + r * model->deter;
-        bfloat16 *rounded = desk->rounded + r * desk->width;
-        const Layer *gates = &model->gates;
-        Norm norm = norm_of(desk->product + r * gates->outputs, gates->scale, gates->shift, gates->outputs);
-        VECTOR() for (long i = 0; i < model->deter; i++) {
-            deter[i] = gated(&norm, i, model->deter, deter[i]);
-            rounded[i] = write_bfloat16(deter[i]);
-        }
+        gate_row(deter, desk->rounded + r * desk->width, row, model->gates.scale, model->gates.shift, model->deter);
     }
     layer_of(desk, desk->rounded, &model->prior);
     multiply(desk, desk->hidden, &model->mean);
@@ -174,7 +167,7 @@ static void advance(Desk *desk, const Model *model) {
 static void read_bins(Desk *desk, const Model *model, const Mlp *head, float *scalars, long apart) {
     output_of(desk, head);
     for (long r = 0; r < desk->count; r++)
-        scalars[r * apart] = expected(desk->product + r * head->output.outputs, model->bin_values, model->bins);
+        scalars[r * apart] = wide_expected(desk->product + r * head->output.outputs, model->bin_values, model->bins);
 }
 
 static long padded(long size) { return (size + BLOCK - 1) / BLOCK * BLOCK; }
@@ -288,3 +281,5 @@ int imagine(const Model *model, float *deter, float *stoch, float *actions, floa
     }
     return failed;
 }
+
+#endif

@@ -21,7 +21,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-SOURCES = tuple(Path(__file__).with_name(name) for name in ("rows.h", "kernels.c", "imagine.c"))
+SOURCES = tuple(Path(__file__).with_name(name) for name in ("rows.h", "vectors.h", "kernels.c", "imagine.c"))
 # Sums may be taken in any order, without which none would be a vector's; nothing else of IEEE 754 is given up.
 ARITHMETIC = ("-fassociative-math", "-fno-signed-zeros", "-fno-trapping-math", "-fno-math-errno")
 FLAGS = ("-O3", "-march=native", *ARITHMETIC, "-fopenmp", "-shared", "-fPIC")

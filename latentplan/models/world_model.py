@@ -99,12 +99,16 @@ class WorldModel(nn.Module):
 
     def step(self, state: State, action: Tensor) -> tuple[State, Tensor]:
         """Imagine one decision: the next state, and the reward (rows,) that arrives with it."""
-        if self._packed() is not None:
-            rewards, following = self.rollout(state, action.unsqueeze(1))
-            return following, rewards.squeeze(1)
         with self.trunk_precision():
             following = self._advance_mean(state, action)
             return following, self.reward_head.mean(self.reward_head(following.features))
+
+    def fast_step(self, state: State, action: Tensor) -> tuple[State, Tensor]:
+        """`step`, compiled where that can be, for rows in dim 0 and without gradients."""
+        if self._packed() is None:
+            return self.step(state, action)
+        rewards, following = self.rollout(state, action.unsqueeze(1))
+        return following, rewards.squeeze(1)
 
     def rollout(self, state: State, actions: Tensor) -> tuple[Tensor, State]:
         """Imagine action sequences (rows, horizon, action): rewards (rows, horizon) and the last state."""
@@ -130,7 +134,7 @@ class WorldModel(nn.Module):
 
     def value(self, state: State) -> Tensor:
         """Expected discounted return from a state on, (rows,)."""
-        packed = self._packed()
+        packed = self._packed() if state.deter.ndim == 2 else None
         if packed is not None:
             return fused.judge(packed, *state)
         with self.trunk_precision():

@@ -11,7 +11,7 @@ from torch import Tensor
 from torch.utils._pytree import tree_map
 
 from latentplan.planning.elites import Scores
-from latentplan.planning.model import Model, State, check_shape, repeat_rows, require, split_rows, supports
+from latentplan.planning.model import Model, State, check_shape, repeat_rows, require, split_rows, supports, take_step
 from latentplan.planning.objectives import Constraint, Objective, Rollout, Term, as_objective, predicted_return
 
 
@@ -84,10 +84,7 @@ class Scorer:
         rows = rearrange(actions, "batch sample horizon action -> (batch sample) horizon action")
         if particles > 1:
             rows = repeat_rows(rows, particles)
-        scores = self._judge(self._imagine(start, rows, batch, particles))
-        # A policy that answers NaN must not become an elite through a model that ignores its action.
-        is_finite = torch.isfinite(actions).all(dim=-1).all(dim=-1)
-        return scores._replace(returns=scores.returns.masked_fill(~is_finite, float("nan")))
+        return self._judge(self._imagine(start, rows, batch, particles))
 
     def propose(
         self, state: State, num: int, generators: Sequence[torch.Generator], bounds: tuple[Tensor, Tensor]
@@ -135,7 +132,7 @@ class Scorer:
                 mode = torch.clamp(mode.to(action.dtype), *bounds)
                 action = torch.where(is_tail[:, step] & torch.isfinite(mode), mode, action)
             filled.append(action)
-            state, _ = self.model.step(state, action)
+            state, _ = take_step(self.model, state, action)
         return torch.stack(filled, dim=1)
 
     @property
@@ -160,7 +157,7 @@ class Scorer:
         rewards, continues = [], []
         for step in range(horizon):
             action = choose(step, state)
-            state, reward = self.model.step(state, action)
+            state, reward = take_step(self.model, state, action)
             check_shape("step()'s reward", reward, action.shape[:1])
             states.append(state)
             rewards.append(reward)

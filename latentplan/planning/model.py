@@ -8,6 +8,7 @@ A model needs one method, `step`. What else it has is detected by name:
     continues(state) -> (rows,)                      probability that the episode goes on from this state
     uncertainty(state, action) -> (rows,)            doubt of the model about that step
     rollout(state, actions (rows, horizon, action)) -> (rewards (rows, horizon), last_state)     fused fast path
+    fast_step(state, action)                         the same as step, sooner; it need not pass gradients
     propose(state, num, horizon, generators) -> actions (batch num, horizon, action)    fused: what the policy would do,
                                                      its mode first, then samples, one generator per row of state
     particles(state, num) -> state                   several versions of each row, batch-major: (batch num) rows
@@ -90,6 +91,13 @@ def require(model: object, method: str, reason: str) -> None:
     """
     if not supports(model, method):
         raise ValueError(f"{reason} needs a model with {method}(), which {type(model).__name__} does not have")
+
+
+def take_step(model: Any, state: State, action: Tensor) -> tuple[State, Tensor]:
+    """The model's step: its `fast_step` where it has one and no gradient is asked for."""
+    is_fast = supports(model, "fast_step") and not torch.is_grad_enabled()
+    following: tuple[State, Tensor] = (model.fast_step if is_fast else model.step)(state, action)
+    return following
 
 
 def count_rows(state: State) -> int:

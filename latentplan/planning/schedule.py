@@ -9,7 +9,16 @@ import torch
 from torch import Tensor
 
 from latentplan.planning.cem import CEMPlanner
-from latentplan.planning.model import Model, State, action_dtype, count_rows, per_dimension, state_device, supports
+from latentplan.planning.model import (
+    Model,
+    State,
+    action_dtype,
+    count_rows,
+    per_dimension,
+    state_device,
+    supports,
+    take_step,
+)
 from latentplan.planning.plan import Plan
 from latentplan.planning.realtime import PlanBuffer
 
@@ -158,7 +167,7 @@ class PlanScheduler:
         if self._last is not None:
             due = max(due, self._last[0] + 1)  # a plan for a tick that already has one would be of no use
         for tick in range(self.tick + 1, due + 1):
-            state, _ = self.model.step(state, action)
+            state, _ = take_step(self.model, state, action)
             if tick < due:
                 planned = self.buffer.peek(tick)
                 action = self._act_alone(state) if planned is None else planned

@@ -157,6 +157,9 @@ class Search:
             if iteration <= 1:  # the proposals are scored once
                 rows = self.scorer.start_rows(self.state, fresh.shape[1])
             scores = self.scorer.score(rows, fresh)
+            if iteration == 0:  # what a policy says may be NaN, and a model may not mind: it must not become an elite
+                is_finite = torch.isfinite(fresh).flatten(2).all(dim=2)
+                scores = scores._replace(returns=scores.returns.masked_fill(~is_finite, float("nan")))
             updated = self._refit(progress, [(fresh, scores), *known, *self._kept(progress)], scores.returns)
             if iteration == 0:  # the policy's proposals and the shifted last plan stay among the candidates
                 known = [(fresh[:, num_fresh:], scores.rest(num_fresh)), (fresh[:, :1], scores.first(1))]

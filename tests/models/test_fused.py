@@ -90,7 +90,7 @@ def test_values_are_those_of_the_value_head_and_rows_are_judged_alone():
 def test_a_step_of_a_search_is_a_rollout_of_one():
     model, state, action = build(), start(), draw(ROWS, ACTION).clamp(-1.0, 1.0)
     with torch.no_grad(), model.trunk_precision():
-        following, reward = model.step(state, action)
+        following, reward = model.fast_step(state, action)
         rewards, last = model.rollout(state, action.unsqueeze(1))
     assert torch.equal(reward, rewards[:, 0]) and all(map(torch.equal, following, last))
 

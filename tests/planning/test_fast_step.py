@@ -1,0 +1,25 @@
+"""A model may take its steps sooner for a planner."""
+
+import torch
+
+from latentplan.planning import CEMPlanner
+
+
+def test_steps_are_taken_by_the_models_fast_step_where_no_gradient_is_asked_for(seeded):
+    class Model:
+        def __init__(self):
+            self.calls = {"step": 0, "fast_step": 0}
+
+        def step(self, state, action, name="step"):
+            self.calls[name] += 1
+            return state + action, -(state + action).square().sum(dim=1)
+
+        def fast_step(self, state, action):
+            return self.step(state, action, "fast_step")
+
+    model, plans = Model(), []
+    for steps in (0, 1):
+        planner = CEMPlanner(action_dim=2, horizon=3, num_samples=16, num_elites=4, gradient_steps=steps)
+        plans.append(planner.plan(model, torch.ones(1, 2), generator=seeded(0)))
+        assert (model.calls["step"] > 0) == (steps > 0) and model.calls["fast_step"] > 0
+    assert not torch.equal(plans[0].actions, plans[1].actions)
