@@ -32,6 +32,8 @@ if TYPE_CHECKING:
     from latentplan.timed_rollout import TimedEpisode
     from latentplan.virtual_clock import VirtualClock
 
+ON_ONE_THREAD = ("actor", "background")  # more would only wait for each other at a single frame
+
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run `scripts/eval.py` and return the exit code: 0, 2 for bad input, 130 when interrupted."""
@@ -71,7 +73,7 @@ def _evaluate(argv: Sequence[str]) -> int:
         raise UserError(f"{request.checkpoint} has settings of another version: {error}") from None
     planner = build_config({"planner": {**to_dict(config.planner), **request.planner}}).planner
     overrides = {name: getattr(planner, name) for name in request.planner}
-    device = use_device(request.device, request.threads)
+    device = use_device(request.device, request.threads or (1 if request.mode in ON_ONE_THREAD else None))
     from latentplan.envs import make_env
     from latentplan.scoring import read_goals, score_env
 

@@ -34,7 +34,7 @@ FLAGS = {
     "--latency": ("measured|FILE", "what thinking costs there: as measured, or drawn from a file of ms (measured)"),
     "--seed": ("S", "episode i starts from a state that depends only on S and i (0)"),
     "--device": ("|".join(DEVICES), "where the agent computes (auto: cuda where usable)"),
-    "--threads": ("N", "CPU threads (torch's own choice)"),
+    "--threads": ("N", "CPU threads (torch's own choice; 1 for actor and background)"),
 }
 
 
