@@ -197,7 +197,8 @@ class PlanningAgent(ModelAgent):
         if isinstance(objective, Expression):
             require_labels([node for _, node in objective.terms], self.model.label_names)
             learned = predicted_return(self.model, self.controller.planner.terminal_value)
-            objective = plan_objective(objective, self.config.env.action_repeat, learned, self._encode_goal)
+            repeat, wanted = self.config.env.action_repeat, objective
+            objective = None if wanted.is_return else plan_objective(wanted, repeat, learned, self._encode_goal)
         if isinstance(constraints, str):
             clauses = parse_constraints(constraints, known)
             require_labels(clauses, self.model.label_names)

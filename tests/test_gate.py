@@ -245,6 +245,7 @@ def test_a_goal_that_was_just_set_is_planned_for_at_once(model, film):
         agent.set_objective(goal)
         agent.act(film[1, 0])
         assert agent.last_source == "plan"
-    agent.set_objective()
-    agent.act(film[2, 0])
-    assert agent.last_source == "actor"
+    for nothing_else in (None, "return"):
+        agent.set_objective(nothing_else)
+        agent.act(film[2, 0])
+        assert agent.last_source == "actor"

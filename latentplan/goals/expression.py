@@ -102,6 +102,11 @@ class Expression:
     terms: tuple[tuple[float, Node], ...]
 
     @property
+    def is_return(self) -> bool:
+        """Whether nothing but the learned return is wanted, which is what agents pursue without an objective."""
+        return len(self.terms) == 1 and self.terms[0][0] > 0.0 and isinstance(self.terms[0][1], LearnedReturn)
+
+    @property
     def clauses(self) -> tuple[Clause, ...]:
         """Every clause, in the order of the text."""
         return tuple(part for _, term in self.terms for part in walk(term) if isinstance(part, Clause))
