@@ -32,10 +32,7 @@ class _Layer(ctypes.Structure):
 
 class _Model(ctypes.Structure):
     _fields_ = (
-        (
-            "layers",
-            _Layer * 13,
-        ),  # input, gates, prior, mean, and three of the reward head, of the actor and of the value head
+        ("layers", _Layer * 13),  # input, gates, prior, mean; then three of each: reward head, actor, value head
         ("bin_values", ctypes.c_void_p),
         *((name, ctypes.c_long) for name in ("action", "latent", "deter", "hidden", "bins")),
     )
@@ -99,18 +96,14 @@ def rollout(packed: Packed, deter: Tensor, stoch: Tensor, actions: Tensor) -> tu
 def follow(packed: Packed, deter: Tensor, stoch: Tensor, noise: Tensor) -> Tensor:
     """The actor's actions, float32 (rows, time, action), for standard normal draws of the same shape."""
     actions = _own(noise)
-    _call(packed, _own(deter), _own(stoch), actions, None)
+    _call(packed, _own(deter), _own(stoch), actions)
     return actions
 
 
 def judge(packed: Packed, deter: Tensor, stoch: Tensor) -> Tensor:
     """The value of states, float32 (rows,)."""
-    library, values = load(), torch.empty(len(deter))
-    assert library is not None
-    deter, stoch = deter.float().contiguous(), stoch.float().contiguous()
-    places = [tensor.data_ptr() for tensor in (deter, stoch, values)]
-    if library.judge(ctypes.addressof(packed.model), *places, len(values), torch.get_num_threads()):
-        raise MemoryError("no memory for the value of a state")
+    values = torch.empty(len(deter))
+    _call(packed, _own(deter), _own(stoch), torch.empty(len(deter), 0, 0), values=values)
     return values
 
 
@@ -119,13 +112,19 @@ def _own(tensor: Tensor) -> Tensor:
     return tensor.to(torch.float32, memory_format=torch.contiguous_format, copy=True)
 
 
-def _call(packed: Packed, deter: Tensor, stoch: Tensor, actions: Tensor, rewards: Tensor | None) -> None:
+def _call(
+    packed: Packed,
+    deter: Tensor,
+    stoch: Tensor,
+    actions: Tensor,
+    rewards: Tensor | None = None,
+    values: Tensor | None = None,
+) -> None:
     library = load()
     assert library is not None
-    places = [tensor.data_ptr() for tensor in (deter, stoch, actions)]
-    where = None if rewards is None else rewards.data_ptr()
+    written = [None if tensor is None else tensor.data_ptr() for tensor in (deter, stoch, actions, rewards, values)]
     rows, time = actions.shape[:2]
-    if library.imagine(ctypes.addressof(packed.model), *places, where, rows, time, torch.get_num_threads()):
+    if library.imagine(ctypes.addressof(packed.model), *written, rows, time, torch.get_num_threads()):
         raise MemoryError("no memory for an imagined rollout")
 
 

@@ -7,7 +7,6 @@
 
 int can_imagine(void) { return 0; }
 int imagine(void) { return 1; }
-int judge(void) { return 1; }
 
 #else
 
@@ -228,33 +227,14 @@ static void decide(Desk *desk, const Model *model, float *actions, long time) {
     }
 }
 
-// The value (rows,) of states. Returns 0, or 1 when there was no memory.
-int judge(const Model *model, const float *deter, const float *stoch, float *values, long rows, int threads) {
-    int failed = 0;
-    long blocks = (rows + BLOCK - 1) / BLOCK;
-#pragma omp parallel num_threads(threads < blocks ? threads : (int)blocks) reduction(| : failed)
-    {
-        float *memory = open_desk(model);
-        failed = memory == NULL;
-#pragma omp for schedule(static)
-        for (long block = 0; block < blocks; block++) {
-            if (memory == NULL) continue;
-            long from = block * BLOCK, here = rows - from < BLOCK ? rows - from : BLOCK;
-            Desk desk = lay(memory, model, deter + from * model->deter, stoch + from * model->latent, here);
-            read_bins(&desk, model, &model->value, values + from, 1);
-        }
-        close_desk(memory);
-    }
-    return failed;
-}
-
 // Rewards (rows, time) along actions (rows, time, action), and the states reached, which replace the first ones. With
 // no rewards to write to, the actor decides, and its actions replace the standard normal draws (rows, time, action).
-// Returns 0, or 1 when there was no memory.
-int imagine(const Model *model, float *deter, float *stoch, float *actions, float *rewards, long rows, long time,
-            int threads) {
+// With values to write to (rows,), the states reached are judged. Returns 0, or 1 when there was no memory.
+int imagine(const Model *model, float *deter, float *stoch, float *actions, float *rewards, float *values, long rows,
+            long time, int threads) {
     int failed = 0;
     long blocks = (rows + BLOCK - 1) / BLOCK;
+    if (blocks == 0) return failed;
 #pragma omp parallel num_threads(threads < blocks ? threads : (int)blocks) reduction(| : failed)
     {
         float *memory = open_desk(model);
@@ -272,6 +252,7 @@ int imagine(const Model *model, float *deter, float *stoch, float *actions, floa
                 advance(&desk, model);
                 if (rewards != NULL) read_bins(&desk, model, &model->head, rewards + from * time + step, time);
             }
+            if (values != NULL) read_bins(&desk, model, &model->value, values + from, 1);
             memcpy(deters, desk.deter, (size_t)(here * model->deter) * sizeof(float));
             for (long r = 0; r < here; r++)
                 for (long i = 0; i < model->latent; i++)

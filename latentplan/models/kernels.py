@@ -109,8 +109,7 @@ def load() -> ctypes.CDLL | None:
         getattr(library, f"norm_silu_{dtype}").argtypes = [place] * 3 + [count, count, threads]
         getattr(library, f"gates_{dtype}").argtypes = [place] * 6 + [count, count, threads]
     library.expectation.argtypes = [place] * 3 + [count, count, threads]
-    library.imagine.argtypes = [place] * 5 + [count, count, threads]
-    library.judge.argtypes = [place] * 4 + [count, threads]
+    library.imagine.argtypes = [place] * 6 + [count, count, threads]
     return library
 
 

@@ -12,7 +12,7 @@ from torch.utils._pytree import tree_leaves, tree_map, tree_structure
 from latentplan.planning.model import Model, State, action_dtype, count_rows, repeat_rows, state_device, supports
 
 _ROWS, _HORIZON = 4, 3
-_OPTIONAL = ("value", "policy", "continues", "uncertainty", "rollout", "propose", "particles")
+_OPTIONAL = ("value", "policy", "continues", "uncertainty", "rollout", "fast_step", "propose", "particles")
 
 
 @torch.no_grad()
@@ -57,6 +57,8 @@ def _problems(model: Any, state: State, actions: Tensor, tolerance: float) -> It
     if not basic:
         yield from _row_problems(model, state, actions[:, 0], tolerance)
     yield from _optional_problems(model, state, actions)
+    if not basic and supports(model, "fast_step"):
+        yield from _fast_step_problems(model, state, actions[:, 0], tolerance)
     if not basic and supports(model, "rollout"):
         yield from _rollout_problems(model, state, actions, tolerance)
 
@@ -99,6 +101,11 @@ def _row_problems(model: Any, state: State, action: Tensor, tolerance: float) ->
     alone = model.step(tree_map(lambda leaf: leaf[:1], state), action[:1])
     if not _agree(tree_map(lambda leaf: leaf[:1], together), alone, tolerance):
         yield "rows influence each other: step() gives a row something else when it comes alone"
+
+
+def _fast_step_problems(model: Any, state: State, action: Tensor, tolerance: float) -> Iterator[str]:
+    if not _agree(model.fast_step(state, action), model.step(state, action), 10 * tolerance):
+        yield "fast_step() does not agree with step()"
 
 
 def _rollout_problems(model: Any, state: State, actions: Tensor, tolerance: float) -> Iterator[str]:

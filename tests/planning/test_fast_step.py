@@ -1,8 +1,9 @@
 """A model may take its steps sooner for a planner."""
 
+import pytest
 import torch
 
-from latentplan.planning import CEMPlanner
+from latentplan.planning import CEMPlanner, check_model
 
 
 def test_steps_are_taken_by_the_models_fast_step_where_no_gradient_is_asked_for(seeded):
@@ -23,3 +24,15 @@ def test_steps_are_taken_by_the_models_fast_step_where_no_gradient_is_asked_for(
         plans.append(planner.plan(model, torch.ones(1, 2), generator=seeded(0)))
         assert (model.calls["step"] > 0) == (steps > 0) and model.calls["fast_step"] > 0
     assert not torch.equal(plans[0].actions, plans[1].actions)
+
+
+def test_a_fast_step_that_is_another_step_is_named_before_the_first_plan():
+    class Model:
+        def step(self, state, action):
+            return state + action, -state.square().sum(dim=1)
+
+        def fast_step(self, state, action):
+            return state - action, -state.square().sum(dim=1)
+
+    with pytest.raises(ValueError, match=r"fast_step\(\) does not agree with step\(\)"):
+        check_model(Model(), torch.ones(3, 2), action_dim=2)
