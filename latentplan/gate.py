@@ -16,6 +16,8 @@ from latentplan.models import State, WorldModel, kl_divergence
 SIGNALS = ("mismatch", "value", "both", "random")
 GAP_STEPS = 2  # a step of imagination costs as much as seeing the frame
 GAIN = 0.1  # of the threshold per decision, in standard deviations of the signal
+RESERVE = 20.0  # plans that are saved up for a goal the actor does not know of
+SAVING, SPENDING = 0.5, 1.5  # shares of the budget that are used until then, and with such a goal
 
 
 class GatedAgent(PlanningAgent):
@@ -27,19 +29,25 @@ class GatedAgent(PlanningAgent):
         value       |V(s) - (imagined return of two actor steps + discounted V)|: how far the critic contradicts what
                     the model says of the actor;
         both        the larger of the two;
-        random      standard normal noise: the baseline that plans as often, anywhere.
+        random      standard normal noise: the baseline that plans as often, anywhere; it neither saves nor spends.
 
     Their logarithms, because both are skewed, are standardised by running mean and standard deviation. The threshold
-    follows the budget by `threshold += 0.1 * (planned - planning_budget)` after each decision, the first ones of
-    episodes included. After N decisions the share of planned ones therefore differs from the budget by exactly the way
-    of the threshold divided by 0.1 N, whatever the signal does (the argument of Gibbs and Candes 2021, "Adaptive
-    conformal inference", proposition 4.1). It starts at the normal quantile, and lives through resets: calibration
-    belongs to the agent, not to an episode. A signal that is not finite plans.
+    follows a share of decisions by `threshold += 0.1 * (planned - share)` after each decision, first ones of episodes
+    included. After N decisions what was planned therefore differs from the share by exactly the way of the threshold
+    divided by 0.1 N, whatever the signal does (the argument of Gibbs and Candes 2021, "Adaptive conformal inference",
+    proposition 4.1). It starts at the normal quantile, and lives through resets: calibration belongs to the agent, not
+    to an episode. The share is half of the budget until 20 plans have been saved, and the budget from then on.
+
+    Doubt never takes the planned share of all decisions beyond the budget: where it would, the most doubtful
+    environments plan. What must be planned is planned all the same, and saved later: first decisions, what no plan is
+    left for, and where a signal is not a number.
 
     While the actor acts the last plan ages: the next search starts from it shifted by the decisions in between, and
     cold when it has run out. An actor knows nothing of an objective or a constraint that was set since: then the last
-    plan goes on where none is made, and where it has run out one is made. Environments of a batch are gated one by
-    one, and share the threshold.
+    plan goes on where none is made, and where it has run out one is made. In doubt is then what the plan did not
+    foresee: the signal (but for `random`) is the sum of the mismatches since it was made, which grows until the next
+    search, the faster the less the world goes as imagined. It has a threshold of its own, for one and a half times the
+    budget: what was saved is spent here. Environments of a batch are gated one by one, and share the threshold.
 
     Attributes:
         last_source: "plan", "tail" (of an older plan) or "actor", of the most recent decision; a list of these for
@@ -76,17 +84,24 @@ class GatedAgent(PlanningAgent):
         if signal not in SIGNALS:
             raise ValueError(f"signal must be one of {', '.join(SIGNALS)}, got {signal!r}")
         self.planning_budget, self.signal, self.discount = planning_budget, signal, discount
-        names = ("mismatch", "value") if signal == "both" else (signal,)
-        self.threshold = _normal_threshold(planning_budget, len(names))
-        self._scales = {name: RunningScale() for name in names}
+        self._names = ("mismatch", "value") if signal == "both" else (signal,)
+        start = _normal_threshold(planning_budget, len(self._names))
+        self._thresholds = {False: start, True: start}  # with the actor's own goal, and with another
+        self._scales = {name: RunningScale() for name in (*self._names, "drift")}
         self._num_planned = self._num_decisions = 0
         self._mismatch: Tensor | None = None
+        self._drift: Tensor | None = None
         self._is_first: Tensor | None = None
 
     @property
     def planned_fraction(self) -> float:
         """Share of planned decisions so far, 0 before the first."""
         return self._num_planned / self._num_decisions if self._num_decisions else 0.0
+
+    @property
+    def threshold(self) -> float:
+        """Of the signal, in standard deviations, for the present goal."""
+        return self._thresholds[self._is_foreign]
 
     @torch.no_grad()
     def imagine(self) -> np.ndarray | None:
@@ -103,26 +118,26 @@ class GatedAgent(PlanningAgent):
 
     def _believe(self, frames: Tensor) -> State:
         if self.state is None:
-            self._is_first = torch.ones(len(frames), dtype=torch.bool)
+            self._is_first, self._drift = torch.ones(len(frames), dtype=torch.bool), None
         else:
             self._is_first = torch.zeros(len(frames), dtype=torch.bool) if self._forget is None else self._forget.cpu()
         return super()._believe(frames)
 
     def _see(self, deter: Tensor, frames: Tensor) -> State:
         posterior = self.model.dynamics.posterior(deter, self.model.encoder(frames))
-        if "mismatch" in self._scales:
-            self._mismatch = kl_divergence(posterior, self.model.dynamics.prior(deter))
+        self._mismatch = kl_divergence(posterior, self.model.dynamics.prior(deter))
+        self._drift = self._mismatch if self._drift is None else self._drift + self._mismatch
         return State(deter, posterior.mean)
 
     def _choose(self, state: State) -> Tensor:
-        assert self._is_first is not None
+        assert self._is_first is not None and self._drift is not None
         action, _ = self.model.actor(state.features)
-        is_planned = self._is_doubtful(state, action, self._is_first) | self._is_first
-        is_tail = torch.zeros_like(is_planned)
-        if self.controller.objective is not None or self.controller.constraints:
+        is_due, is_tail = self._is_first, torch.zeros_like(self._is_first)
+        if self._is_foreign:
             planned, is_tail = self.controller.follow() or (action, is_tail)
-            is_planned = is_planned | ~is_tail
+            is_due = is_due | ~is_tail
             action = torch.where(is_tail[:, None].to(action.device), planned.to(action.dtype), action)
+        is_planned = is_due | self._is_doubtful(state, action, is_due)
         if bool(is_planned.any()):
             with self.model.trunk_precision():
                 planned = self.controller.act_where(state, is_planned)
@@ -130,26 +145,47 @@ class GatedAgent(PlanningAgent):
         else:
             self.controller.skip()
         self._count(is_planned, is_tail)
+        self._drift = torch.where(is_planned.to(self._drift.device), 0.0, self._drift)
         return action
 
-    def _is_doubtful(self, state: State, action: Tensor, is_first: Tensor) -> Tensor:
-        """Whether the signal exceeds the threshold, (batch,) bool on the CPU."""
+    @property
+    def _is_foreign(self) -> bool:
+        """Whether something is pursued that the actor does not know of."""
+        return self.controller.objective is not None or bool(self.controller.constraints)
+
+    @property
+    def _saved(self) -> float:
+        """Plans that the budget would have allowed for and that were not made."""
+        return self.planning_budget * self._num_decisions - self._num_planned
+
+    def _is_doubtful(self, state: State, action: Tensor, is_due: Tensor) -> Tensor:
+        """Whether the signal exceeds the threshold and the budget allows for a plan, (batch,) bool on the CPU.
+
+        Args:
+            state: Where each environment is.
+            action: What is done without a plan, (batch, action).
+            is_due: Where a plan is made anyway, (batch,) bool: nothing is learned of the signal there.
+        """
         scores = [
-            self._scales[name].standardise(values.cpu(), ~is_first)
+            self._scales[name].standardise(values.cpu(), ~is_due)
             for name, values in self._signals(state, action).items()
         ]
         score = torch.stack(scores).amax(0)  # NaN if any is NaN
-        return ~(score <= self.threshold)
+        is_doubtful = (score > self.threshold) & ~is_due
+        left = self._saved + self.planning_budget * len(action) - int(is_due.sum())
+        ranks = score.masked_fill(~is_doubtful, -math.inf).argsort(descending=True).argsort()
+        return score.isnan() | (is_doubtful & (ranks < math.floor(left + 1e-9)))
 
     def _signals(self, state: State, action: Tensor) -> dict[str, Tensor]:
+        if "random" in self._names:
+            return {"random": torch.randn(len(action), generator=self.generator, device=self.generator.device)}
+        assert self._mismatch is not None and self._drift is not None
+        if self._is_foreign:
+            return {"drift": self._drift.clamp_min(1e-6).log()}
         signals = {}
-        if "random" in self._scales:
-            device = self.generator.device
-            signals["random"] = torch.randn(len(action), generator=self.generator, device=device)
-        if "mismatch" in self._scales:
-            assert self._mismatch is not None
+        if "mismatch" in self._names:
             signals["mismatch"] = self._mismatch.clamp_min(1e-6).log()
-        if "value" in self._scales:
+        if "value" in self._names:
             signals["value"] = self._value_gap(state, action).clamp_min(1e-6).log()
         return signals
 
@@ -166,9 +202,11 @@ class GatedAgent(PlanningAgent):
 
     def _count(self, is_planned: Tensor, is_tail: Tensor) -> None:
         num_planned, num = int(is_planned.sum()), len(is_planned)
+        part = SPENDING if self._is_foreign else SAVING if self._saved < RESERVE else 1.0
+        part = 1.0 if self.signal == "random" else part
+        self._thresholds[self._is_foreign] += GAIN * (num_planned - num * part * self.planning_budget)
         self._num_planned += num_planned
         self._num_decisions += num
-        self.threshold += GAIN * (num_planned - num * self.planning_budget)
         self.last_source = [
             "plan" if planned else "tail" if tail else "actor"
             for planned, tail in zip(is_planned.tolist(), is_tail.tolist(), strict=True)

@@ -54,6 +54,22 @@ def test_every_goal_is_measured_with_every_player(tmp_path, checkpoint, capsys):
     assert "cart < 0.01 (constraint)" in capsys.readouterr().out
 
 
+def test_kicks_are_the_same_for_every_player_and_change_what_they_earn(checkpoint):
+    from bench.zero_shot import Conditions, Job, play_job
+
+    def play(player, push, *seeds):
+        return play_job(Conditions(str(checkpoint), seeds, "cpu", {}, push), Job("cart -> 1.0", None, player))["scores"]
+
+    calm, pushed = play("actor", 0.0, *range(20)), play("actor", 3.0, *range(20))
+    changed = [before != after for before, after in zip(calm, pushed, strict=True)]
+    assert 0 < sum(changed) < 15  # five decisions per episode, one in 25 of them with a kick
+    assert play("actor", 3.0, *range(20)) == pushed
+    kicked = changed.index(True)
+    assert play("random", 0.0, kicked) != play("random", 3.0, kicked)
+    calm_seed = changed.index(False)
+    assert play("random", 0.0, calm_seed) == play("random", 3.0, calm_seed)
+
+
 def test_goals_are_listed_once_in_order():
     jobs = list_jobs({"--objectives": "cart > 1; 500: cart < 1 | upright | upright |"})
     assert [job.objective for job in jobs[:: len(OBJECTIVE_PLAYERS)]] == ["cart > 1; 500: cart < 1", "upright"]

@@ -2,15 +2,27 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from bench.arms import check_checkpoint, single_thread
-from bench.options import DEVICE_FLAGS, Flags, choose_device, output_path, settings_layer, whole_number
+from bench.options import (
+    DEVICE_FLAGS,
+    Flags,
+    choose_device,
+    output_path,
+    positive_number,
+    settings_layer,
+    whole_number,
+)
 from bench.report import format_table, interval, number, write_json
 from latentplan.compose import build_config
 from latentplan.config import UserError, to_dict
+
+if TYPE_CHECKING:
+    from latentplan.envs import SuiteEnv
+    from latentplan.rollout import Step
 
 FLAGS = {
     "--checkpoint": ("DIR", "trained agent, or run (its best checkpoint)"),
@@ -18,11 +30,13 @@ FLAGS = {
     "--constraints": ("A | B", "constraints as in eval.py, separated by |, each with the objective of the training"),
     "--episodes": ("N", "episodes of each row, on the same starts (10)"),
     "--seed": ("S", "episode i starts from a state that depends only on S and i (0)"),
+    "--push": ("STD", "of kicks to all joint velocities, one decision in 25, the same for every player (none)"),
     "--workers": ("N", "rows played at once, each in its own process (1)"),
     "--device": DEVICE_FLAGS["--device"],
     "--json": ("FILE", "result as JSON"),
 }
 SETTINGS = ("planner",)
+PUSH_PROBABILITY = 0.04  # per decision
 GATED = {"gated": "both", "random gate": "random"}  # players, and what makes them plan
 OBJECTIVE_PLAYERS = ("planner", *GATED, "actor", "random")
 CONSTRAINT_PLAYERS = ("planner", *GATED, "unconstrained", "actor", "random")
@@ -43,13 +57,33 @@ class Job(NamedTuple):
     player: str
 
 
+class Conditions(NamedTuple):
+    """What all rows share.
+
+    Attributes:
+        checkpoint: Folder of the agent or run.
+        seeds: Of each episode's start.
+        device: Where the agent computes.
+        planner: Settings of the search that differ from the agent's.
+        push: Standard deviation of kicks to the joints' velocities, in m/s or rad/s; 0 for none.
+    """
+
+    checkpoint: str
+    seeds: Sequence[int]
+    device: str
+    planner: dict[str, Any]
+    push: float = 0.0
+
+
 def run(flags: Flags) -> int:
     """Play every goal with every player from the same starts."""
     if "--checkpoint" not in flags:
         raise UserError("flag --checkpoint is missing; give the folder of a trained agent or of a run")
     checkpoint, json_path = flags["--checkpoint"], output_path(flags, "--json")
     episodes, seed = whole_number(flags, "--episodes", 10), whole_number(flags, "--seed", 0, least=0)
-    workers = whole_number(flags, "--workers", 1)
+    workers, push = whole_number(flags, "--workers", 1), 0.0
+    if "--push" in flags:
+        push = positive_number(flags, "--push", push)
     jobs = list_jobs(flags)
     info, trained = check_checkpoint(Path(checkpoint))
     _check_goals(jobs, info["config"]["env"]["domain"])
@@ -69,10 +103,11 @@ def run(flags: Flags) -> int:
         "planner": to_dict(planner),
         "seed": seed,
         "episodes": episodes,
+        "push": push,
     }
     print(f"{about['domain']}-{about['task']}, {episodes} episodes per row, {workers} at once", flush=True)
     rows: list[dict[str, Any]] = []
-    for row in _play(checkpoint, jobs, seeds, device, overrides, workers):
+    for row in _play(Conditions(checkpoint, seeds, device, overrides, push), jobs, workers):
         rows.append(row)
         print(f"{row['goal']}, {row['player']}: {number(row['mean'], row['digits'])}", flush=True)
         write_json(json_path, {**about, "rows": rows})
@@ -95,9 +130,7 @@ def list_jobs(flags: Flags) -> list[Job]:
     ]
 
 
-def play_job(
-    checkpoint: str, job: Job, seeds: Sequence[int], device: str, overrides: dict[str, Any], threads: int
-) -> dict[str, Any]:
+def play_job(conditions: Conditions, job: Job) -> dict[str, Any]:
     """Play one episode per seed and score it by the true quantities.
 
     Returns:
@@ -113,18 +146,19 @@ def play_job(
     from latentplan.rollout import run_episodes, summarize
     from latentplan.scoring import read_goals, score_env
 
-    torch.set_num_threads(threads)
+    torch.set_num_threads(1)
+    checkpoint, device = conditions.checkpoint, conditions.device
     _, config, _ = load_model(checkpoint)
     pursues = job.player == "planner" or job.player in GATED
     mode = "gated" if job.player in GATED else "planner" if job.player == "unconstrained" else job.player
-    settings = {**overrides, "signal": GATED[job.player]} if mode == "gated" else overrides
+    settings = {**conditions.planner, "signal": GATED[job.player]} if mode == "gated" else conditions.planner
     agent: Any = load_agent(checkpoint, mode=mode, device=device, **(settings if mode in ("planner", "gated") else {}))
     goals = read_goals(job.objective, job.constraint, config.env.domain)
     assert goals is not None, "a job names an objective or a constraint"
     env = make_env(config.env)
     try:
         scored = score_env(env, goals, agent if pursues else None)
-        result = summarize(run_episodes(scored, agent, seeds))
+        result = summarize(run_episodes(scored, agent, conditions.seeds, on_step=_pusher(env, conditions)))
     finally:
         env.close()
     is_objective = job.objective is not None
@@ -176,19 +210,32 @@ def _check_goals(jobs: Sequence[Job], domain: str) -> None:
         read_goals(job.objective, job.constraint, domain)
 
 
-def _play(
-    checkpoint: str, jobs: Sequence[Job], seeds: Sequence[int], device: str, overrides: dict[str, Any], workers: int
-) -> Iterator[dict[str, Any]]:
+def _pusher(env: SuiteEnv, conditions: Conditions) -> Callable[[Step], None] | None:
+    """What kicks the body before a decision is executed: the same kicks at the same moments whoever plays."""
+    if conditions.push == 0.0:
+        return None
+    import numpy as np
+
+    def push(step: Step) -> None:
+        draw = np.random.default_rng((conditions.seeds[step.episode], step.decision))
+        if step.action is not None and draw.random() < PUSH_PROBABILITY:
+            velocities = env.physics.data.qvel
+            velocities += conditions.push * draw.normal(size=velocities.shape)
+
+    return push
+
+
+def _play(conditions: Conditions, jobs: Sequence[Job], workers: int) -> Iterator[dict[str, Any]]:
     """The rows in order, each as soon as it and those before it are there."""
     if workers == 1:
         for job in jobs:
-            yield play_job(checkpoint, job, seeds, device, overrides, 1)
+            yield play_job(conditions, job)
         return
     import multiprocessing
     from concurrent.futures import ProcessPoolExecutor
 
     context = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(min(workers, len(jobs)), context, single_thread) as pool:
-        futures = [pool.submit(play_job, checkpoint, job, seeds, device, overrides, 1) for job in jobs]
+        futures = [pool.submit(play_job, conditions, job) for job in jobs]
         for future in futures:
             yield future.result()
