@@ -92,12 +92,18 @@ def train_main(argv: Sequence[str] | None = None) -> int:
 def run_guarded(command: Callable[[Sequence[str]], int], argv: Sequence[str]) -> int:
     """Run a command; what the user got wrong becomes one line on stderr and exit code 2."""
     try:
-        return command(argv)
+        try:
+            return command(argv)
+        finally:
+            sys.stdout.flush()
     except UserError as error:
         print(f"error: {' '.join(str(error).split())}", file=sys.stderr)
         return 2
     except KeyboardInterrupt:
         return 130
+    except BrokenPipeError:  # as in `train.py --help | head`: what read the output has seen enough
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 141
 
 
 def parse_train(argv: Sequence[str]) -> TrainCommand:
