@@ -157,10 +157,7 @@ def _train(argv: Sequence[str]) -> int:
     if "--version" in argv:
         return main(["--version"])
     if "-h" in argv or "--help" in argv:
-        try:
-            print(_train_help(), flush=True)
-        except BrokenPipeError:  # the reader left early, as `head` does
-            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        print(_train_help())
         return 0
     command = parse_train(argv)
     from latentplan.training import resume, train
