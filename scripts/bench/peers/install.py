@@ -46,6 +46,7 @@ PEERS = {
         ("hydra-core", "omegaconf", "antlr4-python3-runtime==4.9.*", "termcolor", "imageio"),
     ),
     "pytorch_mppi": Peer("bench.peers.mppi", "pytorch-mppi", _UTILITIES),
+    "stable_worldmodel": Peer("bench.peers.stable_cem", "stable-worldmodel", ("loguru",)),
     "pytorch_icem": Peer("bench.peers.icem", "pytorch-icem", ("colorednoise", *_UTILITIES)),
 }
 

@@ -1,0 +1,72 @@
+"""stable-worldmodel's CEMSolver, whose model names the cost of whole action sequences."""
+
+from __future__ import annotations
+
+import importlib.util
+import sys
+from types import SimpleNamespace
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from bench.peers.problem import Problem, start_state
+from bench.peers.serve import Search, serve
+from latentplan.models import State, WorldModel
+
+
+class RewardCost:
+    """The model as that library wants it: `get_cost` of candidates (1, sample, horizon, action) is (1, sample)."""
+
+    def __init__(self, model: WorldModel, start: State) -> None:
+        self.model, self.start = model, start
+
+    def get_cost(self, info: dict[str, Tensor], candidates: Tensor) -> Tensor:
+        """Minus the summed reward; the solver knows no bounds, so actions are clamped here."""
+        actions = candidates[0].clamp(-1.0, 1.0)
+        state = State(*(part.expand(len(actions), -1) for part in self.start))
+        total = torch.zeros(len(actions), device=actions.device)
+        for action in actions.unbind(1):
+            state, reward = self.model.step(state, action)
+            total = total + reward
+        return -total[None]
+
+
+def make_search(problem: Problem, model: WorldModel) -> Search:
+    """A cold search from the problem's start."""
+    import gymnasium
+
+    _load_solvers_alone()
+    from stable_worldmodel.solver.cem import CEMSolver  # type: ignore[import-not-found]
+
+    solver = CEMSolver(
+        RewardCost(model, start_state(problem)),
+        num_samples=problem.samples,
+        var_scale=0.5,
+        n_steps=problem.iterations,
+        topk=problem.num_elites,
+        device=problem.device,
+        seed=problem.seed,
+    )
+    space = gymnasium.spaces.Box(-1.0, 1.0, (1, problem.action_dim))
+    solver.configure(action_space=space, n_envs=1, config=SimpleNamespace(horizon=problem.horizon, action_block=1))
+    nothing = {"start": torch.zeros(1, 1)}
+
+    def search() -> Tensor:
+        plan: dict[str, Any] = solver.solve(nothing)
+        action: Tensor = plan["actions"][0, 0].clamp(-1.0, 1.0)
+        return action
+
+    return search
+
+
+def _load_solvers_alone() -> None:
+    """Lets its solvers be imported without its datasets and environments, which want another torchvision and arrow."""
+    found = importlib.util.find_spec("stable_worldmodel")
+    if found is None:
+        raise ModuleNotFoundError("stable_worldmodel is not installed")
+    sys.modules.setdefault("stable_worldmodel", importlib.util.module_from_spec(found))  # found, and not executed
+
+
+if __name__ == "__main__":
+    serve(make_search)
