@@ -34,6 +34,7 @@ FLAGS = {
 SETTINGS = ()
 NUM_FRAMES = 250
 WARM_UP_DECISIONS = 5
+DEADLINE_SHARE = 0.5  # of a period, which a search may take; the rest is for seeing, and for the machine
 PAUSE_SECONDS = 0.2  # between blocks, so that what one agent still searches does not disturb the next
 
 
@@ -88,7 +89,7 @@ def run(flags: Flags) -> int:
     print(f"{', '.join([IDLE, *modes])} at {control_hz:g} Hz in turns, {seconds:.0f} s in all", flush=True)
     tallies = {name: Tally() for name in (IDLE, *modes)}
     code = 0
-    with _loaded_agents(flags["--checkpoint"], modes, str(device)) as agents:
+    with _loaded_agents(flags["--checkpoint"], modes, str(device), 1000.0 * DEADLINE_SHARE / control_hz) as agents:
         try:
             take_turns(agents, frames, control_hz, decisions, block, tallies)
         except KeyboardInterrupt:
@@ -210,15 +211,16 @@ def _record_frames(checkpoint: Path, device: str) -> list[np.ndarray]:
 
 
 @contextlib.contextmanager
-def _loaded_agents(checkpoint: str, modes: Sequence[str], device: str) -> Any:
-    """The agents by name, ready to act."""
+def _loaded_agents(checkpoint: str, modes: Sequence[str], device: str, deadline_ms: float) -> Any:
+    """The agents by name, ready to act; those that search before they act have a deadline."""
     from latentplan.background import BackgroundAgent
     from latentplan.checkpoint import load_agent
 
     with contextlib.ExitStack() as stack:
         agents: dict[str, Any] = {IDLE: IdleAgent()}
         for mode in modes:
-            agent: Any = load_agent(checkpoint, mode=mode, device=device)
+            settings = {"deadline_ms": deadline_ms} if mode in ("gated", "planner") else {}
+            agent: Any = load_agent(checkpoint, mode=mode, device=device, **settings)
             if isinstance(agent, BackgroundAgent):
                 stack.enter_context(agent).wait_until_ready()
             agents[mode] = agent
