@@ -70,6 +70,22 @@ def test_kicks_are_the_same_for_every_player_and_change_what_they_earn(checkpoin
     assert play("random", 0.0, calm_seed) == play("random", 3.0, calm_seed)
 
 
+def test_the_plain_gate_acts_by_its_actor_wherever_it_does_not_plan(checkpoint):
+    from bench.players import make_player
+
+    frames = torch.randint(0, 256, (12, 64, 64, 3), dtype=torch.uint8).numpy()
+    sources = {}
+    for player in ("random gate", "random moments"):
+        agent = make_player(player, str(checkpoint), "cpu", {"horizon": 2})
+        agent.set_objective("cart -> 1.0")
+        sources[player] = []
+        for frame in frames:
+            agent.act(frame)
+            sources[player].append(agent.last_source)
+    assert set(sources["random gate"]) == {"plan", "actor"}
+    assert set(sources["random moments"]) == {"plan", "tail"}
+
+
 def test_goals_are_listed_once_in_order():
     jobs = list_jobs({"--objectives": "cart > 1; 500: cart < 1 | upright | upright |"})
     assert [job.objective for job in jobs[:: len(OBJECTIVE_PLAYERS)]] == ["cart > 1; 500: cart < 1", "upright"]

@@ -37,9 +37,9 @@ FLAGS = {
 }
 SETTINGS = ("planner",)
 PUSH_PROBABILITY = 0.04  # per decision
-GATED = {"gated": "both", "random gate": "random"}  # players, and what makes them plan
-OBJECTIVE_PLAYERS = ("planner", *GATED, "actor", "random")
-CONSTRAINT_PLAYERS = ("planner", *GATED, "unconstrained", "actor", "random")
+PURSUERS = ("planner", "gated", "random moments", "random gate")
+OBJECTIVE_PLAYERS = (*PURSUERS, "actor", "random")
+CONSTRAINT_PLAYERS = (*PURSUERS, "unconstrained", "actor", "random")
 
 
 class Job(NamedTuple):
@@ -48,8 +48,7 @@ class Job(NamedTuple):
     Attributes:
         objective: What is scored, or None.
         constraint: What is scored, or None.
-        player: `planner`, `gated`, `random gate` (which plans as often, anywhere), `actor`, `random`, or
-            `unconstrained`: a planner that does not know of the constraint.
+        player: Who plays; see `make_player`. `unconstrained` is a planner that does not know of the constraint.
     """
 
     objective: str | None
@@ -140,24 +139,21 @@ def play_job(conditions: Conditions, job: Job) -> dict[str, Any]:
     """
     import torch
 
+    from bench.players import make_player
     from bench.statistics import mean_estimate
-    from latentplan.checkpoint import load_agent, load_model
+    from latentplan.checkpoint import load_model
     from latentplan.envs import make_env
     from latentplan.rollout import run_episodes, summarize
     from latentplan.scoring import read_goals, score_env
 
     torch.set_num_threads(1)
-    checkpoint, device = conditions.checkpoint, conditions.device
-    _, config, _ = load_model(checkpoint)
-    pursues = job.player == "planner" or job.player in GATED
-    mode = "gated" if job.player in GATED else "planner" if job.player == "unconstrained" else job.player
-    settings = {**conditions.planner, "signal": GATED[job.player]} if mode == "gated" else conditions.planner
-    agent: Any = load_agent(checkpoint, mode=mode, device=device, **(settings if mode in ("planner", "gated") else {}))
+    _, config, _ = load_model(conditions.checkpoint)
+    agent = make_player(job.player, conditions.checkpoint, conditions.device, conditions.planner)
     goals = read_goals(job.objective, job.constraint, config.env.domain)
     assert goals is not None, "a job names an objective or a constraint"
     env = make_env(config.env)
     try:
-        scored = score_env(env, goals, agent if pursues else None)
+        scored = score_env(env, goals, agent if job.player in PURSUERS else None)
         result = summarize(run_episodes(scored, agent, conditions.seeds, on_step=_pusher(env, conditions)))
     finally:
         env.close()
