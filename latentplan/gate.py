@@ -16,8 +16,6 @@ from latentplan.models import State, WorldModel, kl_divergence
 SIGNALS = ("mismatch", "value", "both", "random")
 GAP_STEPS = 2  # a step of imagination costs as much as seeing the frame
 GAIN = 0.1  # of the threshold per decision, in standard deviations of the signal
-RESERVE = 20.0  # plans that are saved up for a goal the actor does not know of
-SAVING, SPENDING = 0.5, 1.5  # shares of the budget that are used until then, and with such a goal
 
 
 class GatedAgent(PlanningAgent):
@@ -29,14 +27,14 @@ class GatedAgent(PlanningAgent):
         value       |V(s) - (imagined return of two actor steps + discounted V)|: how far the critic contradicts what
                     the model says of the actor;
         both        the larger of the two;
-        random      standard normal noise: the baseline that plans as often, anywhere; it neither saves nor spends.
+        random      standard normal noise: the baseline that plans as often, anywhere.
 
     Their logarithms, because both are skewed, are standardised by running mean and standard deviation. The threshold
-    follows a share of decisions by `threshold += 0.1 * (planned - share)` after each decision, first ones of episodes
-    included. After N decisions what was planned therefore differs from the share by exactly the way of the threshold
-    divided by 0.1 N, whatever the signal does (the argument of Gibbs and Candes 2021, "Adaptive conformal inference",
-    proposition 4.1). It starts at the normal quantile, and lives through resets: calibration belongs to the agent, not
-    to an episode. The share is half of the budget until 20 plans have been saved, and the budget from then on.
+    follows the budget by `threshold += 0.1 * (planned - planning_budget)` after each decision, the first ones of
+    episodes included. After N decisions the share of planned ones therefore differs from the budget by exactly the way
+    of the threshold divided by 0.1 N, whatever the signal does (the argument of Gibbs and Candes 2021, "Adaptive
+    conformal inference", proposition 4.1). It starts at the normal quantile, and lives through resets: calibration
+    belongs to the agent, not to an episode.
 
     Doubt never takes the planned share of all decisions beyond the budget: where it would, the most doubtful
     environments plan. What must be planned is planned all the same, and saved later: first decisions, what no plan is
@@ -46,8 +44,8 @@ class GatedAgent(PlanningAgent):
     cold when it has run out. An actor knows nothing of an objective or a constraint that was set since: then the last
     plan goes on where none is made, and where it has run out one is made. In doubt is then what the plan did not
     foresee: the signal (but for `random`) is the sum of the mismatches since it was made, which grows until the next
-    search, the faster the less the world goes as imagined. It has a threshold of its own, for one and a half times the
-    budget: what was saved is spent here. Environments of a batch are gated one by one, and share the threshold.
+    search, the faster the less the world goes as imagined. Environments of a batch are gated one by one, and share the
+    threshold.
 
     Attributes:
         last_source: "plan", "tail" (of an older plan) or "actor", of the most recent decision; a list of these for
@@ -85,8 +83,7 @@ class GatedAgent(PlanningAgent):
             raise ValueError(f"signal must be one of {', '.join(SIGNALS)}, got {signal!r}")
         self.planning_budget, self.signal, self.discount = planning_budget, signal, discount
         self._names = ("mismatch", "value") if signal == "both" else (signal,)
-        start = _normal_threshold(planning_budget, len(self._names))
-        self._thresholds = {False: start, True: start}  # with the actor's own goal, and with another
+        self.threshold = _normal_threshold(planning_budget, len(self._names))
         self._scales = {name: RunningScale() for name in (*self._names, "drift")}
         self._num_planned = self._num_decisions = 0
         self._mismatch: Tensor | None = None
@@ -97,11 +94,6 @@ class GatedAgent(PlanningAgent):
     def planned_fraction(self) -> float:
         """Share of planned decisions so far, 0 before the first."""
         return self._num_planned / self._num_decisions if self._num_decisions else 0.0
-
-    @property
-    def threshold(self) -> float:
-        """Of the signal, in standard deviations, for the present goal."""
-        return self._thresholds[self._is_foreign]
 
     @torch.no_grad()
     def imagine(self) -> np.ndarray | None:
@@ -153,11 +145,6 @@ class GatedAgent(PlanningAgent):
         """Whether something is pursued that the actor does not know of."""
         return self.controller.objective is not None or bool(self.controller.constraints)
 
-    @property
-    def _saved(self) -> float:
-        """Plans that the budget would have allowed for and that were not made."""
-        return self.planning_budget * self._num_decisions - self._num_planned
-
     def _is_doubtful(self, state: State, action: Tensor, is_due: Tensor) -> Tensor:
         """Whether the signal exceeds the threshold and the budget allows for a plan, (batch,) bool on the CPU.
 
@@ -172,7 +159,7 @@ class GatedAgent(PlanningAgent):
         ]
         score = torch.stack(scores).amax(0)  # NaN if any is NaN
         is_doubtful = (score > self.threshold) & ~is_due
-        left = self._saved + self.planning_budget * len(action) - int(is_due.sum())
+        left = self.planning_budget * (self._num_decisions + len(action)) - self._num_planned - int(is_due.sum())
         ranks = score.masked_fill(~is_doubtful, -math.inf).argsort(descending=True).argsort()
         return score.isnan() | (is_doubtful & (ranks < math.floor(left + 1e-9)))
 
@@ -202,11 +189,9 @@ class GatedAgent(PlanningAgent):
 
     def _count(self, is_planned: Tensor, is_tail: Tensor) -> None:
         num_planned, num = int(is_planned.sum()), len(is_planned)
-        part = SPENDING if self._is_foreign else SAVING if self._saved < RESERVE else 1.0
-        part = 1.0 if self.signal == "random" else part
-        self._thresholds[self._is_foreign] += GAIN * (num_planned - num * part * self.planning_budget)
         self._num_planned += num_planned
         self._num_decisions += num
+        self.threshold += GAIN * (num_planned - num * self.planning_budget)
         self.last_source = [
             "plan" if planned else "tail" if tail else "actor"
             for planned, tail in zip(is_planned.tolist(), is_tail.tolist(), strict=True)

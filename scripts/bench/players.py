@@ -12,7 +12,7 @@ from latentplan.gate import GatedAgent
 class PlainGate(GatedAgent):
     """Plans at random decisions and acts by the actor at all others, whatever the goal."""
 
-    _is_foreign = False  # so that the last plan is not followed, and no plan is saved
+    _is_foreign = False  # so that the last plan is not followed
 
 
 def make_player(player: str, checkpoint: str, device: str, planner: dict[str, Any]) -> Any:
