@@ -73,6 +73,8 @@ def _evaluate(argv: Sequence[str]) -> int:
         raise UserError(f"{request.checkpoint} has settings of another version: {error}") from None
     planner = build_config({"planner": {**to_dict(config.planner), **request.planner}}).planner
     overrides = {name: getattr(planner, name) for name in request.planner}
+    if request.planning_budget is not None:
+        overrides["planning_budget"] = request.planning_budget
     device = use_device(request.device, request.threads or (1 if request.mode in ON_ONE_THREAD else None))
     from latentplan.envs import make_env
     from latentplan.scoring import read_goals, score_env

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import tempfile
 from argparse import SUPPRESS
 from collections.abc import Sequence
@@ -28,6 +29,7 @@ FLAGS = {
     ),
     "--constraint": ("TEXT", "what must hold at every moment, such as 'cart < 0.5'; may be repeated"),
     "--mode": ("|".join(MODES), "who acts (planner)"),
+    "--planning-budget": ("B", "share of its decisions that a gated agent may plan, 0 to 1 (0.3)"),
     "--video": ("FILE", "film of the first episode, .mp4 or .webm"),
     "--json": ("FILE", "result as JSON"),
     "--control-hz": ("F", "decisions per second of a world that goes on while the agent thinks (it waits)"),
@@ -49,6 +51,7 @@ class EvaluationRequest:
         constraint: What must hold at every moment, or None.
         mode: One of `MODES`.
         planner: Planner settings that replace the agent's, as they were typed.
+        planning_budget: Share of its decisions that a gated agent may plan, or None for its own choice.
         video: Where the film goes, or None.
         json: Where the result goes, or None.
         control_hz: Decisions per second of a world that does not wait, or None for one that does.
@@ -64,6 +67,7 @@ class EvaluationRequest:
     constraint: str | None
     mode: str
     planner: dict[str, str]
+    planning_budget: float | None
     video: Path | None
     json: Path | None
     control_hz: float | None
@@ -91,6 +95,8 @@ def parse_arguments(argv: Sequence[str]) -> EvaluationRequest:
     planner = {name.removeprefix("--planner."): value for name, value in flags.items() if name in settings}
     if planner and mode not in PLANNING_MODES:
         raise UserError(f"--planner.{next(iter(planner))} has no effect in mode {mode}; use --mode planner")
+    if "--planning-budget" in flags and mode != "gated":
+        raise UserError(f"--planning-budget has no effect in mode {mode}; use --mode gated")
     from latentplan.latency import read_clock_flags
 
     control_hz, latency = read_clock_flags(flags)
@@ -103,6 +109,7 @@ def parse_arguments(argv: Sequence[str]) -> EvaluationRequest:
         constraint=flags.get("--constraint"),
         mode=mode,
         planner=planner,
+        planning_budget=_share(flags, "--planning-budget") if "--planning-budget" in flags else None,
         video=_output_path(flags, "--video"),
         json=_output_path(flags, "--json"),
         control_hz=control_hz,
@@ -134,6 +141,16 @@ def _whole_number(flags: dict[str, str], name: str, default: int, least: int) ->
     if not text.isascii() or not text.isdigit() or int(text) < least:
         raise UserError(f"{name} must be a whole number of at least {least}, got {text!r}")
     return int(text)
+
+
+def _share(flags: dict[str, str], name: str) -> float:
+    try:
+        value = float(flags[name])
+    except ValueError:
+        value = math.nan
+    if not 0.0 <= value <= 1.0:
+        raise UserError(f"{name} must be a number from 0 to 1, got {flags[name]!r}")
+    return value
 
 
 def _output_path(flags: dict[str, str], name: str) -> Path | None:

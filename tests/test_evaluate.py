@@ -105,6 +105,17 @@ def test_a_deadline_can_be_given(tmp_path, checkpoint, mode):
     assert result["planner"]["deadline_ms"] == 5.0
 
 
+def test_a_gated_agent_plans_no_more_than_it_may(tmp_path, checkpoint):
+    for budget, fraction in (
+        (0, 0.1),
+        (0.5, 0.5),
+        (1, 1.0),
+    ):  # the first of ten decisions is planned whatever is allowed
+        result = result_of(tmp_path, checkpoint, "--episodes", 1, "--mode", "gated", "--planning-budget", budget)
+        assert 0.1 <= result["planned_fraction"] <= fraction
+        assert budget == 0.5 or result["planned_fraction"] == fraction
+
+
 def test_mean_interval_and_latency_are_printed(capsys, checkpoint):
     assert run(checkpoint, "--episodes", 2, "--mode", "random") == 0
     out = capsys.readouterr().out
@@ -154,6 +165,8 @@ def test_evaluate_agent_pairs_agents_by_episode():
         (("--planner.horizon", "long"), ("planner.horizon", "'long'")),
         (("--planner.num_elites", "9"), ("num_elites (9)", "num_samples (8)")),
         (("--mode", "actor", "--planner.horizon", "3"), ("--planner.horizon", "--mode planner")),
+        (("--planning-budget", "0.5"), ("--planning-budget", "--mode gated")),
+        (("--mode", "gated", "--planning-budget", "30%"), ("--planning-budget", "0 to 1", "'30%'")),
         (("--video", "film.avi"), (".mp4", "'film.avi'")),
         (("--json",), ("--json", "value")),
     ],
