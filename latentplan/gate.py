@@ -16,6 +16,7 @@ from latentplan.models import State, WorldModel, kl_divergence
 SIGNALS = ("mismatch", "value", "both", "random")
 GAP_STEPS = 2  # a step of imagination costs as much as seeing the frame
 GAIN = 0.1  # of the threshold per decision, in standard deviations of the signal
+HEAD_START = 1.0  # of the threshold over the normal quantile: ten plans are saved early for when many are due at once
 
 
 class GatedAgent(PlanningAgent):
@@ -33,7 +34,8 @@ class GatedAgent(PlanningAgent):
     follows the budget by `threshold += 0.1 * (planned - planning_budget)` after each decision, the first ones of
     episodes included. After N decisions the share of planned ones therefore differs from the budget by exactly the way
     of the threshold divided by 0.1 N, whatever the signal does (the argument of Gibbs and Candes 2021, "Adaptive
-    conformal inference", proposition 4.1). It starts at the normal quantile, and lives through resets: calibration
+    conformal inference", proposition 4.1). It starts one standard deviation above the normal quantile, so that the ten plans
+    which are made too few on the way down are there when many are due at once, and lives through resets: calibration
     belongs to the agent, not to an episode.
 
     Doubt never takes the planned share of all decisions beyond the budget: where it would, the most doubtful
@@ -83,7 +85,7 @@ class GatedAgent(PlanningAgent):
             raise ValueError(f"signal must be one of {', '.join(SIGNALS)}, got {signal!r}")
         self.planning_budget, self.signal, self.discount = planning_budget, signal, discount
         self._names = ("mismatch", "value") if signal == "both" else (signal,)
-        self.threshold = _normal_threshold(planning_budget, len(self._names))
+        self.threshold = HEAD_START + _normal_threshold(planning_budget, len(self._names))
         self._scales = {name: RunningScale() for name in (*self._names, "drift")}
         self._num_planned = self._num_decisions = 0
         self._mismatch: Tensor | None = None
