@@ -158,8 +158,6 @@ class CollectionConfig:
         behaviour: Who acts while collecting: `planner`, `actor`, or `both` in alternate rounds.
         noise_std: Standard deviation of the noise added to the planner's action.
         noise_correlation: Of the planner's and the actor's noise between one decision and the next, in [0, 1).
-        goal_fraction: Share of the planner's rounds that pursue, beside the return, a random value of a random
-            quantity, so that the model knows more than the way to the reward.
         prefill_decisions: Random decisions before learning starts.
         round_decisions: Decisions per epoch: this many are collected, then learned from.
         updates_per_decision: Updates per collected decision (the replay ratio, in updates).
@@ -169,7 +167,6 @@ class CollectionConfig:
     behaviour: str = "planner"
     noise_std: float = 0.2
     noise_correlation: float = 0.0
-    goal_fraction: float = 0.0
     prefill_decisions: int = 1000
     round_decisions: int = 250
     updates_per_decision: float = 0.5
@@ -178,7 +175,7 @@ class CollectionConfig:
     def __post_init__(self) -> None:
         one_of(self, behaviour=BEHAVIOURS)
         at_least(self, noise_std=0.0, prefill_decisions=1, round_decisions=1)
-        within(self, noise_correlation=(0.0, 0.99), goal_fraction=(0.0, 1.0))
+        within(self, noise_correlation=(0.0, 0.99))
         above_zero(self, "updates_per_decision")
 
 

@@ -15,7 +15,6 @@ import torch
 
 from latentplan.agent import ActorAgent, ModelAgent, PlanningAgent, RandomAgent
 from latentplan.config import Config, UserError, derive_seed
-from latentplan.config.quantities import TASK_PREFIX
 from latentplan.envs import make_env, make_from, make_vector_env, render_info
 from latentplan.models import WorldModel
 from latentplan.replay import Rows
@@ -24,8 +23,6 @@ from latentplan.rollout import episode_seed, run_episodes
 
 TIMED_FRAMES = 5
 FILMED_FRAMES = 250
-GOAL_WEIGHT = 2.0  # of a random goal, of whose worth an env frame can earn 1, beside the return
-GOAL_REACH = 2.0  # how far from the present value a goal may lie, in scales of its quantity
 
 EnvFactory = Callable[[], gymnasium.Env[Any, Any]]
 
@@ -129,8 +126,6 @@ class Collector:
             agent.reset()
             self._acting = agent
         agent.seed(derive_seed(self.config.run.seed, "collect", counter))
-        if isinstance(agent, PlanningAgent):
-            agent.set_objective(self._draw_goal(counter))
         steps = -(-decisions // len(self._ended))
         log = _Log(len(self._ended), self.model.action_dim, self.config.model.deter_dim)
         for _ in range(steps):
@@ -185,26 +180,13 @@ class Collector:
             self._labels[self._ended] = np.asarray(info["labels"])[self._ended]
         self._returns[self._ended] = 0.0
 
-    def _draw_goal(self, counter: int) -> str | None:
-        """What the planner pursues in a round: mostly the return; now and then a quantity's random value beside it."""
-        names = [name for name in self.labels if not name.startswith(TASK_PREFIX)]
-        draw = np.random.default_rng(derive_seed(self.config.run.seed, "goal", counter))
-        if not names or draw.random() >= self.config.collection.goal_fraction:
-            return None
-        name = str(draw.choice(names))
-        present = float(self._labels[0, list(self.labels).index(name)])
-        target = present + self.labels[name] * draw.uniform(-GOAL_REACH, GOAL_REACH)
-        return f"return + {GOAL_WEIGHT} * ({name} -> {target:.4f})"
-
     def _step(self, agent: ModelAgent | RandomAgent, log: _Log) -> None:
         assert self._frames is not None
         frames, labels, first = self._frames.copy(), self._labels.copy(), self._ended.copy()
         actions = agent.act(frames)
         state = agent.state if isinstance(agent, ModelAgent) else None
         deter = None if state is None else state.deter.float().cpu().numpy()
-        plan = None
-        if isinstance(agent, PlanningAgent) and agent.controller.objective is None:  # nobody imitates other goals
-            plan = agent.planned_action()
+        plan = agent.planned_action() if isinstance(agent, PlanningAgent) else None
         self._frames, rewards, terminated, truncated, info = self.envs.step(actions)
         if not np.isfinite(rewards).all():
             raise UserError(f"the environment gave rewards that are not finite: {rewards.tolist()}")

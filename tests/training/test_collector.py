@@ -99,30 +99,3 @@ def test_judging_neither_explores_nor_disturbs_the_collection(make_collector, ti
     following = [collector.collect(weights, "planner", 7, 1).rows[0] for collector in (judged, plain)]
     assert np.array_equal(following[0].actions, following[1].actions)
     assert np.array_equal(following[0].frames, following[1].frames)
-
-
-def test_goals_are_drawn_as_often_as_asked_and_near_where_the_body_is(make_collector):
-    def goals(fraction):
-        collector = make_collector(collection={"goal_fraction": fraction})
-        collector.labels, collector._labels = {"place": 0.5, "task.reach": 0.5}, np.full((1, 2), 3.0)
-        return [collector._draw_goal(counter) for counter in range(200)]
-
-    assert goals(0.0) == [None] * 200
-    some, always = goals(0.3), goals(1.0)
-    assert 30 < sum(goal is not None for goal in some) < 90
-    assert always == goals(1.0) and len(set(always)) == 200
-    (clauses,) = {goal.split("->")[0] for goal in always}  # never the reward of a task
-    assert clauses == "return + 2.0 * (place "
-    targets = np.array([float(goal.split("->")[1].rstrip(")")) for goal in always])
-    assert targets.min() > 2.0 and targets.max() < 4.0 and targets.std() > 0.4
-
-
-def test_nobody_imitates_what_was_planned_for_another_goal(make_collector, tiny):
-    def collect(goal):
-        collector = make_collector(collection={"noise_std": 0.0})
-        collector._draw_goal = lambda counter: goal
-        return collector.collect(weights_of(tiny("")), "planner", 15, 0).rows[0]
-
-    usual, right, left = (collect(goal) for goal in (None, *(lambda r, s=s: s * r.actions[:, 0, 0] for s in (1, -1))))
-    assert right.actions[:15].mean() > 0.4 and left.actions[:15].mean() < -0.3
-    assert np.abs(usual.plan).sum() > 0.0 and np.abs(right.plan).sum() == 0.0
