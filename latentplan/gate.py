@@ -34,9 +34,9 @@ class GatedAgent(PlanningAgent):
     follows the budget by `threshold += 0.1 * (planned - planning_budget)` after each decision, the first ones of
     episodes included. After N decisions the share of planned ones therefore differs from the budget by exactly the way
     of the threshold divided by 0.1 N, whatever the signal does (the argument of Gibbs and Candes 2021, "Adaptive
-    conformal inference", proposition 4.1). It starts one standard deviation above the normal quantile, so that the ten plans
-    which are made too few on the way down are there when many are due at once, and lives through resets: calibration
-    belongs to the agent, not to an episode.
+    conformal inference", proposition 4.1). It starts one standard deviation above the normal quantile, so that the ten
+    plans which are made too few on its way down are there when many are due at once, and lives through resets:
+    calibration belongs to the agent, not to an episode.
 
     Doubt never takes the planned share of all decisions beyond the budget: where it would, the most doubtful
     environments plan. What must be planned is planned all the same, and saved later: first decisions, what no plan is

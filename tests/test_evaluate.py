@@ -106,11 +106,7 @@ def test_a_deadline_can_be_given(tmp_path, checkpoint, mode):
 
 
 def test_a_gated_agent_plans_no_more_than_it_may(tmp_path, checkpoint):
-    for budget, fraction in (
-        (0, 0.1),
-        (0.5, 0.5),
-        (1, 1.0),
-    ):  # the first of ten decisions is planned whatever is allowed
+    for budget, fraction in ((0, 0.1), (0.5, 0.5), (1, 1.0)):  # the first of ten is planned whatever is allowed
         result = result_of(tmp_path, checkpoint, "--episodes", 1, "--mode", "gated", "--planning-budget", budget)
         assert 0.1 <= result["planned_fraction"] <= fraction
         assert budget == 0.5 or result["planned_fraction"] == fraction

@@ -9,8 +9,7 @@ import torch
 from torch import Tensor
 
 from bench.machine import now
-from bench.peers.problem import DTYPES, Problem, build_model, start_state
-from latentplan.models import State
+from bench.peers.problem import DTYPES, Problem, build_model, start_state, summed_rewards
 from latentplan.planning import CEMPlanner
 
 Search = Callable[[], Any]
@@ -53,11 +52,7 @@ def plain_search(problem: Problem, dtype: str = "float32") -> Search:
         for _ in range(problem.iterations):
             noise = torch.randn(problem.samples, *shape, device=problem.device)
             actions = (mean + std * noise).clamp(-1.0, 1.0)
-            state = State(*(part.expand(problem.samples, -1) for part in start))
-            total = torch.zeros(problem.samples, device=problem.device)
-            for action in actions.unbind(1):
-                state, reward = model.step(state, action)
-                total = total + reward
+            total = summed_rewards(model, start, actions)
             elites = actions[total.topk(problem.num_elites).indices]
             mean, std = elites.mean(0), elites.std(0)
         return mean[0]

@@ -6,9 +6,9 @@ import torch
 from mbrl.planning.trajectory_opt import CEMOptimizer  # type: ignore[import-not-found]
 from torch import Tensor
 
-from bench.peers.problem import ELITE_SHARE, Problem, start_state
+from bench.peers.problem import ELITE_SHARE, Problem, start_state, summed_rewards
 from bench.peers.serve import Search, serve
-from latentplan.models import State, WorldModel
+from latentplan.models import WorldModel
 
 
 def make_search(problem: Problem, model: WorldModel) -> Search:
@@ -27,12 +27,7 @@ def make_search(problem: Problem, model: WorldModel) -> Search:
     start = start_state(problem)
 
     def objective(population: Tensor) -> Tensor:
-        state = State(*(part.expand(problem.samples, -1) for part in start))
-        total = torch.zeros(problem.samples, device=device)
-        for action in population.unbind(1):
-            state, reward = model.step(state, action)
-            total = total + reward
-        return total
+        return summed_rewards(model, start, population)
 
     return lambda: optimizer.optimize(objective, x0=torch.zeros(shape, device=device))[0]
 

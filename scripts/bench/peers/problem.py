@@ -88,6 +88,16 @@ def start_state(problem: Problem, batch: int = 1) -> State:
     return State(deter.to(problem.device), stoch.to(problem.device))
 
 
+def summed_rewards(model: WorldModel, start: State, actions: Tensor) -> Tensor:
+    """Reward of each action sequence (sample, horizon, action) from one start (1, ...), step by step: (sample,)."""
+    state = State(*(part.expand(len(actions), -1) for part in start))
+    total = torch.zeros(len(actions), device=actions.device)
+    for action in actions.unbind(1):
+        state, reward = model.step(state, action)
+        total = total + reward
+    return total
+
+
 def as_state(model: WorldModel, features: Tensor) -> State:
     """The state inside one vector per row, features (rows, deter + latent)."""
     return State(*features.split([model.config.deter_dim, model.config.latent_dim], -1))

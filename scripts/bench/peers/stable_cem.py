@@ -10,7 +10,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from bench.peers.problem import Problem, start_state
+from bench.peers.problem import Problem, start_state, summed_rewards
 from bench.peers.serve import Search, serve
 from latentplan.models import State, WorldModel
 
@@ -23,13 +23,7 @@ class RewardCost:
 
     def get_cost(self, info: dict[str, Tensor], candidates: Tensor) -> Tensor:
         """Minus the summed reward; the solver knows no bounds, so actions are clamped here."""
-        actions = candidates[0].clamp(-1.0, 1.0)
-        state = State(*(part.expand(len(actions), -1) for part in self.start))
-        total = torch.zeros(len(actions), device=actions.device)
-        for action in actions.unbind(1):
-            state, reward = self.model.step(state, action)
-            total = total + reward
-        return -total[None]
+        return -summed_rewards(self.model, self.start, candidates[0].clamp(-1.0, 1.0))[None]
 
 
 def make_search(problem: Problem, model: WorldModel) -> Search:
