@@ -12,6 +12,7 @@ from latentplan.config import LearningConfig
 from latentplan.models import Gaussian, State, WorldModel, kl_divergence
 from latentplan.models.heads import MAX_ACTION_STD, MIN_ACTION_STD, Actor, ScalarHead, sample_action
 from latentplan.replay import Batch
+from latentplan.training.augmentation import random_shift
 
 HALF_LOG_2_PI_E = 1.4189385  # entropy of a Gaussian is log std + this, in nats
 
@@ -49,10 +50,15 @@ class Learned(NamedTuple):
 
 
 def world_model_loss(model: WorldModel, batch: Batch, config: LearningConfig, generator: torch.Generator) -> Learned:
-    """Reconstruction, reward, continuation and balanced KL over a batch of sequences, and open-loop predictions."""
+    """Reconstruction, reward, continuation and balanced KL over a batch of sequences, and open-loop predictions.
+
+    With `random_shift` the encoder sees moved frames while the decoder paints them unmoved, so that the latent need not
+    hold by how much.
+    """
     size, frames_per_sequence = batch.frames.shape[:2]
+    moved = random_shift(batch.frames, config.random_shift, generator)
     with model.trunk_precision(cache=False):
-        embeddings = model.encoder(batch.frames.flatten(0, 1)).unflatten(0, (size, frames_per_sequence))
+        embeddings = model.encoder(moved.flatten(0, 1)).unflatten(0, (size, frames_per_sequence))
     noise = torch.randn(
         size, frames_per_sequence, model.config.latent_dim, generator=generator, device=batch.frames.device
     )

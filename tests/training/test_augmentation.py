@@ -1,0 +1,59 @@
+"""Random shifts: one move per sequence, of bounded size, borders repeated."""
+
+import pytest
+import torch
+
+from latentplan.models import WorldModel
+from latentplan.training.augmentation import random_shift
+from latentplan.training.losses import world_model_loss
+
+
+def _frames(batch: int = 32, time: int = 3) -> torch.Tensor:
+    """Pictures whose pixels tell their own row and column."""
+    rows, columns = torch.meshgrid(torch.arange(64), torch.arange(64), indexing="ij")
+    picture = torch.stack([rows, columns, torch.zeros_like(rows)], -1).to(torch.uint8)
+    return picture.expand(batch, time, 64, 64, 3)
+
+
+def _shifted(pixels: int, seed: int = 0) -> torch.Tensor:
+    return random_shift(_frames(), pixels, torch.Generator().manual_seed(seed))
+
+
+def test_no_pixels_change_nothing() -> None:
+    assert torch.equal(_shifted(0), _frames())
+
+
+@pytest.mark.parametrize("pixels", [1, 4])
+def test_every_sequence_moves_as_a_whole_and_repeats_its_border(pixels: int) -> None:
+    seen = set()
+    for sequence in _shifted(pixels):
+        down, right = (int(x) for x in sequence[0, 32, 32, :2].int() - torch.tensor([32, 32]))
+        expected = torch.stack(
+            [
+                (torch.arange(64) + down).clamp(0, 63).unsqueeze(1).expand(64, 64),
+                (torch.arange(64) + right).clamp(0, 63).expand(64, 64),
+            ],
+            -1,
+        )
+        assert (sequence[..., :2] == expected.to(torch.uint8)).all()
+        seen.add((down, right))
+    assert max(abs(move) for both in seen for move in both) == pixels
+    assert len(seen) > 2 * pixels
+
+
+def test_the_moves_are_those_of_the_generator() -> None:
+    assert torch.equal(_shifted(4), _shifted(4))
+    assert not torch.equal(_shifted(4), _shifted(4, seed=1))
+
+
+def test_the_encoder_sees_moved_frames_and_the_decoder_paints_them_unmoved(batch, tiny) -> None:
+    config = tiny("", learning={"random_shift": 4})
+    model = WorldModel(config.model, 1)
+    seen, painted = [], []
+    model.encoder.register_forward_pre_hook(lambda _, arguments: seen.append(arguments[0]))
+    loss = model.decoder.loss
+    model.decoder.loss = lambda patches, frames: painted.append(frames) or loss(patches, frames)
+    world_model_loss(model, batch, config.learning, torch.Generator().manual_seed(3))
+    moved = random_shift(batch.frames, 4, torch.Generator().manual_seed(3))
+    assert torch.equal(seen[0], moved.flatten(0, 1)) and not torch.equal(moved, batch.frames)
+    assert torch.equal(painted[0], batch.frames.flatten(0, 1))
