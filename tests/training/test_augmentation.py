@@ -8,11 +8,11 @@ from latentplan.training.augmentation import random_shift
 from latentplan.training.losses import world_model_loss
 
 
-def _frames(batch: int = 32, time: int = 3) -> torch.Tensor:
+def _frames() -> torch.Tensor:
     """Pictures whose pixels tell their own row and column."""
     rows, columns = torch.meshgrid(torch.arange(64), torch.arange(64), indexing="ij")
     picture = torch.stack([rows, columns, torch.zeros_like(rows)], -1).to(torch.uint8)
-    return picture.expand(batch, time, 64, 64, 3)
+    return picture.expand(32, 3, 64, 64, 3)
 
 
 def _shifted(pixels: int, seed: int = 0) -> torch.Tensor:
