@@ -143,9 +143,7 @@ class LearningConfig:
         at_least(
             self, batch_size=1, sequence_length=1, imagination_horizon=1, imagination_starts=1, overshooting_horizon=1
         )
-        at_least(
-            self, random_shift=0, reconstruction_scale=0.0, dynamics_scale=0.0, representation_scale=0.0, free_nats=0.0
-        )
+        at_least(self, reconstruction_scale=0.0, dynamics_scale=0.0, representation_scale=0.0, free_nats=0.0)
         at_least(self, overshooting_scale=0.0, reward_scale=0.0, replay_value_scale=0.0, entropy_scale=0.0)
         at_least(self, imitation_scale=0.0, random_shift=0)
         above_zero(self, "model_learning_rate", "behaviour_learning_rate", "max_grad_norm", "target_rate")
