@@ -32,7 +32,7 @@ LAYERS = {
     "planning": (("config",), {"torch", "einops"}),
     "goals": (("config", "planning"), {"torch", "einops", "numpy", "cv2"}),
     "models": (("config",), {"torch", "einops"}),
-    "envs": (("config",), {*SIMULATION, "numpy", "cv2"}),
+    "envs": (("config", "goals"), {*SIMULATION, "numpy", "cv2"}),
     "replay": (("config",), {"numpy", "torch", "einops"}),
     "reporting": (("config",), {"numpy", "cv2", "matplotlib", "rich"}),
     "agent": (("config", "models", "planning", "goals"), {"torch", "numpy", "einops"}),

@@ -49,6 +49,8 @@ class EnvConfig:
         render_quality: `exact` (dm_control's default), `fast` (small shadow map) or `fastest`
             (no shadows, reflections or anti-aliasing: a visibly easier picture).
         num_envs: Environments that collect at once; more than one runs each in its own process.
+        objective: Expression over the body's quantities that pays in place of the task's reward, once per control step,
+            such as `speed -> 2.0 and height > 1.1`; None leaves the task's.
     """
 
     domain: str = "walker"
@@ -57,6 +59,7 @@ class EnvConfig:
     camera: int = 0
     render_quality: str = "fast"
     num_envs: int = 1
+    objective: str | None = None
 
     def __post_init__(self) -> None:
         at_least(self, action_repeat=1, num_envs=1, camera=-1)
@@ -97,6 +100,8 @@ class LearningConfig:
         batch_size: Sequences per update.
         sequence_length: Decisions per sequence.
         random_shift: Pixels by which each replayed sequence of frames is moved at most, in either direction.
+        rotated_share: Share of the replayed sequences turned by a random angle; for bodies seen from above, whose task
+            and labels look the same from every side.
         model_learning_rate: Adam step of encoder, dynamics, decoder, reward and continue heads.
         behaviour_learning_rate: Adam step of actor and value.
         max_grad_norm: Gradient norm at which each optimizer clips.
@@ -120,6 +125,7 @@ class LearningConfig:
     batch_size: int = 16
     sequence_length: int = 16
     random_shift: int = 0
+    rotated_share: float = 0.0
     model_learning_rate: float = 1e-3
     behaviour_learning_rate: float = 3e-4
     max_grad_norm: float = 100.0
@@ -147,7 +153,7 @@ class LearningConfig:
         at_least(self, overshooting_scale=0.0, reward_scale=0.0, replay_value_scale=0.0, entropy_scale=0.0)
         at_least(self, imitation_scale=0.0, random_shift=0)
         above_zero(self, "model_learning_rate", "behaviour_learning_rate", "max_grad_norm", "target_rate")
-        within(self, lambda_=(0.0, 1.0), target_rate=(0.0, 1.0))
+        within(self, lambda_=(0.0, 1.0), target_rate=(0.0, 1.0), rotated_share=(0.0, 1.0))
         if self.discount is not None and not 0.0 < self.discount <= 1.0:
             raise ValueError(f"discount must lie in (0, 1], got {self.discount}")
 
@@ -160,6 +166,7 @@ class CollectionConfig:
         behaviour: Who acts while collecting: `planner`, `actor`, or `both` in alternate rounds.
         noise_std: Standard deviation of the noise added to the planner's action.
         noise_correlation: Of the planner's and the actor's noise between one decision and the next, in [0, 1).
+        noise_share: Share of the rounds with that noise; in the others planner and actor act as they are evaluated.
         prefill_decisions: Random decisions before learning starts.
         round_decisions: Decisions per epoch: this many are collected, then learned from.
         updates_per_decision: Updates per collected decision (the replay ratio, in updates).
@@ -169,6 +176,7 @@ class CollectionConfig:
     behaviour: str = "planner"
     noise_std: float = 0.2
     noise_correlation: float = 0.0
+    noise_share: float = 1.0
     prefill_decisions: int = 1000
     round_decisions: int = 250
     updates_per_decision: float = 0.5
@@ -177,7 +185,7 @@ class CollectionConfig:
     def __post_init__(self) -> None:
         one_of(self, behaviour=BEHAVIOURS)
         at_least(self, noise_std=0.0, prefill_decisions=1, round_decisions=1)
-        within(self, noise_correlation=(0.0, 0.99))
+        within(self, noise_correlation=(0.0, 0.99), noise_share=(0.0, 1.0))
         above_zero(self, "updates_per_decision")
 
 

@@ -16,6 +16,7 @@ from latentplan.config import EnvConfig, UserError
 from latentplan.envs.gl import explain_gl_errors, require_backend
 from latentplan.envs.quantities import measure, scales, true_values
 from latentplan.envs.render import FrameRenderer
+from latentplan.envs.reward import ObjectiveReward
 from latentplan.envs.schedule import control_step, split_schedule
 
 if TYPE_CHECKING:
@@ -89,8 +90,9 @@ class SuiteEnv(gymnasium.Env[np.ndarray, np.ndarray]):
             seed: Start of the random stream; None draws one from the system.
 
         Raises:
-            UserError: Domain, task or camera do not exist, or nothing can render.
+            UserError: Domain, task or camera do not exist, nothing can render, or the objective cannot be read.
         """
+        self._objective = None if config.objective is None else ObjectiveReward(config.objective, config.domain)
         task = default_task(config.domain) if config.task is None else config.task
         self._task_env = _load(config.domain, task)
         self._camera = _checked_camera(self.physics, config)
@@ -188,9 +190,8 @@ class SuiteEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         reward, env_frames, terminated = 0.0, 0, False
         for control in split_schedule(controls, self._task_env._n_sub_steps):
             outcome = control_step(self._task_env, control)
-            reward += float(outcome.reward)
+            reward += self._rewarded(float(outcome.reward))
             env_frames += 1
-            self._record(outcome.reward)
             self._steps_left -= 1
             # The suite marks an end of its own with discount 0, and the time limit with discount 1.
             terminated = outcome.last() and outcome.discount == 0.0
@@ -225,9 +226,16 @@ class SuiteEnv(gymnasium.Env[np.ndarray, np.ndarray]):
             self._recorded.clear()
         return info
 
-    def _record(self, reward: float) -> None:
+    def _rewarded(self, reward: float) -> float:
+        """What this control step pays where the task's own reward is this; recorded where that was asked for."""
+        if self._objective is None and not self.record_quantities:
+            return reward
+        values = true_values(self.domain, self.physics)
+        if self._objective is not None:
+            reward = self._objective(values)
         if self.record_quantities:
-            self._recorded.append((true_values(self.domain, self.physics), float(reward)))
+            self._recorded.append((values, reward))
+        return reward
 
     def _seed_task(self, seed: int | None) -> None:
         self._task_env.task.random.seed(seed)

@@ -14,7 +14,7 @@ import numpy as np
 import torch
 
 from latentplan.checkpoint import save_checkpoint
-from latentplan.config import Config
+from latentplan.config import CollectionConfig, Config
 from latentplan.models import WorldModel
 from latentplan.replay import Replay
 from latentplan.training.collector import Collected
@@ -64,11 +64,10 @@ class Experience(lightning.Callback):
             self._take_round()
         self.take()
         weights = {name: value.detach().cpu().numpy().copy() for name, value in learner.model.state_dict().items()}
-        both = ("planner", "actor")[state.rounds % 2]
-        behaviour = both if settings.behaviour == "both" else settings.behaviour
+        behaviour, noisy = turn(settings, state.rounds)
         decisions = min(settings.round_decisions, self._decisions_left())
         if decisions > 0:
-            self.worker.submit("collect", weights, behaviour, decisions, state.rounds)
+            self.worker.submit("collect", weights, behaviour, decisions, state.rounds, noisy)
             self._asked_round = True
         if self._asked_round and state.env_frames >= state.next_evaluation:
             self._ask_evaluation(learner.updates)
@@ -113,6 +112,15 @@ class Experience(lightning.Callback):
         self.state.decisions += collected.decisions
         self.state.rounds += 1
         self.episode_returns.extend(collected.episode_returns)
+
+
+def turn(settings: CollectionConfig, rounds: int) -> tuple[str, bool]:
+    """Who collects after so many rounds, and whether with noise: both take turns, and share the noise evenly."""
+    own, behaviour = rounds, settings.behaviour
+    if behaviour == "both":
+        own, who = divmod(rounds, 2)
+        behaviour = ("planner", "actor")[who]
+    return behaviour, int((own + 1) * settings.noise_share) > int(own * settings.noise_share)
 
 
 class Record(lightning.Callback):

@@ -84,9 +84,13 @@ class Collector:
         self.labels: dict[str, float] = getattr(self._eval_env.unwrapped, "labels", {})
         self.model = WorldModel(config.model, action_dim, self.labels).to(device)
         noise, correlation = config.collection.noise_std, config.collection.noise_correlation
-        self._agents: dict[str, ModelAgent] = {
-            "planner": PlanningAgent(self.model, config, discount, noise_std=noise, noise_correlation=correlation),
-            "actor": ActorAgent(self.model, config, explore=True, noise_correlation=correlation),
+        self._agents: dict[tuple[str, bool], ModelAgent] = {
+            ("planner", True): PlanningAgent(
+                self.model, config, discount, noise_std=noise, noise_correlation=correlation
+            ),
+            ("actor", True): ActorAgent(self.model, config, explore=True, noise_correlation=correlation),
+            ("planner", False): PlanningAgent(self.model, config, discount),
+            ("actor", False): ActorAgent(self.model, config),
         }
         self._judged: dict[str, ModelAgent] = {
             "planner": PlanningAgent(self.model, config, discount),
@@ -110,7 +114,9 @@ class Collector:
         renderer = {name: str(value) for name, value in facts.items()}
         return Description(self.model.action_dim, self.discount, render_ms, renderer, self.labels)
 
-    def collect(self, weights: dict[str, np.ndarray] | None, behaviour: str, decisions: int, counter: int) -> Collected:
+    def collect(
+        self, weights: dict[str, np.ndarray] | None, behaviour: str, decisions: int, counter: int, noisy: bool = True
+    ) -> Collected:
         """Take `decisions` decisions in all, with new weights; continues the episodes of the last round.
 
         Args:
@@ -118,8 +124,9 @@ class Collector:
             behaviour: `planner` or `actor`.
             decisions: Rounded up to a multiple of the number of environments.
             counter: Number of the round, from which its random stream derives.
+            noisy: Whether it explores, or acts as it is evaluated.
         """
-        agent = self._random if weights is None else self._agents[behaviour]
+        agent = self._random if weights is None else self._agents[behaviour, noisy]
         if weights is not None:
             self._load(weights)
         if agent is not self._acting:

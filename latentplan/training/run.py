@@ -69,6 +69,8 @@ def train(config: Config, make_env: EnvFactory | None = None) -> Result:
         raise UserError("a run needs an end: give --frames or --minutes")
     domain, task = config.env.domain, config.env.task
     if make_env is not None:
+        if config.env.objective is not None:
+            raise UserError("env.objective needs a domain of the suite; an environment of your own pays its own reward")
         domain, task = USER_DOMAIN, getattr(make_env, "__name__", type(make_env).__name__)
     config = replace(config, env=replace(config.env, domain=domain, task=task or default_task(domain)))
     if config.run.run_dir is None:
@@ -245,6 +247,7 @@ class _Run:
         rows = self.replay.lane_size * self.replay.num_lanes
         lines = {
             "task": f"{_task_name(config)}, action repeat {config.env.action_repeat}",
+            **({} if config.env.objective is None else {"objective": config.env.objective}),
             "device": f"{self.device}, {torch.get_num_threads()} threads",
             "renderer": f"{renderer}; {description.render_ms:.1f} ms per frame, quality {config.env.render_quality}",
             "parameters": f"{parameters:,}; discount {description.discount:g}",

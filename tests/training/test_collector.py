@@ -4,7 +4,9 @@ import numpy as np
 import pytest
 import torch
 
+from latentplan.config import CollectionConfig
 from latentplan.models import WorldModel
+from latentplan.training.callbacks import turn
 from latentplan.training.collector import Collector
 
 
@@ -86,6 +88,37 @@ def test_collection_follows_from_seed_round_and_weights(make_collector, tiny, be
     assert np.array_equal(one.actions, same.actions) and np.array_equal(one.frames, same.frames)
     assert not np.array_equal(one.actions, other.actions)
     assert np.abs(one.actions).max() <= 1.0
+
+
+@pytest.mark.parametrize("behaviour", ["planner", "actor"])
+def test_a_round_without_noise_acts_as_agents_are_judged(make_collector, tiny, behaviour):
+    """Noise or none, nothing else differs: the noiseless round is that of an agent that has no noise to add."""
+    weights = weights_of(tiny(""))
+    noiseless, explored = (
+        make_collector().collect(weights, behaviour, 12, 3, noisy).rows[0] for noisy in (False, True)
+    )
+    assert not np.array_equal(noiseless.actions, explored.actions)
+    if behaviour == "planner":
+        (expected,) = make_collector(collection={"noise_std": 0.0}).collect(weights, behaviour, 12, 3).rows
+        assert np.array_equal(noiseless.actions, expected.actions)
+    else:  # the mode of the actor is a function of the frame and the past alone
+        (other,) = make_collector().collect(weights, behaviour, 12, 3, False).rows
+        assert np.array_equal(noiseless.actions, other.actions) and (np.abs(noiseless.actions) < 0.1).all()
+
+
+def _turns(count, **settings):
+    return [turn(CollectionConfig(**settings), rounds) for rounds in range(count)]
+
+
+def test_planner_and_actor_share_the_noise_evenly():
+    assert _turns(4, behaviour="actor") == [("actor", True)] * 4
+    assert _turns(4, behaviour="planner", noise_share=0.0) == [("planner", False)] * 4
+    turns = _turns(40, behaviour="both", noise_share=0.25)
+    assert {name: [who for who, _ in turns].count(name) for name in ("planner", "actor")} == {
+        "planner": 20,
+        "actor": 20,
+    }
+    assert [sum(noisy for who, noisy in turns if who == name) for name in ("planner", "actor")] == [5, 5]
 
 
 def test_judging_neither_explores_nor_disturbs_the_collection(make_collector, tiny):

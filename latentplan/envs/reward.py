@@ -1,0 +1,34 @@
+"""Rewards that the user writes down, in place of a task's own."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from latentplan.config import UserError
+from latentplan.envs.quantities import clause_degree, scales
+from latentplan.goals.expression import GoalImage, LearnedReturn, evaluate
+from latentplan.goals.parser import parse_objective
+
+
+class ObjectiveReward:
+    """What an expression over a body's quantities pays in one control step.
+
+    Args:
+        text: In the language of test-time objectives, without `return`, goal images and changes of mind.
+        domain: Domain of `dm_control.suite`, whose quantities it names.
+
+    Raises:
+        UserError: The text is no such expression.
+    """
+
+    def __init__(self, text: str, domain: str) -> None:
+        self._expression = parse_objective(text, scales(domain))
+        self._names = tuple(scales(domain))
+        for _, term in self._expression.terms:
+            if isinstance(term, LearnedReturn | GoalImage):
+                raise UserError(f"env.objective {text!r} must be made of named quantities and tasks alone")
+
+    def __call__(self, values: np.ndarray) -> float:
+        """The reward where the quantities have these true values, (quantity,)."""
+        lookup = dict(zip(self._names, values, strict=True)).__getitem__
+        return float(sum(weight * evaluate(term, lookup, clause_degree) for weight, term in self._expression.terms))
