@@ -9,15 +9,13 @@ import torch
 from torch import Tensor
 
 from latentplan.config import Config, PlannerConfig
-from latentplan.config.quantities import scales
 from latentplan.goals.expression import Expression
 from latentplan.goals.image import read_goal
-from latentplan.goals.objective import plan_constraint, plan_objective, require_labels
-from latentplan.goals.parser import parse_constraints, parse_objective
+from latentplan.goals.objective import plan_goals
 from latentplan.models import State, WorldModel, reflex
 from latentplan.models.heads import sample_action
 from latentplan.planning import CEMPlanner, ModelPredictiveController
-from latentplan.planning.objectives import Constraint, Term, predicted_return
+from latentplan.planning.objectives import Constraint, Term
 
 
 class ModelAgent:
@@ -124,6 +122,18 @@ class ModelAgent:
         _, last = self.model.rollout(first, actions[:1].to(first.deter.dtype))
         return self.model.decoder.picture(last.features.float())[0].cpu().numpy()
 
+    def _plan_goals(
+        self, objective: str | Expression | Term | None, constraints: str | Sequence[Constraint], planner: CEMPlanner
+    ) -> tuple[Term | None, Sequence[Constraint]]:
+        return plan_goals(
+            objective,
+            constraints,
+            model=self.model,
+            env=self.config.env,
+            use_value=planner.terminal_value,
+            encode_goal=lambda path: torch.as_tensor(self.encode(read_goal(path)), device=self.model.device),
+        )
+
     def _believe(self, frames: Tensor) -> State:
         if self.state is None or self.model.device.type != "cpu":  # elsewhere the weights do not follow the model's
             self._weights = reflex.lay_out(self.model)
@@ -191,19 +201,7 @@ class PlanningAgent(ModelAgent):
         Raises:
             UserError: The text is no expression, or is about what this agent does not predict.
         """
-        known = self.model.labels or scales(self.config.env.domain)
-        if isinstance(objective, str):
-            objective = parse_objective(objective, known)
-        if isinstance(objective, Expression):
-            require_labels([node for _, node in objective.terms], self.model.label_names)
-            learned = predicted_return(self.model, self.controller.planner.terminal_value)
-            repeat, wanted = self.config.env.action_repeat, objective
-            objective = None if wanted.is_return else plan_objective(wanted, repeat, learned, self._encode_goal)
-        if isinstance(constraints, str):
-            clauses = parse_constraints(constraints, known)
-            require_labels(clauses, self.model.label_names)
-            constraints = [plan_constraint(clauses)]
-        self.controller.set_objective(objective, constraints)
+        self.controller.set_objective(*self._plan_goals(objective, constraints, self.controller.planner))
 
     @torch.no_grad()
     def imagine(self) -> np.ndarray | None:
@@ -211,9 +209,6 @@ class PlanningAgent(ModelAgent):
         if self.controller.plan is None or self.state is None:
             return None
         return self._picture(self.state, self.controller.plan.actions)
-
-    def _encode_goal(self, path: str) -> Tensor:
-        return torch.as_tensor(self.encode(read_goal(path)), device=self.model.device)
 
     def planned_action(self) -> np.ndarray | None:
         """Mean and std of the last plan's first action side by side, float32 (batch, 2 action); None without a plan.

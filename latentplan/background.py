@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from types import TracebackType
 from typing import Any
@@ -13,8 +13,10 @@ from torch import Tensor
 
 from latentplan.agent import ModelAgent
 from latentplan.config import Config, PlannerConfig
+from latentplan.goals.expression import Expression
 from latentplan.models import State, WorldModel
 from latentplan.planning import BackgroundPlanner, CEMPlanner, Plan, PlanExecutor, PlanScheduler
+from latentplan.planning.objectives import Constraint, Term
 
 
 @dataclass(frozen=True)
@@ -81,6 +83,23 @@ class BackgroundAgent(ModelAgent):
         """Forget the past, everywhere or where mask (batch,) is true, and all plans."""
         super().reset(mask)
         self.scheduler.reset()
+
+    def set_objective(
+        self, objective: str | Expression | Term | None = None, constraints: str | Sequence[Constraint] = ()
+    ) -> None:
+        """Changes what plans asked for from now on pursue; those made before are followed until these come.
+
+        The actor, which acts where no plan is due, goes on with what it was trained for.
+
+        Args:
+            objective: See `PlanningAgent.set_objective`.
+            constraints: See `PlanningAgent.set_objective`.
+
+        Raises:
+            UserError: The text is no expression, or is about what this agent does not predict.
+            TypeError: A term cannot be sent to the process that plans.
+        """
+        self.scheduler.set_objective(*self._plan_goals(objective, constraints, self.scheduler.planner))
 
     @torch.no_grad()
     def imagine(self) -> np.ndarray | None:

@@ -16,7 +16,6 @@ from latentplan.cli import run_guarded, use_device
 from latentplan.compose import build_config
 from latentplan.config import EnvConfig, PlannerConfig, UserError, from_dict, to_dict
 from latentplan.evaluation_request import (
-    GOAL_MODES,
     PLANNING_MODES,
     EvaluationRequest,
     help_text,
@@ -89,7 +88,7 @@ def _evaluate(argv: Sequence[str]) -> int:
             f"{about['domain']}-{about['task']}, {request.mode} on {device}, pictures by {about['renderer']}",
             flush=True,
         )
-        played = env if goals is None else score_env(env, goals, agent if request.mode in GOAL_MODES else None)
+        played = env if goals is None else score_env(env, goals, agent if request.mode in PLANNING_MODES else None)
         return _play_and_report(request, played, agent, about, planner.horizon, clock)
     except OSError as error:
         raise UserError(f"an output could not be written: {error}") from error

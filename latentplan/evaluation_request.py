@@ -17,8 +17,7 @@ from latentplan.config import DEVICES, PlannerConfig, UserError
 if TYPE_CHECKING:
     from latentplan.latency import Latency
 
-PLANNING_MODES = ("planner", "gated", "background")
-GOAL_MODES = ("planner", "gated")  # who pursues an objective; the others are scored on it
+PLANNING_MODES = ("planner", "gated", "background")  # who pursues an objective; the others are scored on it
 MODES = (*PLANNING_MODES, "actor", "random")
 FLAGS = {
     "--checkpoint": ("DIR", "folder of a trained agent, or of a run (its best checkpoint)"),
@@ -100,8 +99,6 @@ def parse_arguments(argv: Sequence[str]) -> EvaluationRequest:
     from latentplan.latency import read_clock_flags
 
     control_hz, latency = read_clock_flags(flags)
-    if mode == "background" and ("--objective" in flags or "--constraint" in flags):
-        raise UserError("mode background plans for the learned return alone; give goals to --mode planner or gated")
     return EvaluationRequest(
         checkpoint=Path(flags["--checkpoint"]),
         episodes=_whole_number(flags, "--episodes", 10, 1),

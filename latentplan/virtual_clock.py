@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, TypeVar
 
 import numpy as np
@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from latentplan.config import derive_seed
 from latentplan.latency import Charge, Latency
 from latentplan.planning.model import State, state_device
+from latentplan.planning.objectives import Constraint, Term
 from latentplan.planning.plan import Plan
 from latentplan.rollout import Agent
 
@@ -93,6 +94,8 @@ class VirtualExecutor:
     def __init__(self, planner: Any, model: Any, clock: VirtualClock) -> None:
         self.planner, self.model, self.clock = planner, model, clock
         self.asked_ms: dict[int, float] = {}
+        self._objective: Term | None = None
+        self._constraints: Sequence[Constraint] = ()
         self._episode = clock.episode
         self._pending: tuple[int, Plan, float] | None = None  # tick, plan, when it is there
 
@@ -101,6 +104,10 @@ class VirtualExecutor:
         """Whether a request would be taken now."""
         self._follow_episode()
         return self._pending is None
+
+    def set_objective(self, objective: Term | None = None, constraints: Sequence[Constraint] = ()) -> None:
+        """Plan for this from the next request on; see `CEMPlanner.plan`."""
+        self._objective, self._constraints = objective, constraints
 
     def request(self, state: State, tick: int, previous: Plan | None = None, seed: int | None = None) -> bool:
         """Makes the plan whose first action is due at `tick`; False (and nothing happens) when one is in work.
@@ -114,8 +121,9 @@ class VirtualExecutor:
         if not self.is_idle:
             return False
         generator = None if seed is None else torch.Generator(state_device(state)).manual_seed(seed)
+        goals: dict[str, Any] = {"objective": self._objective, "constraints": self._constraints}
         plan, ready_ms = self.clock.charge_plan(
-            lambda: self.planner.plan(self.model, state, previous, generator=generator)
+            lambda: self.planner.plan(self.model, state, previous, generator=generator, **goals)
         )
         self.asked_ms[tick] = self.clock.now_ms
         self._pending = (tick, plan, ready_ms)

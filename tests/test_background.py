@@ -1,5 +1,6 @@
 """The agent that acts at once: frames in, bounded actions out, and where each came from."""
 
+import pickle
 import time
 
 import numpy as np
@@ -8,7 +9,7 @@ import torch
 
 from latentplan.agent import ActorAgent
 from latentplan.background import BackgroundAgent
-from latentplan.config import Config, ModelConfig, PlannerConfig
+from latentplan.config import Config, ModelConfig, PlannerConfig, UserError
 from latentplan.models import WorldModel
 
 CONFIG = Config(
@@ -37,13 +38,18 @@ class Ticking:
 
     def __init__(self, planner, model, ticks):
         self.planner, self.model, self.ticks, self.polls, self.work = planner, model, ticks, 0, None
+        self.goals = {}
 
     @property
     def is_idle(self):
         return self.work is None
 
+    def set_objective(self, objective=None, constraints=()):
+        self.goals = {"objective": objective, "constraints": constraints}
+
     def request(self, state, tick, previous=None, seed=None):
-        plan = self.planner.plan(self.model, state, previous, generator=torch.Generator().manual_seed(seed))
+        generator = torch.Generator().manual_seed(seed)
+        plan = self.planner.plan(self.model, state, previous, generator=generator, **self.goals)
         self.work = (self.polls + self.ticks, tick, plan)
         return True
 
@@ -125,6 +131,22 @@ def test_a_failed_decision_loses_no_reset(model, film):
         agent.act(film[1])
     agent.scheduler.executor.poll = poll
     assert np.allclose(agent.act(film[1]), fresh.act(film[1]), atol=1e-5)
+
+
+def test_goals_reach_the_plans_and_not_the_actor(film):
+    torch.manual_seed(0)
+    model = WorldModel(CONFIG.model, action_dim=2, labels={"cart": 1.0})
+    agents = [make(model), make(model)]
+    agents[1].set_objective("cart > 100", constraints="cart > 50")
+    told = agents[1].scheduler.executor.goals
+    assert len(told["constraints"]) == 1
+    assert pickle.loads(pickle.dumps(told["objective"])).needs == ("probe",)  # it can go to a process
+    first, later = [[agent.act(frames[0]) for agent in agents] for frames in film[:3]][::2]
+    assert np.array_equal(*first) and not np.array_equal(*later)
+    with pytest.raises(UserError, match="height"):
+        agents[1].set_objective("height > 1")
+    agents[1].set_objective()
+    assert agents[1].scheduler.executor.goals == {"objective": None, "constraints": ()}
 
 
 @pytest.mark.parametrize("worker", ["process", "thread"])

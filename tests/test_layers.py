@@ -37,7 +37,7 @@ LAYERS = {
     "reporting": (("config",), {"numpy", "cv2", "matplotlib", "rich"}),
     "agent": (("config", "models", "planning", "goals"), {"torch", "numpy", "einops"}),
     "scoring": (("config", "envs", "goals"), {"numpy", "gymnasium"}),
-    "background": (("config", "models", "planning", "agent"), {"torch", "numpy"}),
+    "background": (("config", "models", "planning", "goals", "agent"), {"torch", "numpy"}),
     "gate": (("config", "models", "planning", "agent"), {"torch", "numpy"}),
     "rollout": (("config", "envs", "replay", "agent"), {"numpy"}),
     "latency": (("config",), {"numpy"}),

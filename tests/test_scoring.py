@@ -152,7 +152,7 @@ def test_goal_images_are_scored_by_the_cameras_picture(env, tmp_path):
     assert max(other.worth) < min(scored.worth)
 
 
-@pytest.mark.parametrize("mode", ["planner", "actor", "random"])
+@pytest.mark.parametrize("mode", ["planner", "gated", "background", "actor", "random"])
 def test_every_mode_reports_scores_on_the_same_objective(tmp_path, checkpoint, mode):
     flags = ["--objective", "cart -> 0.5", "--constraint", "cart < 0.4", "--constraint=cart > -0.4", "--mode", mode]
     result = evaluate_agent(checkpoint, tmp_path, *flags)
@@ -168,8 +168,10 @@ def test_results_without_goals_hold_no_scores(tmp_path, checkpoint):
     assert not {"objective", "objective_return", "violation_rate"} & result.keys()
 
 
-def test_the_objective_changes_what_the_planner_does(tmp_path, checkpoint):
-    runs = [evaluate_agent(checkpoint, tmp_path, *flags)["returns"] for flags in ([], ["--objective", "cart -> 1.5"])]
+@pytest.mark.parametrize("mode", ["planner", "background"])
+def test_the_objective_changes_what_the_planner_does(tmp_path, checkpoint, mode):
+    goals = ([], ["--objective", "cart -> 1.5"])
+    runs = [evaluate_agent(checkpoint, tmp_path, "--mode", mode, *flags)["returns"] for flags in goals]
     assert runs[0] != runs[1]
 
 

@@ -24,7 +24,7 @@ class Searcher:
     def __init__(self):
         self.count = 0
 
-    def plan(self, model, state, previous=None, *, generator=None):
+    def plan(self, model, state, previous=None, *, objective=None, constraints=(), generator=None):
         self.count += 1
         return self.count
 
@@ -76,7 +76,7 @@ def test_a_measured_plan_takes_as_long_as_it_took_and_nothing_from_the_decision(
     import time
 
     class Slow(Searcher):
-        def plan(self, model, state, previous=None, *, generator=None):
+        def plan(self, model, state, previous=None, *, objective=None, constraints=(), generator=None):
             time.sleep(0.05)
             return super().plan(model, state, previous, generator=generator)
 

@@ -10,13 +10,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any
 
 import torch
 from einops import rearrange, reduce
 from torch import Tensor
 
-from latentplan.config import UserError
+from latentplan.config import EnvConfig, UserError
+from latentplan.config.quantities import scales
 from latentplan.goals.expression import (
     Clause,
     Expression,
@@ -29,10 +31,48 @@ from latentplan.goals.expression import (
     shortfall,
     walk,
 )
-from latentplan.planning.objectives import Objective, Rollout
+from latentplan.goals.parser import parse_constraints, parse_objective
+from latentplan.planning.objectives import Constraint, Objective, Rollout, Term, predicted_return
 
 CAUTION = 0.1  # margins that a plan stays away from where a constraint would break
 GOAL_DISTANCE = 1.0  # root mean square distance of latents that counts as one margin
+
+
+def plan_goals(
+    objective: str | Expression | Term | None,
+    constraints: str | Sequence[Constraint],
+    *,
+    model: Any,
+    env: EnvConfig,
+    use_value: bool | None,
+    encode_goal: Callable[[str], Tensor],
+) -> tuple[Term | None, Sequence[Constraint]]:
+    """What a planner is given for goals written as text.
+
+    Args:
+        objective: A text or what the parser made of it; a term, or None for what the agent was trained for, stays.
+        constraints: Inequalities separated by `;`; functions of imagined rollouts stay.
+        model: The world model, with `labels` and `label_names`.
+        env: Settings of the environment.
+        use_value: Whether `return` has a value at its end; None where the model has one.
+        encode_goal: See `plan_objective`.
+
+    Raises:
+        UserError: A text is no expression, or is about what this agent does not predict.
+    """
+    known = model.labels or scales(env.domain)
+    if isinstance(objective, str):
+        objective = parse_objective(objective, known)
+    if isinstance(objective, Expression):
+        require_labels([node for _, node in objective.terms], model.label_names)
+        learned = predicted_return(model, use_value)
+        wanted = objective
+        objective = None if wanted.is_return else plan_objective(wanted, env.action_repeat, learned, encode_goal)
+    if isinstance(constraints, str):
+        clauses = parse_constraints(constraints, known)
+        require_labels(clauses, model.label_names)
+        constraints = [plan_constraint(clauses)]
+    return objective, constraints
 
 
 def plan_objective(
@@ -54,23 +94,18 @@ def plan_objective(
         if isinstance(term, LearnedReturn):
             objectives.append(weight * learned)
         elif isinstance(term, GoalImage):
-            objectives.append(weight * frames_per_step * _goal_objective(encode_goal(term.path)))
+            closeness = Objective(partial(_closeness, encode_goal(term.path)), needs_states=True)
+            objectives.append(weight * frames_per_step * closeness)
         else:
             quantities.append((weight * frames_per_step, term))
     if quantities:
-        objectives.append(_quantity_objective(quantities))
+        objectives.append(Objective(partial(_worth, tuple(quantities)), needs_states=True, needs=("probe",)))
     return sum(objectives[1:], objectives[0])
 
 
 def plan_constraint(clauses: Sequence[Clause]) -> Objective:
     """By how many margins predicted quantities break the clauses, summed over steps; 0 where all hold with distance."""
-
-    def violation(rollout: Rollout) -> Tensor:
-        values = predicted_quantities(rollout)
-        excesses = [torch.as_tensor(shortfall(clause, values)) + CAUTION for clause in clauses]
-        return reduce(torch.stack(excesses).clamp_min(0.0), "clause step rows -> rows", "sum")
-
-    return Objective(violation, needs_states=True, needs=("probe",))
+    return Objective(partial(_violation, tuple(clauses)), needs_states=True, needs=("probe",))
 
 
 def require_labels(nodes: Sequence[Node], labels: Sequence[str]) -> None:
@@ -111,22 +146,22 @@ def plan_degree(shortfalls: Tensor) -> Tensor:
     return 0.5 * (gaussian + 1.0 / (1.0 + missing))
 
 
-def _quantity_objective(terms: Sequence[tuple[float, Node]]) -> Objective:
-    def evaluate_terms(rollout: Rollout) -> Tensor:
-        values = predicted_quantities(rollout)
-        worth: Any = sum(weight * evaluate(node, values, plan_degree) for weight, node in terms)
-        return _discounted(torch.as_tensor(worth).expand(len(rollout.states), len(rollout.actions)), rollout)
-
-    return Objective(evaluate_terms, needs_states=True, needs=("probe",))
+def _violation(clauses: Sequence[Clause], rollout: Rollout) -> Tensor:
+    values = predicted_quantities(rollout)
+    excesses = [torch.as_tensor(shortfall(clause, values)) + CAUTION for clause in clauses]
+    return reduce(torch.stack(excesses).clamp_min(0.0), "clause step rows -> rows", "sum")
 
 
-def _goal_objective(goal: Tensor) -> Objective:
-    def closeness(rollout: Rollout) -> Tensor:
-        latents = torch.stack([state.stoch for state in rollout.states])
-        distances = (latents.float() - goal.float()).square().mean(dim=-1).sqrt()
-        return _discounted(plan_degree(distances / GOAL_DISTANCE), rollout)
+def _worth(terms: Sequence[tuple[float, Node]], rollout: Rollout) -> Tensor:
+    values = predicted_quantities(rollout)
+    worth: Any = sum(weight * evaluate(node, values, plan_degree) for weight, node in terms)
+    return _discounted(torch.as_tensor(worth).expand(len(rollout.states), len(rollout.actions)), rollout)
 
-    return Objective(closeness, needs_states=True)
+
+def _closeness(goal: Tensor, rollout: Rollout) -> Tensor:
+    latents = torch.stack([state.stoch for state in rollout.states])
+    distances = (latents.float() - goal.float()).square().mean(dim=-1).sqrt()
+    return _discounted(plan_degree(distances / GOAL_DISTANCE), rollout)
 
 
 def _discounted(worth: Tensor, rollout: Rollout) -> Tensor:

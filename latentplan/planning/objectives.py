@@ -5,6 +5,7 @@ Terms are added and multiplied, with each other and with numbers:
     learned_return() + terminal_value() + 0.1 * action_penalty() + 5 * goal_term(goal)
 
 Every term is maximised, so penalties are negative. A bare function `function(rollout) -> (rows,)` is a term as well.
+Terms can be sent to another process as long as the functions and tensors they are given can.
 """
 
 from __future__ import annotations
@@ -12,6 +13,7 @@ from __future__ import annotations
 import operator
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import torch
@@ -108,18 +110,12 @@ def as_objective(term: Term) -> Objective:
 
 def learned_return() -> Objective:
     """The predicted reward of every step, discounted and summed."""
-    return Objective(lambda rollout: (rollout.rewards * rollout.weights[..., :-1]).sum(dim=1))
+    return Objective(_rewards)
 
 
 def terminal_value() -> Objective:
     """The model's value of where a rollout ends, discounted."""
-
-    def evaluate(rollout: Rollout) -> Tensor:
-        value = rollout.model.value(rollout.last_state)
-        check_shape("value()", value, rollout.actions.shape[:1])
-        return rollout.weights[..., -1] * value.to(rollout.rewards.dtype)
-
-    return Objective(evaluate, needs=("value",))
+    return Objective(_last_value, needs=("value",))
 
 
 def goal_term(
@@ -145,46 +141,22 @@ def goal_term(
     if goal.ndim not in (1, 2):
         raise ValueError(f"a goal has shape (feature,) or (batch, feature), got {tuple(goal.shape)}")
 
-    def distance(rollout: Rollout, state: State) -> Tensor:
-        features = state if select is None else select(state)
-        target = goal.to(features)
-        if goal.ndim == 2:
-            check_shape("the goal", goal, (rollout.batch, features.shape[-1]))
-            target = repeat(target, "batch feature -> (batch num) feature", num=len(features) // rollout.batch)
-        if metric == "mse":
-            return (features - target).square().mean(dim=-1)
-        return 1 - functional.cosine_similarity(features, target.expand_as(features), dim=-1)
-
-    def evaluate(rollout: Rollout) -> Tensor:
-        if over == "last":
-            return -distance(rollout, rollout.last_state)
-        distances = torch.stack([distance(rollout, state) for state in rollout.states])
-        return -(distances.sum(dim=0) if over == "sum" else distances.amin(dim=0))
-
-    return Objective(evaluate, needs_states=over != "last")
+    return Objective(partial(_closeness, goal, metric, over, select), needs_states=over != "last")
 
 
 def action_penalty() -> Objective:
     """Minus the squared size of the actions, summed over steps and dimensions."""
-    return Objective(lambda rollout: -rollout.actions.square().sum(dim=(1, 2)))
+    return Objective(_action_size)
 
 
 def smoothness_penalty() -> Objective:
     """Minus the squared change from each action to the next, summed over steps and dimensions."""
-    return Objective(lambda rollout: -rollout.actions.diff(dim=1).square().sum(dim=(1, 2)))
+    return Objective(_action_changes)
 
 
 def uncertainty_penalty() -> Objective:
     """Minus the model's doubt about every step, discounted and summed."""
-
-    def evaluate(rollout: Rollout) -> Tensor:
-        befores = (rollout.start, *rollout.states[:-1])
-        pairs = zip(befores, rollout.actions.unbind(dim=1), strict=True)
-        doubts = torch.stack([rollout.model.uncertainty(state, action) for state, action in pairs], dim=1)
-        check_shape("uncertainty()", doubts, rollout.rewards.shape)
-        return -(rollout.weights[..., :-1] * doubts).sum(dim=1)
-
-    return Objective(evaluate, needs_states=True, needs=("uncertainty",))
+    return Objective(_doubt, needs_states=True, needs=("uncertainty",))
 
 
 def risk(objective: Term, *, measure: str = "cvar", num_particles: int = 8, worst_share: float = 0.25) -> Objective:
@@ -209,14 +181,7 @@ def risk(objective: Term, *, measure: str = "cvar", num_particles: int = 8, wors
     inner = as_objective(objective)
     num_worst = {"mean": num_particles, "worst": 1, "cvar": max(1, round(worst_share * num_particles))}[measure]
 
-    def evaluate(rollout: Rollout) -> Tensor:
-        values = rearrange(inner(rollout), "(row particle) -> row particle", particle=rollout.num_particles)
-        worst = torch.topk(values, num_worst, dim=1, largest=False).values.mean(dim=1)
-        # NaN sorts as the largest number: without this it would hide among the particles that do not count.
-        worst = worst.masked_fill(values.isnan().any(dim=1), float("nan"))
-        return repeat(worst, "row -> (row particle)", particle=rollout.num_particles)
-
-    return Objective(evaluate, inner.needs_states, num_particles, inner.needs)
+    return Objective(partial(_worst, inner, num_worst), inner.needs_states, num_particles, inner.needs)
 
 
 def at_every_state(function: Callable[[State], Tensor]) -> Objective:
@@ -224,12 +189,7 @@ def at_every_state(function: Callable[[State], Tensor]) -> Objective:
 
     Its violation is what exceeds 0, summed over the steps.
     """
-
-    def violation(rollout: Rollout) -> Tensor:
-        excess = torch.stack([function(state) for state in rollout.states])
-        return reduce(excess.clamp_min(0.0), "step rows -> rows", "sum")
-
-    return Objective(violation, needs_states=True)
+    return Objective(partial(_excess, function), needs_states=True)
 
 
 def predicted_return(model: Model, use_value: bool | None) -> Objective:
@@ -244,15 +204,87 @@ def predicted_return(model: Model, use_value: bool | None) -> Objective:
 def _compose(operation: Callable[[Any, Any], Any], left: Objective, right: Term | float) -> Objective:
     if isinstance(right, int | float):
         return Objective(
-            lambda rollout: operation(left(rollout), right), left.needs_states, left.num_particles, left.needs
+            partial(_with_number, operation, left, right), left.needs_states, left.num_particles, left.needs
         )
     other = as_objective(right)
     particles = {left.num_particles, other.num_particles} - {1}
     if len(particles) > 1:
         raise ValueError(f"terms of one objective must agree on num_particles, got {sorted(particles)}")
     return Objective(
-        lambda rollout: operation(left(rollout), other(rollout)),
+        partial(_both, operation, left, other),
         left.needs_states or other.needs_states,
         max(left.num_particles, other.num_particles),
         (*left.needs, *other.needs),
     )
+
+
+def _with_number(operation: Callable[[Any, Any], Any], left: Term, right: float, rollout: Rollout) -> Tensor:
+    result: Tensor = operation(left(rollout), right)
+    return result
+
+
+def _both(operation: Callable[[Any, Any], Any], left: Term, right: Term, rollout: Rollout) -> Tensor:
+    result: Tensor = operation(left(rollout), right(rollout))
+    return result
+
+
+def _rewards(rollout: Rollout) -> Tensor:
+    return (rollout.rewards * rollout.weights[..., :-1]).sum(dim=1)
+
+
+def _last_value(rollout: Rollout) -> Tensor:
+    value = rollout.model.value(rollout.last_state)
+    check_shape("value()", value, rollout.actions.shape[:1])
+    weighted: Tensor = rollout.weights[..., -1] * value.to(rollout.rewards.dtype)
+    return weighted
+
+
+def _closeness(
+    goal: Tensor, metric: str, over: str, select: Callable[[State], Tensor] | None, rollout: Rollout
+) -> Tensor:
+    if over == "last":
+        return -_distance(goal, metric, select, rollout, rollout.last_state)
+    distances = torch.stack([_distance(goal, metric, select, rollout, state) for state in rollout.states])
+    return -(distances.sum(dim=0) if over == "sum" else distances.amin(dim=0))
+
+
+def _distance(
+    goal: Tensor, metric: str, select: Callable[[State], Tensor] | None, rollout: Rollout, state: State
+) -> Tensor:
+    features = state if select is None else select(state)
+    target = goal.to(features)
+    if goal.ndim == 2:
+        check_shape("the goal", goal, (rollout.batch, features.shape[-1]))
+        target = repeat(target, "batch feature -> (batch num) feature", num=len(features) // rollout.batch)
+    if metric == "mse":
+        return (features - target).square().mean(dim=-1)
+    return 1 - functional.cosine_similarity(features, target.expand_as(features), dim=-1)
+
+
+def _action_size(rollout: Rollout) -> Tensor:
+    return -rollout.actions.square().sum(dim=(1, 2))
+
+
+def _action_changes(rollout: Rollout) -> Tensor:
+    return -rollout.actions.diff(dim=1).square().sum(dim=(1, 2))
+
+
+def _doubt(rollout: Rollout) -> Tensor:
+    befores = (rollout.start, *rollout.states[:-1])
+    pairs = zip(befores, rollout.actions.unbind(dim=1), strict=True)
+    doubts = torch.stack([rollout.model.uncertainty(state, action) for state, action in pairs], dim=1)
+    check_shape("uncertainty()", doubts, rollout.rewards.shape)
+    return -(rollout.weights[..., :-1] * doubts).sum(dim=1)
+
+
+def _worst(inner: Term, num_worst: int, rollout: Rollout) -> Tensor:
+    values = rearrange(inner(rollout), "(row particle) -> row particle", particle=rollout.num_particles)
+    worst = torch.topk(values, num_worst, dim=1, largest=False).values.mean(dim=1)
+    # NaN sorts as the largest number: without this it would hide among the particles that do not count.
+    worst = worst.masked_fill(values.isnan().any(dim=1), float("nan"))
+    return repeat(worst, "row -> (row particle)", particle=rollout.num_particles)
+
+
+def _excess(function: Callable[[State], Tensor], rollout: Rollout) -> Tensor:
+    excess = torch.stack([function(state) for state in rollout.states])
+    return reduce(excess.clamp_min(0.0), "step rows -> rows", "sum")

@@ -20,6 +20,7 @@ from latentplan.planning.sampling import Generators
 from latentplan.planning.worker import (
     CLOSING_SECONDS,
     Answer,
+    Goals,
     Request,
     drive_process,
     drive_search,
@@ -162,6 +163,7 @@ class BackgroundPlanner:
         if worker not in WORKERS:
             raise ValueError(f"worker must be one of {', '.join(WORKERS)}, got {worker!r}")
         problem = (planner, model, objective, tuple(constraints))
+        self._goals: Goals | bytes | None = None  # that the next request carries
         self._is_idle, self._is_closed = True, False
         self._ready = threading.Event()
         self._requests: SimpleQueue[Request | None] = SimpleQueue()
@@ -188,6 +190,19 @@ class BackgroundPlanner:
         """Wait until the worker can search at once, at most so long; whether it can (or has failed to start)."""
         return self._ready.wait(seconds)
 
+    def set_objective(self, objective: Term | None = None, constraints: Sequence[Constraint] = ()) -> None:
+        """Changes what is searched for, from the next request on.
+
+        Args:
+            objective: See `CEMPlanner.plan`.
+            constraints: See `CEMPlanner.plan`.
+
+        Raises:
+            TypeError: Something cannot be sent to another process; the old goals stay.
+        """
+        goals = (objective, tuple(constraints))
+        self._goals = goals if self.process is None else dump(goals)
+
     def request(self, state: State, tick: int, previous: Plan | None = None, seed: int | None = None) -> bool:
         """Start the search of a plan whose first action is due at `tick`; False (and nothing happens) if one is busy.
 
@@ -200,7 +215,9 @@ class BackgroundPlanner:
         if not self.is_idle:
             return False
         self._is_idle = False
-        self._requests.put((tree_map(lambda leaf: leaf.detach().clone(), state), tick, previous, seed))
+        goals, self._goals = self._goals, None
+        own = tree_map(lambda leaf: leaf.detach().clone(), state)
+        self._requests.put(Request(own, tick, previous, seed, goals))
         return True
 
     def poll(self) -> tuple[int, Plan] | None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Sequence
 from typing import Any, NamedTuple, Protocol
 
 import torch
@@ -19,6 +20,7 @@ from latentplan.planning.model import (
     supports,
     take_step,
 )
+from latentplan.planning.objectives import Constraint, Term
 from latentplan.planning.plan import Plan
 from latentplan.planning.realtime import PlanBuffer
 
@@ -42,6 +44,10 @@ class PlanExecutor(Protocol):
             previous: Warm start, already shifted (its `elapsed` says by how much).
             seed: Of the search's random stream; None takes torch's default.
         """
+        ...
+
+    def set_objective(self, objective: Term | None = None, constraints: Sequence[Constraint] = ()) -> None:
+        """Plan for this from the next request on; see `CEMPlanner.plan`."""
         ...
 
     def poll(self) -> tuple[int, Plan] | None:
@@ -136,6 +142,10 @@ class PlanScheduler:
             self._ask(state, action)
         self.tick += 1
         return Decision(action, source, age)
+
+    def set_objective(self, objective: Term | None = None, constraints: Sequence[Constraint] = ()) -> None:
+        """Changes what plans asked for from now on pursue; those made before are followed until these come."""
+        self.executor.set_objective(objective, constraints)
 
     def reset(self) -> None:
         """Forget all plans, the one in work too: what it was asked for is over."""

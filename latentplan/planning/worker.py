@@ -10,7 +10,7 @@ import traceback
 from multiprocessing.connection import Connection
 from multiprocessing.context import SpawnProcess
 from queue import SimpleQueue
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 
@@ -19,9 +19,19 @@ from latentplan.planning.plan import Plan
 
 CLOSING_SECONDS = 2.0
 
-Request = tuple[State, int, Plan | None, int | None]  # state, tick, previous, seed
 Answer = tuple[str, Any]  # "ready", "plan" with (tick, plan), "error" with (error, where), or "ended"
 Problem = tuple[Any, ...]  # planner, model, objective, constraints
+Goals = tuple[Any, Any]  # objective, constraints
+
+
+class Request(NamedTuple):
+    """What is to be searched, and goals that hold from this search on: as they are, as bytes, or None for the old."""
+
+    state: State
+    tick: int
+    previous: Plan | None
+    seed: int | None
+    goals: Goals | bytes | None
 
 
 def start_process() -> tuple[SpawnProcess, Connection]:
@@ -35,7 +45,7 @@ def start_process() -> tuple[SpawnProcess, Connection]:
 
 
 def dump(problem: Problem) -> bytes:
-    """The problem as bytes, by value: torch's own way over pipes shares memory, which outlives a crash.
+    """A problem or goals as bytes, by value: torch's own way over pipes shares memory, which outlives a crash.
 
     Raises:
         TypeError: It cannot be sent to another process.
@@ -77,8 +87,9 @@ def drive_search(
 ) -> None:
     """Searches in a thread of the loop's process."""
     ready.set()
+    search = _Search(problem)
     while (request := requests.get()) is not None:
-        answers.put(_search(problem, request))
+        answers.put(search(request))
 
 
 def end(requests: SimpleQueue[Request | None], thread: threading.Thread, process: SpawnProcess | None) -> None:
@@ -115,21 +126,40 @@ def _serve(connection: Connection) -> None:
             connection.send_bytes(pickle.dumps(("error", _portable(error))))
             return
         connection.send_bytes(pickle.dumps(("ready", None)))
+        search = _Search(problem)
         while True:
-            connection.send_bytes(pickle.dumps(_search(problem, pickle.loads(connection.recv_bytes()))))
+            connection.send_bytes(pickle.dumps(search(pickle.loads(connection.recv_bytes()))))
     except (EOFError, OSError):
         return
 
 
-def _search(problem: Problem, request: Request) -> Answer:
-    planner, model, objective, constraints = problem
-    state, tick, previous, seed = request
-    generator = None if seed is None else torch.Generator().manual_seed(seed)
-    try:
-        plan = planner.plan(model, state, previous, objective=objective, constraints=constraints, generator=generator)
-    except Exception as error:
-        return "error", _portable(error)
-    return "plan", (tick, plan)
+class _Search:
+    """Answers one request after another, each with the latest goals."""
+
+    def __init__(self, problem: Problem) -> None:
+        self._planner, self._model, *goals = problem
+        self._goals: Any = tuple(goals)
+
+    def __call__(self, request: Request) -> Answer:
+        """The plan, or what went wrong; goals that cannot be read go wrong until there are others."""
+        if request.goals is not None:
+            self._goals = request.goals
+        generator = None if request.seed is None else torch.Generator().manual_seed(request.seed)
+        try:
+            if isinstance(self._goals, bytes):
+                self._goals = pickle.loads(self._goals)
+            objective, constraints = self._goals
+            plan = self._planner.plan(
+                self._model,
+                request.state,
+                request.previous,
+                objective=objective,
+                constraints=constraints,
+                generator=generator,
+            )
+        except Exception as error:
+            return "error", _portable(error)
+        return "plan", (request.tick, plan)
 
 
 def _portable(error: Exception) -> tuple[Exception, str]:

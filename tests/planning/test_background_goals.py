@@ -1,0 +1,112 @@
+"""Goals of a search beside the loop: they travel, change on the way, and what cannot travel is refused."""
+
+import pickle
+import time
+
+import pytest
+import torch
+
+from latentplan.planning import BackgroundPlanner, CEMPlanner, FunctionModel
+from latentplan.planning.objectives import (
+    action_penalty,
+    at_every_state,
+    goal_term,
+    learned_return,
+    risk,
+    smoothness_penalty,
+)
+
+STATE = torch.tensor([[1.0]])
+CEM = CEMPlanner(action_dim=1, horizon=4, num_samples=16, num_elites=4, num_iterations=2)
+
+
+def dynamics(state, action):
+    return state + action
+
+
+def reward(state, action):
+    return -(state + action).square().sum(dim=1)
+
+
+def to_the_left(state):
+    return state[:, 0] - STATE[0, 0]
+
+
+def refuse():
+    raise ValueError("not here")
+
+
+class Unreadable:
+    """Can be sent, but not be read."""
+
+    def __reduce__(self):
+        return refuse, ()
+
+
+MODEL = FunctionModel(dynamics, reward)
+
+
+def wait_for_plan(background, seconds=60.0):
+    deadline = time.monotonic() + seconds
+    while time.monotonic() < deadline:
+        found = background.poll()
+        if found is not None:
+            return found
+        time.sleep(0.002)
+    raise AssertionError("no plan came")
+
+
+TERMS = (
+    learned_return() + 0.5 * action_penalty(),
+    -1.0 * goal_term(torch.tensor([2.0])) * 2.0 - smoothness_penalty(),
+    goal_term(torch.tensor([2.0]), over="sum", metric="cosine"),
+    risk(learned_return(), num_particles=1),
+)
+
+
+@pytest.mark.parametrize("term", TERMS)
+def test_composed_terms_survive_the_way_to_another_process(term):
+    arrived = pickle.loads(pickle.dumps(term))
+    plans = [
+        CEM.plan(MODEL, STATE, objective=objective, generator=torch.Generator().manual_seed(0))
+        for objective in (term, arrived)
+    ]
+    assert torch.equal(plans[0].actions, plans[1].actions)
+
+
+@pytest.mark.parametrize("worker", ["process", "thread"])
+def test_goals_change_from_the_next_request_on(worker):
+    constraint = at_every_state(to_the_left)
+
+    def expected(**goals):
+        return CEM.plan(MODEL, STATE, generator=torch.Generator().manual_seed(3), **goals).actions
+
+    with BackgroundPlanner(CEM, MODEL, worker=worker) as background:
+        for goals in ({}, {"objective": goal_term(torch.tensor([9.0]))}, {"constraints": [constraint]}, {}):
+            background.set_objective(**goals)
+            for tick in (1, 2):
+                assert background.request(STATE, tick, seed=3)
+                torch.testing.assert_close(wait_for_plan(background)[1].actions, expected(**goals))
+
+
+def test_goals_that_cannot_be_sent_are_refused_and_the_old_ones_stay():
+    with BackgroundPlanner(CEM, MODEL) as background:
+        goal = goal_term(torch.tensor([9.0]))
+        background.set_objective(goal)
+        with pytest.raises(TypeError, match="worker='thread'"):
+            background.set_objective(lambda rollout: rollout.rewards.sum(1))
+        background.request(STATE, 1, seed=3)
+        kept = CEM.plan(MODEL, STATE, objective=goal, generator=torch.Generator().manual_seed(3))
+        torch.testing.assert_close(wait_for_plan(background)[1].actions, kept.actions)
+
+
+def test_goals_that_cannot_be_read_there_fail_until_there_are_others():
+    with BackgroundPlanner(CEM, MODEL) as background:
+        background.set_objective(Unreadable())
+        for tick in (1, 2):
+            background.request(STATE, tick, seed=3)
+            with pytest.raises(ValueError, match="not here"):
+                wait_for_plan(background)
+        background.set_objective()
+        background.request(STATE, 3, seed=3)
+        assert wait_for_plan(background)[0] == 3
