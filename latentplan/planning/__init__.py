@@ -25,6 +25,7 @@ from latentplan.planning.objectives import (
 from latentplan.planning.plan import Plan
 from latentplan.planning.realtime import BackgroundPlanner, PlanBuffer
 from latentplan.planning.schedule import Decision, PlanExecutor, PlanScheduler
+from latentplan.planning.worker import settle
 
 __all__ = [
     "BackgroundPlanner",
@@ -49,6 +50,7 @@ __all__ = [
     "mppi_planner",
     "refit",
     "risk",
+    "settle",
     "smoothness_penalty",
     "terminal_value",
     "uncertainty_penalty",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import multiprocessing
 import pickle
 import signal
@@ -32,6 +33,16 @@ class Request(NamedTuple):
     previous: Plan | None
     seed: int | None
     goals: Goals | bytes | None
+
+
+def settle() -> None:
+    """Keep everything that exists now out of garbage collection, after one last; to be called before a control loop.
+
+    A full collection walks through all that torch and others have imported, a tenth of a second in which no thread runs
+    Python, and comes when enough else has been made. What is made later is collected as ever.
+    """
+    gc.collect()
+    gc.freeze()
 
 
 def start_process() -> tuple[SpawnProcess, Connection]:
@@ -125,8 +136,9 @@ def _serve(connection: Connection) -> None:
         except (AttributeError, ImportError, pickle.UnpicklingError) as error:  # defined where this process cannot see
             connection.send_bytes(pickle.dumps(("error", _portable(error))))
             return
-        connection.send_bytes(pickle.dumps(("ready", None)))
         search = _Search(problem)
+        settle()
+        connection.send_bytes(pickle.dumps(("ready", None)))
         while True:
             connection.send_bytes(pickle.dumps(search(pickle.loads(connection.recv_bytes()))))
     except (EOFError, OSError):

@@ -89,7 +89,10 @@ def run(flags: Flags) -> int:
     print(f"{', '.join([IDLE, *modes])} at {control_hz:g} Hz in turns, {seconds:.0f} s in all", flush=True)
     tallies = {name: Tally() for name in (IDLE, *modes)}
     code = 0
+    from latentplan.planning import settle
+
     with _loaded_agents(flags["--checkpoint"], modes, str(device), 1000.0 * DEADLINE_SHARE / control_hz) as agents:
+        settle()
         try:
             take_turns(agents, frames, control_hz, decisions, block, tallies)
         except KeyboardInterrupt:
