@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import ctypes
 import gc
 import multiprocessing
 import pickle
 import signal
+import sys
 import threading
 import traceback
 from multiprocessing.connection import Connection
@@ -19,6 +21,7 @@ from latentplan.planning.model import State
 from latentplan.planning.plan import Plan
 
 CLOSING_SECONDS = 2.0
+LOCK_ALL_ON_USE = 1 | 2 | 4  # MCL_CURRENT | MCL_FUTURE | MCL_ONFAULT, mlockall(2)
 
 Answer = tuple[str, Any]  # "ready", "plan" with (tick, plan), "error" with (error, where), or "ended"
 Problem = tuple[Any, ...]  # planner, model, objective, constraints
@@ -35,14 +38,21 @@ class Request(NamedTuple):
     goals: Goals | bytes | None
 
 
-def settle() -> None:
-    """Keep everything that exists now out of garbage collection, after one last; to be called before a control loop.
+def settle() -> bool:
+    """Keep away from this process what would stop it for long; to be called before a control loop.
 
-    A full collection walks through all that torch and others have imported, a tenth of a second in which no thread runs
-    Python, and comes when enough else has been made. What is made later is collected as ever.
+    Everything that exists now is taken out of garbage collection, after one last: a full one walks through all that
+    torch and others have imported, a tenth of a second in which no thread runs Python, and comes when enough else has
+    been made. What is made later is collected as ever. Pages of memory stay where they are once they have been used, if
+    the system allows that.
+
+    Returns:
+        Whether the system allows it: on Linux, with the capability or the limit for locked memory.
     """
     gc.collect()
     gc.freeze()
+    lock = getattr(ctypes.CDLL(None), "mlockall", None) if sys.platform == "linux" else None
+    return lock is not None and lock(LOCK_ALL_ON_USE) == 0
 
 
 def start_process() -> tuple[SpawnProcess, Connection]:
