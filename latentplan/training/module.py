@@ -13,7 +13,6 @@ from torch import Tensor
 from latentplan.config import LearningConfig, derive_seed
 from latentplan.models import State, WorldModel
 from latentplan.replay import Batch, Replay
-from latentplan.training.augmentation import rotate
 from latentplan.training.losses import Learned, imagine, imitation_loss, lambda_return, value_loss, world_model_loss
 from latentplan.training.snapshot import Snapshot
 
@@ -63,13 +62,12 @@ class Learner(lightning.LightningModule):
         world_optimizer, _ = self._optimizers()
         behaviour = self._start_behaviour()
         generator = torch.Generator(self.device).manual_seed(derive_seed(self.seed, "update", self.updates))
-        batch, turned = rotate(batch, self.config.rotated_share, generator)
         try:
             learned = world_model_loss(self.model, batch, self.config, generator)
             learned.parts["model_grad_norm"] = self._descend(world_optimizer, learned.loss)
         finally:
             self._finish_behaviour(behaviour)
-        self.replay.refresh(batch.rows[turned:], learned.states.deter[turned:])
+        self.replay.refresh(batch.rows, learned.states.deter)
         self.snapshot.refresh()
         self._waiting = (learned._replace(loss=learned.loss.detach()), batch, generator)
         self.updates += 1

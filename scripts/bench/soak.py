@@ -34,7 +34,7 @@ FLAGS = {
 SETTINGS = ()
 NUM_FRAMES = 250
 WARM_UP_DECISIONS = 5
-DEADLINE_SHARE = 0.3  # of a period, which a search may take; seeing and doubting take as much, the rest is the machine's
+DEADLINE_SHARE = 0.3  # of a period, for a search; seeing and doubting take as much, the rest is the machine's
 PAUSE_SECONDS = 0.2  # between blocks, so that what one agent still searches does not disturb the next
 
 

@@ -16,12 +16,10 @@ class Standalone(Learner):
         return self.own
 
 
-def standalone(tiny, **learning):
+def standalone(tiny):
     torch.manual_seed(0)
     model = WorldModel(tiny("").model, action_dim=1)
-    return Standalone(
-        model, tiny("", learning=learning).learning, 0.9, Replay(24, 1, 16, 1, torch.device("cpu")), seed=0
-    )
+    return Standalone(model, tiny("").learning, 0.9, Replay(24, 1, 16, 1, torch.device("cpu")), seed=0)
 
 
 def test_behaviour_learns_each_batch_from_the_model_as_the_same_batch_left_it(batch, tiny):
@@ -59,10 +57,3 @@ def test_what_fails_in_behaviour_is_raised_in_the_update(batch, tiny):
         learner.model.value_head.mlp.output.bias.fill_(float("nan"))
     with pytest.raises(FloatingPointError, match="not finite"):
         learner.catch_up()
-
-
-def test_beliefs_of_turned_frames_do_not_reach_the_replay(batch, tiny):
-    learner = standalone(tiny, rotated_share=0.5)
-    learner.training_step(batch, 0)
-    refreshed = (learner.replay.deter != 0.0).any(-1)
-    assert refreshed.tolist() == [False] * 12 + [False, *[True] * 5] * 2  # a sequence starts without a belief here
