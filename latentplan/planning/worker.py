@@ -21,7 +21,8 @@ from latentplan.planning.model import State
 from latentplan.planning.plan import Plan
 
 CLOSING_SECONDS = 2.0
-LOCK_ALL_ON_USE = 1 | 2 | 4  # MCL_CURRENT | MCL_FUTURE | MCL_ONFAULT, mlockall(2)
+# MCL_CURRENT | MCL_ONFAULT of mlockall(2); without MCL_FUTURE, under which a limit would let later memory fail.
+LOCK_ON_USE = 1 | 4
 
 Answer = tuple[str, Any]  # "ready", "plan" with (tick, plan), "error" with (error, where), or "ended"
 Problem = tuple[Any, ...]  # planner, model, objective, constraints
@@ -43,8 +44,8 @@ def settle() -> bool:
 
     Everything that exists now is taken out of garbage collection, after one last: a full one walks through all that
     torch and others have imported, a tenth of a second in which no thread runs Python, and comes when enough else has
-    been made. What is made later is collected as ever. Pages of memory stay where they are once they have been used, if
-    the system allows that.
+    been made. What is made later is collected as ever. Pages of the memory there is now stay where they are once they
+    have been used, if the system allows that.
 
     Returns:
         Whether the system allows it: on Linux, with the capability or the limit for locked memory.
@@ -52,7 +53,7 @@ def settle() -> bool:
     gc.collect()
     gc.freeze()
     lock = getattr(ctypes.CDLL(None), "mlockall", None) if sys.platform == "linux" else None
-    return lock is not None and lock(LOCK_ALL_ON_USE) == 0
+    return lock is not None and lock(LOCK_ON_USE) == 0
 
 
 def start_process() -> tuple[SpawnProcess, Connection]:
