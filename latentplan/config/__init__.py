@@ -164,6 +164,7 @@ class CollectionConfig:
         noise_std: Standard deviation of the noise added to the planner's action.
         noise_correlation: Of the planner's and the actor's noise between one decision and the next, in [0, 1).
         noise_share: Share of the rounds with that noise; in the others planner and actor act as they are evaluated.
+        episode_decisions: After how many a collected episode is cut short; None plays on. Evaluations are whole.
         prefill_decisions: Random decisions before learning starts.
         round_decisions: Decisions per epoch: this many are collected, then learned from.
         updates_per_decision: Updates per collected decision (the replay ratio, in updates).
@@ -174,6 +175,7 @@ class CollectionConfig:
     noise_std: float = 0.2
     noise_correlation: float = 0.0
     noise_share: float = 1.0
+    episode_decisions: int | None = None
     prefill_decisions: int = 1000
     round_decisions: int = 250
     updates_per_decision: float = 0.5
@@ -183,7 +185,7 @@ class CollectionConfig:
         one_of(self, behaviour=BEHAVIOURS)
         at_least(self, noise_std=0.0, prefill_decisions=1, round_decisions=1)
         within(self, noise_correlation=(0.0, 0.99), noise_share=(0.0, 1.0))
-        above_zero(self, "updates_per_decision")
+        above_zero(self, "updates_per_decision", "episode_decisions")
 
 
 @dataclass(frozen=True)

@@ -73,6 +73,22 @@ def test_an_end_of_the_task_is_told_from_the_time_limit(make_collector, dot):
     assert (limited.continues == 1.0).all()
 
 
+def test_episodes_cut_short_restart_and_do_not_count_as_ends_of_the_task(make_collector):
+    collector = make_collector(collection={"episode_decisions": 8})
+    first, second = (collector.collect(None, "random", count, counter) for counter, count in enumerate((20, 10)))
+    (rows,), (later,) = first.rows, second.rows
+    assert np.flatnonzero(rows.is_first).tolist() == [0, 9, 18]
+    assert np.flatnonzero(later.is_first).tolist() == [5]  # the third episode goes on through the round's end
+    assert (rows.continues == 1.0).all() and (len(first.episode_returns), len(second.episode_returns)) == (2, 1)
+    assert first.episode_returns == pytest.approx([rows.rewards[:8].sum(), rows.rewards[9:17].sum()], rel=1e-5)
+
+
+def test_evaluations_are_whole_where_collection_is_cut_short(make_collector, tiny):
+    weights = weights_of(tiny(""))
+    cut, whole = make_collector(collection={"episode_decisions": 8}), make_collector()
+    assert cut.evaluate(2, weights=weights) == whole.evaluate(2, weights=weights)
+
+
 def test_beliefs_are_stored_beside_their_frames(make_collector, tiny):
     collector = make_collector()
     (rows,) = collector.collect(weights_of(tiny("")), "actor", 25, 0).rows
