@@ -17,6 +17,7 @@ COMMANDS = {
     "render": "milliseconds per frame and change of the picture in each render quality",
     "decide": "milliseconds per decision of planner and actor",
     "plan": "milliseconds per search beside other planners, on the same model with the same settings",
+    "compile": "milliseconds per search in small models of one's own, stepped and with compile_rollout",
     "ablate": "what each part of a trained planner earns, in paired episodes",
     "zero-shot": "goals that an agent was not trained for, pursued by planner, actor and chance",
     "realtime": "what thinking earns and costs: iterations, control rates, prediction error, re-planning",

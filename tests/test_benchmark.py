@@ -194,6 +194,18 @@ def test_model_steps_of_a_decision_are_those_of_a_warm_search(model):
     assert measure_decisions(ActorAgent(model, CONFIG), batch=1, decisions=2)["model_steps"] == 0
 
 
+def test_compiled_models_are_timed_beside_themselves(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr("torch.compile", lambda function, **_: function)
+    path = tmp_path / "compile.json"
+    sizes = ["--samples", "16", "--horizon", "3", "--iterations", "2", "--plans", "2"]
+    assert benchmark.main(["compile", *sizes, "--json", str(path)]) == 0
+    result = json.loads(path.read_text())
+    assert "16 samples x 3 steps x 2 iterations" in capsys.readouterr().out
+    for row in result["rows"]:
+        assert row["ratio"] == pytest.approx(row["stepped_ms"] / row["compiled_ms"])
+        assert row["largest_difference"] == 0.0 and row["stepped_ms"] > 0.0
+
+
 def test_decide_leaves_planner_settings_to_the_command_line(tmp_path, checkpoint):
     path = tmp_path / "result.json"
     command = ["decide", "--checkpoint", checkpoint, "--decisions", 2, "--device", "cpu", "--json", path]

@@ -6,6 +6,7 @@ Imports torch and einops, and of this project only the settings.
 from latentplan.planning.adapters import CEMTrajectoryOptimizer
 from latentplan.planning.cem import CEMPlanner
 from latentplan.planning.check import check_model
+from latentplan.planning.compiled import compile_rollout
 from latentplan.planning.controller import ModelPredictiveController
 from latentplan.planning.elites import refit
 from latentplan.planning.family import icem_planner, mppi_planner
@@ -44,6 +45,7 @@ __all__ = [
     "action_penalty",
     "at_every_state",
     "check_model",
+    "compile_rollout",
     "goal_term",
     "icem_planner",
     "learned_return",

@@ -1,0 +1,116 @@
+"""`benchmark.py compile`: small models of one's own, stepped by Python and with `compile_rollout`."""
+
+from __future__ import annotations
+
+from statistics import median
+from typing import TYPE_CHECKING, Any
+
+from bench.options import DEVICE_FLAGS, Flags, choose_device, output_path, whole_number
+from bench.report import format_table, number, write_json
+
+if TYPE_CHECKING:
+    import torch
+
+    from latentplan.planning import CEMPlanner, Model
+
+FLAGS = {
+    "--samples": ("N", "candidates per iteration (500)"),
+    "--horizon": ("H", "model steps of each candidate (20)"),
+    "--iterations": ("I", "refits of each search (5)"),
+    "--plans": ("N", "timed searches of each model, taken in turns (30)"),
+    **DEVICE_FLAGS,
+    "--json": ("FILE", "result as JSON"),
+}
+SETTINGS: tuple[str, ...] = ()
+WARM_UP_PLANS = 3  # torch compiles for the first size, then once more for sizes that vary
+
+
+def run(flags: Flags) -> int:
+    """Time searches in both versions of each model, in turns, and print how they compare."""
+    plans, json_path = whole_number(flags, "--plans", 30), output_path(flags, "--json")
+    defaults = {"samples": 500, "horizon": 20, "iterations": 5}
+    sizes = {name: whole_number(flags, f"--{name}", default) for name, default in defaults.items()}
+    device = choose_device(flags)
+    from bench.machine import describe_machine
+    from latentplan.planning import CEMPlanner
+
+    planner = CEMPlanner(
+        action_dim=1,
+        horizon=sizes["horizon"],
+        num_samples=sizes["samples"],
+        num_elites=max(1, sizes["samples"] // 10),
+        num_iterations=sizes["iterations"],
+    )
+    rows = [
+        {"model": name, **measure_model(model, state.to(device), planner, plans)}
+        for name, (model, state) in own_models(device).items()
+    ]
+    machine = describe_machine(device)
+    extent = f"{sizes['samples']:,} samples x {sizes['horizon']} steps x {sizes['iterations']} iterations"
+    print(f"{machine['name']} ({device.type}, {machine['threads']} threads), {extent}")
+    header = ["model", "stepped, ms p50", "compiled", "ratio", "compilation, s", "actions differ by"]
+    keys = (("stepped_ms", 1), ("compiled_ms", 1), ("ratio", 2), ("compilation_s", 1), ("largest_difference", 7))
+    print(format_table(header, [[row["model"], *(number(row[key], digits) for key, digits in keys)] for row in rows]))
+    write_json(json_path, {**sizes, "plans": plans, "machine": machine, "rows": rows})
+    return 0
+
+
+def own_models(device: torch.device) -> dict[str, tuple[Model, torch.Tensor]]:
+    """A model of equations and one that is a small network, each with a state (1, n) to plan from."""
+    import torch
+
+    from latentplan.planning import FunctionModel
+
+    def swing(state: torch.Tensor, action: torch.Tensor) -> torch.Tensor:
+        angle, speed = state.unbind(dim=1)
+        speed = (speed + 0.05 * (15.0 * torch.sin(angle) + 6.0 * action[:, 0])).clamp(-8.0, 8.0)
+        return torch.stack([angle + 0.05 * speed, speed], dim=1)
+
+    def upright(state: torch.Tensor, action: torch.Tensor) -> torch.Tensor:
+        angle, speed = torch.remainder(state[:, 0] + torch.pi, 2 * torch.pi) - torch.pi, state[:, 1]
+        return -(angle.square() + 0.1 * speed.square() + 0.004 * action[:, 0].square())
+
+    torch.manual_seed(0)
+    layers = [torch.nn.Linear(5, 128), torch.nn.SiLU(), torch.nn.Linear(128, 128), torch.nn.SiLU()]
+    network = torch.nn.Sequential(*layers, torch.nn.Linear(128, 4)).to(device)
+    return {
+        "pendulum's equations": (FunctionModel(swing, upright), torch.tensor([[3.0, 0.0]])),
+        "network of 2 x 128": (
+            FunctionModel(
+                lambda state, action: state + network(torch.cat([state, action], dim=1)),
+                lambda state, action: -state.square().sum(dim=1),
+            ),
+            torch.ones(1, 4),
+        ),
+    }
+
+
+def measure_model(model: Model, state: torch.Tensor, planner: CEMPlanner, plans: int) -> dict[str, Any]:
+    """Median milliseconds of a search in the model as it is and compiled, from the same noise.
+
+    Returns:
+        `stepped_ms`, `compiled_ms`, their `ratio`, `compilation_s` (what the first searches took beyond the later ones)
+        and `largest_difference` of the sequences that the two chose.
+    """
+    import torch
+
+    from bench.machine import now
+    from latentplan.planning import compile_rollout
+
+    def search(arm: Model, seed: int) -> tuple[float, torch.Tensor]:
+        generator = torch.Generator(state.device).manual_seed(seed)
+        started = now(state.device)
+        actions = planner.plan(arm, state, generator=generator).actions
+        return now(state.device) - started, actions
+
+    arms = (model, compile_rollout(model))
+    first = [sum(search(arm, seed)[0] for seed in range(WARM_UP_PLANS)) for arm in arms]
+    laps = [[search(arm, seed) for arm in arms] for seed in range(plans)]
+    stepped, compiled = (median(lap[index][0] for lap in laps) for index in range(2))
+    return {
+        "stepped_ms": 1000.0 * stepped,
+        "compiled_ms": 1000.0 * compiled,
+        "ratio": stepped / compiled,
+        "compilation_s": first[1] - WARM_UP_PLANS * compiled,
+        "largest_difference": max(float((lap[0][1] - lap[1][1]).abs().max()) for lap in laps),
+    }
