@@ -100,6 +100,7 @@ class LearningConfig:
         batch_size: Sequences per update.
         sequence_length: Decisions per sequence.
         random_shift: Pixels by which each replayed sequence of frames is moved at most, in either direction.
+        turned_share: Of the replayed sequences, turned by quarter turns; for a body to which every side is the same.
         model_learning_rate: Adam step of encoder, dynamics, decoder, reward and continue heads.
         behaviour_learning_rate: Adam step of actor and value.
         max_grad_norm: Gradient norm at which each optimizer clips.
@@ -123,6 +124,7 @@ class LearningConfig:
     batch_size: int = 16
     sequence_length: int = 16
     random_shift: int = 0
+    turned_share: float = 0.0
     model_learning_rate: float = 1e-3
     behaviour_learning_rate: float = 3e-4
     max_grad_norm: float = 100.0
@@ -150,7 +152,7 @@ class LearningConfig:
         at_least(self, overshooting_scale=0.0, reward_scale=0.0, replay_value_scale=0.0, entropy_scale=0.0)
         at_least(self, imitation_scale=0.0, random_shift=0)
         above_zero(self, "model_learning_rate", "behaviour_learning_rate", "max_grad_norm", "target_rate")
-        within(self, lambda_=(0.0, 1.0), target_rate=(0.0, 1.0))
+        within(self, lambda_=(0.0, 1.0), turned_share=(0.0, 1.0), target_rate=(0.0, 1.0))
         if self.discount is not None and not 0.0 < self.discount <= 1.0:
             raise ValueError(f"discount must lie in (0, 1], got {self.discount}")
 

@@ -1,9 +1,11 @@
-"""Replayed frames, moved a little so that few pictures teach more."""
+"""Replayed frames, moved a little or turned so that few pictures teach more."""
 
 from __future__ import annotations
 
 import torch
 from torch import Tensor
+
+from latentplan.replay import Batch
 
 
 def random_shift(frames: Tensor, pixels: int, generator: torch.Generator) -> Tensor:
@@ -31,3 +33,28 @@ def random_shift(frames: Tensor, pixels: int, generator: torch.Generator) -> Ten
         for sequence, (down, right) in zip(frames, offsets, strict=True)
     ]
     return torch.stack(moved)
+
+
+def quarter_turns(batch: Batch, share: float, generator: torch.Generator) -> tuple[Batch, Tensor]:
+    """Turn the pictures of some sequences by a quarter, a half or three quarters, and forget what came before them.
+
+    For bodies seen from above, to which every side is the same: what is learned of one place holds for four.
+
+    Args:
+        batch: Sequences; their pictures are square.
+        share: Of the sequences that are turned, each as a whole, in [0, 1].
+        generator: Where they are drawn from.
+
+    Returns:
+        The batch, with a belief of zeros where it is turned, and which sequences are as they were, bool (batch,).
+    """
+    size, device = len(batch.frames), batch.frames.device
+    if share == 0.0:
+        return batch, torch.ones(size, dtype=torch.bool, device=device)
+    turns = torch.randint(1, 4, (size,), generator=generator, device=device)
+    is_turned = torch.rand(size, generator=generator, device=device) < share
+    amounts = (turns * is_turned).tolist()
+    frames = torch.stack(
+        [torch.rot90(each, amount, (1, 2)) for each, amount in zip(batch.frames, amounts, strict=True)]
+    )
+    return batch._replace(frames=frames, deter=batch.deter * ~is_turned[:, None]), ~is_turned

@@ -13,6 +13,7 @@ from torch import Tensor
 from latentplan.config import LearningConfig, derive_seed
 from latentplan.models import State, WorldModel
 from latentplan.replay import Batch, Replay
+from latentplan.training.augmentation import quarter_turns
 from latentplan.training.losses import Learned, imagine, imitation_loss, lambda_return, value_loss, world_model_loss
 from latentplan.training.snapshot import Snapshot
 
@@ -62,12 +63,13 @@ class Learner(lightning.LightningModule):
         world_optimizer, _ = self._optimizers()
         behaviour = self._start_behaviour()
         generator = torch.Generator(self.device).manual_seed(derive_seed(self.seed, "update", self.updates))
+        batch, is_same = quarter_turns(batch, self.config.turned_share, generator)
         try:
             learned = world_model_loss(self.model, batch, self.config, generator)
             learned.parts["model_grad_norm"] = self._descend(world_optimizer, learned.loss)
         finally:
             self._finish_behaviour(behaviour)
-        self.replay.refresh(batch.rows, learned.states.deter)
+        self.replay.refresh(batch.rows[is_same], learned.states.deter[is_same])
         self.snapshot.refresh()
         self._waiting = (learned._replace(loss=learned.loss.detach()), batch, generator)
         self.updates += 1

@@ -1,10 +1,10 @@
-"""Random shifts: one move per sequence, of bounded size, borders repeated."""
+"""Random shifts and quarter turns: one per sequence, as a whole."""
 
 import pytest
 import torch
 
 from latentplan.models import WorldModel
-from latentplan.training.augmentation import random_shift
+from latentplan.training.augmentation import quarter_turns, random_shift
 from latentplan.training.losses import world_model_loss
 
 
@@ -57,3 +57,34 @@ def test_the_encoder_sees_moved_frames_and_the_decoder_paints_them_unmoved(batch
     moved = random_shift(batch.frames, 4, torch.Generator().manual_seed(3))
     assert torch.equal(seen[0], moved.flatten(0, 1)) and not torch.equal(moved, batch.frames)
     assert torch.equal(painted[0], batch.frames.flatten(0, 1))
+
+
+def _turned(batch, share, seed=0):
+    return quarter_turns(batch, share, torch.Generator().manual_seed(seed))
+
+
+def test_sequences_turn_as_a_whole_and_forget_their_belief(batch):
+    batch = batch._replace(deter=torch.ones_like(batch.deter))
+    seen = set()
+    for seed in range(8):
+        turned, is_same = _turned(batch, 0.5, seed)
+        for index, same in enumerate(is_same.tolist()):
+            fitting = [
+                amount
+                for amount in range(4)
+                if torch.equal(turned.frames[index], torch.rot90(batch.frames[index], amount, (1, 2)))
+            ]
+            assert len(fitting) == 1 and (fitting[0] == 0) == same
+            assert (turned.deter[index] == float(same)).all()
+            seen.add(fitting[0])
+        others = turned._replace(frames=batch.frames, deter=batch.deter)
+        assert all(torch.equal(one, other) for one, other in zip(others, batch, strict=True))
+    assert seen == {0, 1, 2, 3}
+
+
+def test_a_share_of_nothing_turns_nothing_and_draws_nothing(batch):
+    generator = torch.Generator().manual_seed(1)
+    turned, is_same = quarter_turns(batch, 0.0, generator)
+    assert turned is batch and is_same.all()
+    assert generator.get_state().equal(torch.Generator().manual_seed(1).get_state())
+    assert not _turned(batch, 1.0)[1].any()

@@ -16,10 +16,11 @@ class Standalone(Learner):
         return self.own
 
 
-def standalone(tiny):
+def standalone(tiny, **learning):
     torch.manual_seed(0)
-    model = WorldModel(tiny("").model, action_dim=1)
-    return Standalone(model, tiny("").learning, 0.9, Replay(24, 1, 16, 1, torch.device("cpu")), seed=0)
+    config = tiny("", learning=learning)
+    model = WorldModel(config.model, action_dim=1)
+    return Standalone(model, config.learning, 0.9, Replay(24, 1, 16, 1, torch.device("cpu")), seed=0)
 
 
 def test_behaviour_learns_each_batch_from_the_model_as_the_same_batch_left_it(batch, tiny):
@@ -57,3 +58,10 @@ def test_what_fails_in_behaviour_is_raised_in_the_update(batch, tiny):
         learner.model.value_head.mlp.output.bias.fill_(float("nan"))
     with pytest.raises(FloatingPointError, match="not finite"):
         learner.catch_up()
+
+
+@pytest.mark.parametrize("share", [0.0, 1.0])
+def test_beliefs_of_turned_sequences_are_not_kept(batch, tiny, share):
+    learner = standalone(tiny, turned_share=share)
+    learner.training_step(batch, 0)
+    assert (learner.replay.deter[batch.rows] == 0.0).all() == (share == 1.0)
