@@ -63,8 +63,8 @@ class Learner(lightning.LightningModule):
         world_optimizer, _ = self._optimizers()
         behaviour = self._start_behaviour()
         generator = torch.Generator(self.device).manual_seed(derive_seed(self.seed, "update", self.updates))
-        batch, is_same = quarter_turns(batch, self.config.turned_share, generator)
         try:
+            batch, is_same = quarter_turns(batch, self.config.turned_share, generator)
             learned = world_model_loss(self.model, batch, self.config, generator)
             learned.parts["model_grad_norm"] = self._descend(world_optimizer, learned.loss)
         finally:
