@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv, VectorEnv
+from gymnasium.wrappers import TimeLimit
 
 from latentplan.config import EnvConfig
 from latentplan.envs.suite import SuiteEnv
@@ -40,6 +41,7 @@ def make_vector_env(
     num_envs: int,
     seed: int | None,
     make_env: Callable[[], gymnasium.Env[Any, Any]] | None = None,
+    episode_decisions: int | None = None,
 ) -> VectorEnv[np.ndarray, np.ndarray, Any]:
     """Several environments behind one `step`, each in a process of its own if there is more than one.
 
@@ -53,6 +55,7 @@ def make_vector_env(
         num_envs: How many.
         seed: Each environment's random stream derives from this and its index; None draws from the system.
         make_env: A user's factory, called in each process in place of the suite; it must be picklable.
+        episode_decisions: After how many an episode is truncated; None leaves its length to the task.
 
     Returns:
         Observations uint8 (env, 64, 64, 3), rewards (env,), terminated and truncated (env,).
@@ -60,7 +63,7 @@ def make_vector_env(
     Raises:
         UserError: The environment cannot be built.
     """
-    builders = [_Builder(config, _derived_seed(seed, index), make_env) for index in range(num_envs)]
+    builders = [_Builder(config, _derived_seed(seed, index), make_env, episode_decisions) for index in range(num_envs)]
     if num_envs == 1:
         return SyncVectorEnv(builders, autoreset_mode=AutoresetMode.DISABLED)
     with single_threaded_children():
@@ -74,10 +77,12 @@ class _Builder:
     config: EnvConfig
     seed: int | None
     factory: Callable[[], gymnasium.Env[Any, Any]] | None
+    episode_decisions: int | None
 
     def __call__(self) -> gymnasium.Env[np.ndarray, np.ndarray]:
         build = make_env if self.factory is None else make_from(self.factory)
-        return build(self.config, self.seed)
+        env = build(self.config, self.seed)
+        return env if self.episode_decisions is None else TimeLimit(env, self.episode_decisions)
 
 
 def _derived_seed(seed: int | None, index: int) -> int | None:

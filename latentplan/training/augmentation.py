@@ -35,7 +35,7 @@ def random_shift(frames: Tensor, pixels: int, generator: torch.Generator) -> Ten
     return torch.stack(moved)
 
 
-def quarter_turns(batch: Batch, share: float, generator: torch.Generator) -> tuple[Batch, Tensor]:
+def quarter_turns(batch: Batch, share: float, generator: torch.Generator) -> tuple[Batch, Tensor | slice]:
     """Turn the pictures of some sequences by a quarter, a half or three quarters, and forget what came before them.
 
     For bodies seen from above, to which every side is the same: what is learned of one place holds for four.
@@ -46,11 +46,12 @@ def quarter_turns(batch: Batch, share: float, generator: torch.Generator) -> tup
         generator: Where they are drawn from.
 
     Returns:
-        The batch, with a belief of zeros where it is turned, and which sequences are as they were, bool (batch,).
+        The batch, with a belief of zeros where it is turned, and an index of the sequences that are as they were: bool
+        (batch,), or a whole slice where none is turned.
     """
-    size, device = len(batch.frames), batch.frames.device
     if share == 0.0:
-        return batch, torch.ones(size, dtype=torch.bool, device=device)
+        return batch, slice(None)
+    size, device = len(batch.frames), batch.frames.device
     turns = torch.randint(1, 4, (size,), generator=generator, device=device)
     is_turned = torch.rand(size, generator=generator, device=device) < share
     amounts = (turns * is_turned).tolist()

@@ -75,7 +75,9 @@ class Collector:
     def __init__(self, config: Config, make_user_env: EnvFactory | None, device: str) -> None:
         self.config = config
         self._make_user_env = make_user_env
-        self.envs = make_vector_env(config.env, config.env.num_envs, config.run.seed, make_user_env)
+        self.envs = make_vector_env(
+            config.env, config.env.num_envs, config.run.seed, make_user_env, config.collection.episode_decisions
+        )
         build = make_env if make_user_env is None else make_from(make_user_env)
         self._eval_env = build(config.env, 0)
         action_dim = int(np.prod(self.envs.single_action_space.shape or ()))
@@ -101,7 +103,6 @@ class Collector:
         self._labels = np.zeros((config.env.num_envs, len(self.labels)), np.float32)
         self._ended = np.ones(config.env.num_envs, dtype=bool)
         self._returns = np.zeros(config.env.num_envs)
-        self._lengths = np.zeros(config.env.num_envs, dtype=int)
         self._acting: object = None
 
     def describe(self) -> Description:
@@ -186,7 +187,7 @@ class Collector:
             agent.reset(self._ended)
         if self.labels:
             self._labels[self._ended] = np.asarray(info["labels"])[self._ended]
-        self._returns[self._ended], self._lengths[self._ended] = 0.0, 0
+        self._returns[self._ended] = 0.0
 
     def _step(self, agent: ModelAgent | RandomAgent, log: _Log) -> None:
         assert self._frames is not None
@@ -198,9 +199,7 @@ class Collector:
         self._frames, rewards, terminated, truncated, info = self.envs.step(actions)
         if not np.isfinite(rewards).all():
             raise UserError(f"the environment gave rewards that are not finite: {rewards.tolist()}")
-        self._lengths += 1
-        limit = self.config.collection.episode_decisions
-        self._ended = terminated | truncated | (limit is not None and self._lengths >= limit)
+        self._ended = terminated | truncated
         self._returns += rewards
         if self.labels:
             self._labels = np.array(info["labels"], np.float32)

@@ -64,12 +64,12 @@ class Learner(lightning.LightningModule):
         behaviour = self._start_behaviour()
         generator = torch.Generator(self.device).manual_seed(derive_seed(self.seed, "update", self.updates))
         try:
-            batch, is_same = quarter_turns(batch, self.config.turned_share, generator)
+            batch, unturned = quarter_turns(batch, self.config.turned_share, generator)
             learned = world_model_loss(self.model, batch, self.config, generator)
             learned.parts["model_grad_norm"] = self._descend(world_optimizer, learned.loss)
         finally:
             self._finish_behaviour(behaviour)
-        self.replay.refresh(batch.rows[is_same], learned.states.deter[is_same])
+        self.replay.refresh(batch.rows[unturned], learned.states.deter[unturned])
         self.snapshot.refresh()
         self._waiting = (learned._replace(loss=learned.loss.detach()), batch, generator)
         self.updates += 1

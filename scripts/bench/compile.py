@@ -5,7 +5,7 @@ from __future__ import annotations
 from statistics import median
 from typing import TYPE_CHECKING, Any
 
-from bench.options import DEVICE_FLAGS, Flags, choose_device, output_path, whole_number
+from bench.options import DEVICE_FLAGS, SEARCH_FLAGS, Flags, choose_device, output_path, search_sizes, whole_number
 from bench.report import format_table, number, write_json
 
 if TYPE_CHECKING:
@@ -14,22 +14,19 @@ if TYPE_CHECKING:
     from latentplan.planning import CEMPlanner, Model
 
 FLAGS = {
-    "--samples": ("N", "candidates per iteration (500)"),
-    "--horizon": ("H", "model steps of each candidate (20)"),
-    "--iterations": ("I", "refits of each search (5)"),
+    **SEARCH_FLAGS,
     "--plans": ("N", "timed searches of each model, taken in turns (30)"),
     **DEVICE_FLAGS,
     "--json": ("FILE", "result as JSON"),
 }
-SETTINGS: tuple[str, ...] = ()
+SETTINGS = ()
 WARM_UP_PLANS = 3  # torch compiles for the first size, then once more for sizes that vary
 
 
 def run(flags: Flags) -> int:
     """Time searches in both versions of each model, in turns, and print how they compare."""
     plans, json_path = whole_number(flags, "--plans", 30), output_path(flags, "--json")
-    defaults = {"samples": 500, "horizon": 20, "iterations": 5}
-    sizes = {name: whole_number(flags, f"--{name}", default) for name, default in defaults.items()}
+    sizes = search_sizes(flags)
     device = choose_device(flags)
     from bench.machine import describe_machine
     from latentplan.planning import CEMPlanner

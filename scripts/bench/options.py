@@ -26,6 +26,12 @@ COMPOSE_FLAGS = {
     "--action-dim": ("N", "size of the action; unless given, the simulator is asked"),
 }
 
+SEARCH_FLAGS = {
+    "--samples": ("N", "candidates per iteration (500)"),
+    "--horizon": ("H", "model steps of each candidate (20)"),
+    "--iterations": ("I", "refits of each search (5)"),
+}
+
 
 def whole_number(flags: Flags, name: str, default: int, least: int = 1) -> int:
     """The whole number that a flag gives.
@@ -37,6 +43,16 @@ def whole_number(flags: Flags, name: str, default: int, least: int = 1) -> int:
     if not text.isascii() or not text.isdigit() or int(text) < least:
         raise UserError(f"{name} must be a whole number of at least {least}, got {text!r}")
     return int(text)
+
+
+def search_sizes(flags: Flags) -> dict[str, int]:
+    """Samples, horizon and iterations of a search, by `SEARCH_FLAGS`.
+
+    Raises:
+        UserError: One of them is no whole number, or too small.
+    """
+    defaults = (("samples", 500, 2), ("horizon", 20, 1), ("iterations", 5, 1))
+    return {name: whole_number(flags, f"--{name}", default, least=least) for name, default, least in defaults}
 
 
 def positive_number(flags: Flags, name: str, default: float) -> float:

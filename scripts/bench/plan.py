@@ -10,11 +10,13 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 from bench.options import (
     COMPOSE_FLAGS,
     DEVICE_FLAGS,
+    SEARCH_FLAGS,
     Flags,
     action_size,
     choose_device,
     composed_config,
     output_path,
+    search_sizes,
     whole_number,
     words,
 )
@@ -29,9 +31,7 @@ if TYPE_CHECKING:
 
 FLAGS = {
     **COMPOSE_FLAGS,
-    "--samples": ("N", "candidates per iteration (500)"),
-    "--horizon": ("H", "model steps of each candidate (20)"),
-    "--iterations": ("I", "refits of each search (5)"),
+    **SEARCH_FLAGS,
     "--peers": ("P,P", f"any of {','.join(PEERS)} (all), or none; installed on first use, out of the project's way"),
     "--plans": ("N", "timed searches of each planner, taken in turns (30)"),
     **DEVICE_FLAGS,
@@ -75,10 +75,7 @@ class Comparison(NamedTuple):
 def run(flags: Flags) -> int:
     """Time every planner in turns and print how they compare."""
     plans, names = whole_number(flags, "--plans", 30), _peer_names(flags)
-    sizes = {
-        name: whole_number(flags, f"--{name}", default, least=least)
-        for name, default, least in (("samples", 500, 2), ("horizon", 20, 1), ("iterations", 5, 1))
-    }
+    sizes = search_sizes(flags)
     json_path, plot_path = output_path(flags, "--json"), output_path(flags, "--scaling")
     config = composed_config(flags)
     device = choose_device(flags)

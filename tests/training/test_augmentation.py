@@ -84,7 +84,7 @@ def test_sequences_turn_as_a_whole_and_forget_their_belief(batch):
 
 def test_a_share_of_nothing_turns_nothing_and_draws_nothing(batch):
     generator = torch.Generator().manual_seed(1)
-    turned, is_same = quarter_turns(batch, 0.0, generator)
-    assert turned is batch and is_same.all()
+    turned, unturned = quarter_turns(batch, 0.0, generator)
+    assert turned is batch and unturned == slice(None)
     assert generator.get_state().equal(torch.Generator().manual_seed(1).get_state())
     assert not _turned(batch, 1.0)[1].any()
