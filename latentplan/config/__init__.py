@@ -119,7 +119,6 @@ class LearningConfig:
         entropy_scale: Weight of the actor's entropy, in units of the normalised return.
         imitation_scale: Weight of the actor's KL to the plans it was collected with; 0 leaves it out.
         target_rate: Share of the value network that its slow target takes over at each update.
-        annealed_share: Of the run, at its end, in which both learning rates and `entropy_scale` fall to a tenth.
     """
 
     batch_size: int = 16
@@ -144,7 +143,6 @@ class LearningConfig:
     entropy_scale: float = 3e-4
     imitation_scale: float = 0.0
     target_rate: float = 0.02
-    annealed_share: float = 0.0
 
     def __post_init__(self) -> None:
         at_least(
@@ -154,7 +152,7 @@ class LearningConfig:
         at_least(self, overshooting_scale=0.0, reward_scale=0.0, replay_value_scale=0.0, entropy_scale=0.0)
         at_least(self, imitation_scale=0.0, random_shift=0)
         above_zero(self, "model_learning_rate", "behaviour_learning_rate", "max_grad_norm", "target_rate")
-        within(self, lambda_=(0.0, 1.0), turned_share=(0.0, 1.0), target_rate=(0.0, 1.0), annealed_share=(0.0, 1.0))
+        within(self, lambda_=(0.0, 1.0), turned_share=(0.0, 1.0), target_rate=(0.0, 1.0))
         if self.discount is not None and not 0.0 < self.discount <= 1.0:
             raise ValueError(f"discount must lie in (0, 1], got {self.discount}")
 

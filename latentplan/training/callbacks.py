@@ -25,8 +25,6 @@ if TYPE_CHECKING:
     from latentplan.training.module import Learner
     from latentplan.training.progress import Progress
 
-LAST_FACTOR = 0.1  # of the rates, where a run that is annealed ends
-
 COLUMNS = (
     *("env_frames", "decisions", "updates", "minutes", "episode_return"),
     *("planner_return", "actor_return", "planner_minus_actor"),
@@ -123,22 +121,6 @@ def turn(settings: CollectionConfig, rounds: int) -> tuple[str, bool]:
         own, who = divmod(rounds, 2)
         behaviour = ("planner", "actor")[who]
     return behaviour, int((own + 1) * settings.noise_share) > int(own * settings.noise_share)
-
-
-class Anneal(lightning.Callback):
-    """Learns more slowly, and towards less entropy, at the end of a run."""
-
-    def __init__(self, config: Config, state: RunState) -> None:
-        self.config, self.state = config, state
-
-    def on_train_epoch_start(self, trainer: lightning.Trainer, learner: Learner) -> None:  # type: ignore[override]
-        """Set what this epoch learns at."""
-        learner.anneal(annealing(self.state.spent(self.config.run), self.config.learning.annealed_share))
-
-
-def annealing(spent: float, share: float) -> float:
-    """The factor on rates when `spent` of a run is over: 1, and falling geometrically to 0.1 over its last `share`."""
-    return 1.0 if share == 0.0 else LAST_FACTOR ** min(max((spent - 1.0 + share) / share, 0.0), 1.0)
 
 
 class Record(lightning.Callback):

@@ -44,7 +44,6 @@ class Learner(lightning.LightningModule):
         self.target_value = copy.deepcopy(model.value_head).requires_grad_(False)
         self.register_buffer("return_range", torch.zeros(()))
         self.updates = 0
-        self.annealing = 1.0
         self.metrics: dict[str, Tensor] = {}
         self._thread = ThreadPoolExecutor(1, thread_name_prefix="behaviour")
         self._waiting: tuple[Learned, Batch, torch.Generator] | None = None
@@ -75,14 +74,6 @@ class Learner(lightning.LightningModule):
         self._waiting = (learned._replace(loss=learned.loss.detach()), batch, generator)
         self.updates += 1
         self.metrics |= learned.parts
-
-    def anneal(self, factor: float) -> None:
-        """From now on learn at `factor` times the configured rates and weight of the entropy, 1 at first."""
-        self.annealing = factor
-        rates = (self.config.model_learning_rate, self.config.behaviour_learning_rate)
-        for optimizer, rate in zip(self._optimizers(), rates, strict=True):
-            for group in optimizer.param_groups:
-                group["lr"] = factor * rate
 
     @cached_property
     def snapshot(self) -> Snapshot:
@@ -139,8 +130,7 @@ class Learner(lightning.LightningModule):
         returns = lambda_return(dream.rewards, discounts, values, config.lambda_)
         reach = torch.cat([torch.ones_like(discounts[:1]), discounts[:-1]]).cumprod(0).detach()
         scale = self._return_scale(returns.detach())
-        entropy_scale = self.annealing * config.entropy_scale
-        actor = -(reach * (returns / scale + entropy_scale * dream.entropies)).mean()
+        actor = -(reach * (returns / scale + config.entropy_scale * dream.entropies)).mean()
         with self.model.trunk_precision(cache=False):
             imagined = value_loss(self.model.value_head, dream.features[:-1], returns, reach)
             replayed = self._replayed_value_loss(learned, batch)

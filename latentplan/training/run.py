@@ -21,7 +21,7 @@ from latentplan.config import Config, RunConfig, UserError, derive_seed
 from latentplan.envs import default_task
 from latentplan.models import WorldModel
 from latentplan.replay import Replay
-from latentplan.training.callbacks import Anneal, Experience, Record, Save, Stop
+from latentplan.training.callbacks import Experience, Record, Save, Stop
 from latentplan.training.collector import Description, EnvFactory
 from latentplan.training.data import ReplayBatches, ReplayData
 from latentplan.training.module import Learner
@@ -175,7 +175,7 @@ class _Run:
         save = Save(self.folder, config, experience, self.state, self._facts())
         stop = Stop(config, self.state)
         record = Record(self.folder / "metrics.csv", self.state, experience, self.console)
-        trainer = self._trainer([experience, Anneal(config, self.state), record, save, stop])
+        trainer = self._trainer([experience, record, save, stop])
         length = max(1, round(config.collection.round_decisions * config.collection.updates_per_decision))
         batches = ReplayBatches(self.replay, config.learning, self.state, config.run.seed, length)
         if not stop.is_spent():

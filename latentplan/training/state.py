@@ -9,7 +9,7 @@ from typing import Any
 
 import torch
 
-from latentplan.config import RunConfig, UserError
+from latentplan.config import UserError
 from latentplan.replay import Replay
 
 STATE_FILE = "state.pt"
@@ -45,11 +45,6 @@ class RunState:
     def minutes(self) -> float:
         """Wall clock of the run, over all its processes."""
         return self.earlier_minutes + (time.monotonic() - self.started) / 60.0
-
-    def spent(self, budget: RunConfig) -> float:
-        """The share of a run's frames or minutes that is used up, of the one of which more is: from 0 on."""
-        frames = self.env_frames / budget.frames if budget.frames else 0.0
-        return max(frames, self.minutes / budget.minutes if budget.minutes else 0.0)
 
     def to_dict(self) -> dict[str, Any]:
         """What is saved: everything but this process's own clock and interruption."""

@@ -65,24 +65,3 @@ def test_beliefs_of_turned_sequences_are_not_kept(batch, tiny, share):
     learner = standalone(tiny, turned_share=share)
     learner.training_step(batch, 0)
     assert (learner.replay.deter[batch.rows] == 0.0).all() == (share == 1.0)
-
-
-def test_annealing_slows_both_optimizers_and_can_be_taken_back(tiny):
-    learner = standalone(tiny, model_learning_rate=1e-3, behaviour_learning_rate=4e-4)
-    for factor in (0.5, 1.0):
-        learner.anneal(factor)
-        rates = [[group["lr"] for group in optimizer.param_groups] for optimizer in learner.optimizers()]
-        assert rates == [[factor * 1e-3], [factor * 4e-4]]
-
-
-def test_an_annealed_learner_is_one_with_smaller_settings(batch, tiny):
-    def learned(factor, **settings):
-        learner = standalone(tiny, **settings)
-        learner.anneal(factor)
-        learner.training_step(batch, 0)
-        learner.catch_up()
-        return {name: value.item() for name, value in learner.metrics.items()}
-
-    whole = {"model_learning_rate": 2e-3, "behaviour_learning_rate": 4e-4, "entropy_scale": 2.0}
-    assert learned(0.5, **whole) == learned(1.0, **{name: value / 2 for name, value in whole.items()})
-    assert learned(0.5, **whole) != learned(0.5, **whole | {"entropy_scale": 1.0})

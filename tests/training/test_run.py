@@ -11,7 +11,7 @@ import torch
 from latentplan.checkpoint import load_agent, read_info
 from latentplan.config import UserError
 from latentplan.training import resume, train
-from latentplan.training.callbacks import COLUMNS, annealing
+from latentplan.training.callbacks import COLUMNS
 from latentplan.training.run import INTERRUPTED
 
 
@@ -158,25 +158,6 @@ def test_an_interrupted_run_is_saved_and_goes_on_where_it_was(tiny, dot, tmp_pat
     assert after["run"]["env_frames"] == 90
     updates = [int(row["updates"]) for row in epochs_of(stopped.run_dir)]
     assert updates == sorted(set(updates))
-
-
-@pytest.mark.parametrize("share", [0.25, 0.5, 1.0])
-def test_annealing_begins_where_it_should_and_ends_at_a_tenth(share):
-    assert annealing(0.0, share) == annealing(1.0 - share, share) == 1.0
-    assert annealing(1.0 - share / 2, share) == pytest.approx(0.1**0.5)
-    assert annealing(1.0, share) == annealing(1.2, share) == pytest.approx(0.1)
-
-
-def test_without_a_share_nothing_is_annealed():
-    assert {annealing(spent, 0.0) for spent in (0.0, 0.5, 1.0, 2.0)} == {1.0}
-
-
-def test_a_run_ends_at_annealed_rates(tiny, dot, tmp_path):
-    config = tiny(tmp_path / "run", learning={"annealed_share": 0.5})
-    saved = saved_state(train(config, dot).run_dir)["optimizers"]
-    rates = (config.learning.model_learning_rate, config.learning.behaviour_learning_rate)
-    for optimizer, rate in zip(saved, rates, strict=True):
-        assert 0.1 * rate <= optimizer["param_groups"][0]["lr"] < 0.5 * rate
 
 
 def test_a_finished_run_can_be_extended(tiny, dot, tmp_path):
