@@ -10,8 +10,9 @@ import dataclasses
 from dataclasses import dataclass, field
 from typing import Any
 
-from latentplan.config.checks import UserError, above_zero, at_least, derive_seed, one_of, within
+from latentplan.config.checks import UserError, above_zero, at_least, derive_seed, one_of
 from latentplan.config.distill import DistillConfig
+from latentplan.config.learning import CollectionConfig, LearningConfig
 from latentplan.config.planner import PlannerConfig
 
 __all__ = [
@@ -33,7 +34,6 @@ __all__ = [
 
 LATENT_DIM = 32
 RENDER_QUALITIES = ("exact", "fast", "fastest")
-BEHAVIOURS = ("planner", "actor", "both")
 DEVICES = ("auto", "cpu", "cuda")
 
 
@@ -90,104 +90,6 @@ class ModelConfig:
         at_least(self, latent_dim=1, deter_dim=1, hidden_dim=1, decoder_channels=1, num_bins=3)
         if not 1 <= len(self.encoder_channels) <= 5 or min(self.encoder_channels) < 1:
             raise ValueError(f"encoder_channels must hold 1 to 5 positive sizes, got {self.encoder_channels}")
-
-
-@dataclass(frozen=True)
-class LearningConfig:
-    """Losses and optimizers.
-
-    Attributes:
-        batch_size: Sequences per update.
-        sequence_length: Decisions per sequence.
-        random_shift: Pixels by which each replayed sequence of frames is moved at most, in either direction.
-        turned_share: Of the replayed sequences, turned by quarter turns; for a body to which every side is the same.
-        model_learning_rate: Adam step of encoder, dynamics, decoder, reward and continue heads.
-        behaviour_learning_rate: Adam step of actor and value.
-        max_grad_norm: Gradient norm at which each optimizer clips.
-        reconstruction_scale: Weight of the squared error summed over the 32 x 32 picture.
-        dynamics_scale: Weight of the KL that pulls the prior to the posterior.
-        representation_scale: Weight of the KL that pulls the posterior to the prior.
-        free_nats: KL below which neither is pulled.
-        overshooting_scale: Weight of the KL that pulls open-loop predictions to what was seen.
-        overshooting_horizon: Decisions that open-loop predictions reach.
-        reward_scale: Weight of the reward loss.
-        imagination_horizon: Model steps of each imagined rollout.
-        imagination_starts: Rollouts imagined per update, drawn from the batch's states.
-        lambda_: Mixing of n-step returns into the lambda-return, in [0, 1].
-        discount: Discount per decision; None derives 1 - 5 / (decisions per episode).
-        replay_value_scale: Weight of the value loss on replayed rewards beside the imagined one.
-        entropy_scale: Weight of the actor's entropy, in units of the normalised return.
-        imitation_scale: Weight of the actor's KL to the plans it was collected with; 0 leaves it out.
-        target_rate: Share of the value network that its slow target takes over at each update.
-    """
-
-    batch_size: int = 16
-    sequence_length: int = 16
-    random_shift: int = 0
-    turned_share: float = 0.0
-    model_learning_rate: float = 1e-3
-    behaviour_learning_rate: float = 3e-4
-    max_grad_norm: float = 100.0
-    reconstruction_scale: float = 4.0
-    dynamics_scale: float = 1.0
-    representation_scale: float = 0.1
-    free_nats: float = 1.0
-    overshooting_scale: float = 0.1
-    overshooting_horizon: int = 8
-    reward_scale: float = 1.0
-    imagination_horizon: int = 10
-    imagination_starts: int = 160
-    lambda_: float = 0.95
-    discount: float | None = None
-    replay_value_scale: float = 0.3
-    entropy_scale: float = 3e-4
-    imitation_scale: float = 0.0
-    target_rate: float = 0.02
-
-    def __post_init__(self) -> None:
-        at_least(
-            self, batch_size=1, sequence_length=1, imagination_horizon=1, imagination_starts=1, overshooting_horizon=1
-        )
-        at_least(self, reconstruction_scale=0.0, dynamics_scale=0.0, representation_scale=0.0, free_nats=0.0)
-        at_least(self, overshooting_scale=0.0, reward_scale=0.0, replay_value_scale=0.0, entropy_scale=0.0)
-        at_least(self, imitation_scale=0.0, random_shift=0)
-        above_zero(self, "model_learning_rate", "behaviour_learning_rate", "max_grad_norm", "target_rate")
-        within(self, lambda_=(0.0, 1.0), turned_share=(0.0, 1.0), target_rate=(0.0, 1.0))
-        if self.discount is not None and not 0.0 < self.discount <= 1.0:
-            raise ValueError(f"discount must lie in (0, 1], got {self.discount}")
-
-
-@dataclass(frozen=True)
-class CollectionConfig:
-    """How experience is gathered, and how much is learned from it.
-
-    Attributes:
-        behaviour: Who acts while collecting: `planner`, `actor`, or `both` in alternate rounds.
-        noise_std: Standard deviation of the noise added to the planner's action.
-        noise_correlation: Of the planner's and the actor's noise between one decision and the next, in [0, 1).
-        noise_share: Share of the rounds with that noise; in the others planner and actor act as they are evaluated.
-        episode_decisions: After how many a collected episode is cut short; None plays on. Evaluations are whole.
-        prefill_decisions: Random decisions before learning starts.
-        round_decisions: Decisions per epoch: this many are collected, then learned from.
-        updates_per_decision: Updates per collected decision (the replay ratio, in updates).
-        overlap: Whether the next round is collected in another process while this one is learned from.
-    """
-
-    behaviour: str = "planner"
-    noise_std: float = 0.2
-    noise_correlation: float = 0.0
-    noise_share: float = 1.0
-    episode_decisions: int | None = None
-    prefill_decisions: int = 1000
-    round_decisions: int = 250
-    updates_per_decision: float = 0.5
-    overlap: bool = True
-
-    def __post_init__(self) -> None:
-        one_of(self, behaviour=BEHAVIOURS)
-        at_least(self, noise_std=0.0, prefill_decisions=1, round_decisions=1)
-        within(self, noise_correlation=(0.0, 0.99), noise_share=(0.0, 1.0))
-        above_zero(self, "updates_per_decision", "episode_decisions")
 
 
 @dataclass(frozen=True)

@@ -8,16 +8,25 @@ import lightning
 import numpy as np
 from torch.utils.data import DataLoader, IterableDataset
 
-from latentplan.config import LearningConfig, derive_seed
+from latentplan.config import Config, derive_seed
 from latentplan.replay import Batch, Replay
+from latentplan.training.curriculum import Curriculum
 from latentplan.training.state import RunState
 
 
 class ReplayBatches(IterableDataset[Batch]):
-    """The updates of one epoch: reads replay, so that nothing is fetched past a collection."""
+    """The updates of one epoch: reads replay, so that nothing is fetched past a collection.
 
-    def __init__(self, replay: Replay, config: LearningConfig, state: RunState, seed: int, length: int) -> None:
-        self.replay, self.config, self.state, self.seed, self.length = replay, config, state, seed, length
+    Args:
+        replay: Where sequences are drawn from.
+        config: Settings of the run.
+        curriculum: What their rewards are.
+        state: Clocks of the run.
+    """
+
+    def __init__(self, replay: Replay, config: Config, curriculum: Curriculum, state: RunState) -> None:
+        self.replay, self.config, self.curriculum, self.state = replay, config, curriculum, state
+        self.length = max(1, round(config.collection.round_decisions * config.collection.updates_per_decision))
 
     def __len__(self) -> int:
         """Updates per epoch."""
@@ -25,9 +34,11 @@ class ReplayBatches(IterableDataset[Batch]):
 
     def __iter__(self) -> Iterator[Batch]:
         """Draw the batches of this epoch, each when it is asked for."""
-        rng = np.random.default_rng(derive_seed(self.seed, "batches", self.state.rounds))
+        learning, state = self.config.learning, self.state
+        rng = np.random.default_rng(derive_seed(self.config.run.seed, "batches", state.rounds))
         for _ in range(self.length):
-            yield self.replay.sample(self.config.batch_size, self.config.sequence_length, rng)
+            batch = self.replay.sample(learning.batch_size, learning.sequence_length, rng)
+            yield self.curriculum(batch, state.env_frames)
 
 
 class ReplayData(lightning.LightningDataModule):

@@ -23,6 +23,7 @@ from latentplan.models import WorldModel
 from latentplan.replay import Replay
 from latentplan.training.callbacks import Experience, Record, Save, Stop
 from latentplan.training.collector import Description, EnvFactory
+from latentplan.training.curriculum import Curriculum
 from latentplan.training.data import ReplayBatches, ReplayData
 from latentplan.training.module import Learner
 from latentplan.training.progress import Progress
@@ -146,11 +147,11 @@ class _Run:
             torch.manual_seed(derive_seed(seed, "weights"))
             model = WorldModel(config.model, self.description.action_dim, self.description.labels).to(self.device)
         on = self.device if config.replay.on_device else torch.device("cpu")
-        capacity = _capacity(config)
-        num_labels = len(model.labels)
+        capacity, num_labels = _capacity(config), len(model.labels)
         self.replay = Replay(capacity, model.action_dim, config.model.deter_dim, config.env.num_envs, on, num_labels)
-        discount = self.description.discount
-        self.learner = Learner(model, config.learning, discount, self.replay, derive_seed(seed, "learner"))
+        own_seed = derive_seed(seed, "learner")
+        self.learner = Learner(model, config.learning, self.description.discount, self.replay, own_seed)
+        self.curriculum = Curriculum(config.learning, model.labels, config.env.action_repeat)
         self.state = RunState()
         self._saved_optimizers: list[Any] = []
         if resume:
@@ -176,8 +177,7 @@ class _Run:
         stop = Stop(config, self.state)
         record = Record(self.folder / "metrics.csv", self.state, experience, self.console)
         trainer = self._trainer([experience, record, save, stop])
-        length = max(1, round(config.collection.round_decisions * config.collection.updates_per_decision))
-        batches = ReplayBatches(self.replay, config.learning, self.state, config.run.seed, length)
+        batches = ReplayBatches(self.replay, config, self.curriculum, self.state)
         if not stop.is_spent():
             self.console.start(self.learner.updates)
             try:

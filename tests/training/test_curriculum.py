@@ -1,0 +1,70 @@
+"""Rewards of a sibling task, learned first."""
+
+import numpy as np
+import pytest
+import torch
+
+from latentplan.config import EnvConfig, LearningConfig, UserError
+from latentplan.envs import make_env
+from latentplan.training.curriculum import Curriculum, summed_reward
+
+LABELS = ("height", "task.stand", "task.walk")
+
+
+def first(task, frames=100):
+    return LearningConfig(curriculum_task=task, curriculum_frames=frames)
+
+
+@pytest.fixture
+def labelled(batch):
+    labels = torch.rand(4, 6, 3, generator=torch.Generator().manual_seed(0))
+    return batch._replace(labels=labels)
+
+
+def test_rewards_are_the_sibling_task_s_until_its_frames_are_over(labelled):
+    curriculum = Curriculum(first("stand"), LABELS, action_repeat=1)
+    assert torch.equal(curriculum(labelled, 0).rewards, labelled.labels[:, 1:, 1])
+    assert torch.equal(curriculum(labelled, 99).rewards, labelled.labels[:, 1:, 1])
+    assert curriculum(labelled, 100) is labelled
+
+
+def test_nothing_but_the_rewards_changes(labelled):
+    changed = Curriculum(first("walk"), LABELS, action_repeat=2)(labelled, 0)
+    for name in set(labelled._fields) - {"rewards"}:
+        assert getattr(changed, name) is getattr(labelled, name)
+
+
+def test_without_a_task_the_batch_is_what_it_was(labelled):
+    assert Curriculum(LearningConfig(curriculum_frames=100), LABELS, action_repeat=2)(labelled, 0) is labelled
+
+
+@pytest.mark.parametrize(("labels", "told"), [(LABELS, "stand, walk"), ((), "none")])
+def test_a_task_that_the_simulator_does_not_tell_of_is_refused(labels, told):
+    with pytest.raises(UserError, match=f"curriculum_task 'fly' is unknown; .*: {told}$"):
+        Curriculum(first("fly"), labels, action_repeat=2)
+
+
+@pytest.mark.parametrize("action_repeat", [1, 2, 4, 8])
+def test_a_reward_that_changes_evenly_is_summed_exactly(action_repeat):
+    steps = torch.arange(3 * action_repeat + 1.0)
+    expected = steps[1:].reshape(3, action_repeat).sum(-1)
+    assert torch.allclose(summed_reward(steps[None, ::action_repeat], action_repeat), expected[None])
+
+
+@pytest.mark.parametrize(("action_repeat", "error"), [(1, 1e-6), (2, 0.04)])
+def test_it_comes_to_what_the_task_pays(action_repeat, error):
+    """The labels of an episode of one task, summed for that same task, give its rewards: exactly without repeats."""
+    env = make_env(EnvConfig("walker", "walk", action_repeat, render_quality="fastest"), seed=0)
+    rng = np.random.default_rng(0)
+    try:
+        _, info = env.reset(seed=0)
+        labels, rewards = [info["labels"]], []
+        for _ in range(30):
+            _, reward, _, _, info = env.step(rng.uniform(-1.0, 1.0, 6).astype(np.float32))
+            labels.append(info["labels"])
+            rewards.append(reward)
+        column = list(env.unwrapped.labels).index("task.walk")
+    finally:
+        env.close()
+    walk = torch.tensor(np.array(labels), dtype=torch.float32)[None, :, column]
+    assert (summed_reward(walk, action_repeat)[0] - torch.tensor(rewards)).abs().mean() < error
