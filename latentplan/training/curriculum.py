@@ -9,7 +9,7 @@ from collections.abc import Collection
 
 from torch import Tensor
 
-from latentplan.config import LearningConfig, UserError
+from latentplan.config import Config, UserError
 from latentplan.config.quantities import TASK_PREFIX
 from latentplan.replay import Batch
 
@@ -18,25 +18,27 @@ class Curriculum:
     """Replaces replayed rewards by those of another task until so many frames have been collected.
 
     Args:
-        config: Names the task, and for how many simulator frames it is learned.
+        config: Settings of the run: which task comes first, and for how many simulator frames; nothing is replaced when
+            that is the run's own task.
         labels: Names of the quantities that come with each frame, in their order.
-        action_repeat: Control steps per decision.
 
     Raises:
         UserError: The simulator does not tell what that task pays.
     """
 
-    def __init__(self, config: LearningConfig, labels: Collection[str], action_repeat: int) -> None:
-        self._frames, self._repeat = config.curriculum_frames, action_repeat
+    def __init__(self, config: Config, labels: Collection[str]) -> None:
+        self._frames, self._repeat = config.learning.curriculum_frames, config.env.action_repeat
         self._column = None
-        if config.curriculum_task is not None:
+        first = config.learning.curriculum_task
+        own = config.env.task if config.env.objective is None else None
+        if first not in (None, own):
             tasks = [name.removeprefix(TASK_PREFIX) for name in labels if name.startswith(TASK_PREFIX)]
-            if config.curriculum_task not in tasks:
+            if first not in tasks:
                 raise UserError(
-                    f"learning.curriculum_task {config.curriculum_task!r} is unknown; this body's simulator tells what "
+                    f"learning.curriculum_task {first!r} is unknown; this body's simulator tells what "
                     f"these tasks pay: {', '.join(tasks) or 'none'}"
                 )
-            self._column = list(labels).index(TASK_PREFIX + config.curriculum_task)
+            self._column = list(labels).index(TASK_PREFIX + first)
 
     def __call__(self, batch: Batch, env_frames: int) -> Batch:
         """The batch as it is to be learned from after so many simulator frames of the run."""

@@ -151,7 +151,7 @@ class _Run:
         self.replay = Replay(capacity, model.action_dim, config.model.deter_dim, config.env.num_envs, on, num_labels)
         own_seed = derive_seed(seed, "learner")
         self.learner = Learner(model, config.learning, self.description.discount, self.replay, own_seed)
-        self.curriculum = Curriculum(config.learning, model.labels, config.env.action_repeat)
+        self.curriculum = Curriculum(config, model.labels)
         self.state = RunState()
         self._saved_optimizers: list[Any] = []
         if resume:

@@ -4,15 +4,17 @@ import numpy as np
 import pytest
 import torch
 
-from latentplan.config import EnvConfig, LearningConfig, UserError
+from latentplan.config import Config, EnvConfig, LearningConfig, UserError
 from latentplan.envs import make_env
 from latentplan.training.curriculum import Curriculum, summed_reward
 
 LABELS = ("height", "task.stand", "task.walk")
 
 
-def first(task, frames=100):
-    return LearningConfig(curriculum_task=task, curriculum_frames=frames)
+def first(name, action_repeat=1, **env):
+    """The settings of a run whose first 100 frames are for a task."""
+    learning = LearningConfig(curriculum_task=name, curriculum_frames=100)
+    return Config(env=EnvConfig(action_repeat=action_repeat, **env), learning=learning)
 
 
 @pytest.fixture
@@ -22,26 +24,33 @@ def labelled(batch):
 
 
 def test_rewards_are_the_sibling_task_s_until_its_frames_are_over(labelled):
-    curriculum = Curriculum(first("stand"), LABELS, action_repeat=1)
+    curriculum = Curriculum(first("stand"), LABELS)
     assert torch.equal(curriculum(labelled, 0).rewards, labelled.labels[:, 1:, 1])
     assert torch.equal(curriculum(labelled, 99).rewards, labelled.labels[:, 1:, 1])
     assert curriculum(labelled, 100) is labelled
 
 
 def test_nothing_but_the_rewards_changes(labelled):
-    changed = Curriculum(first("walk"), LABELS, action_repeat=2)(labelled, 0)
+    changed = Curriculum(first("walk", action_repeat=2), LABELS)(labelled, 0)
     for name in set(labelled._fields) - {"rewards"}:
         assert getattr(changed, name) is getattr(labelled, name)
 
 
-def test_without_a_task_the_batch_is_what_it_was(labelled):
-    assert Curriculum(LearningConfig(curriculum_frames=100), LABELS, action_repeat=2)(labelled, 0) is labelled
+def test_without_another_task_the_batch_is_what_it_was(labelled):
+    assert Curriculum(first(None), LABELS)(labelled, 0) is labelled
+    assert Curriculum(first("walk", task="walk"), LABELS)(labelled, 0) is labelled
+    assert Curriculum(first("walk", task="walk"), ())(labelled, 0) is labelled
+
+
+def test_a_task_comes_before_an_objective_of_the_user_s_that_pays_in_its_place(labelled):
+    curriculum = Curriculum(first("walk", task="walk", objective="speed -> 2.0"), LABELS)
+    assert torch.equal(curriculum(labelled, 0).rewards, labelled.labels[:, 1:, 2])
 
 
 @pytest.mark.parametrize(("labels", "told"), [(LABELS, "stand, walk"), ((), "none")])
 def test_a_task_that_the_simulator_does_not_tell_of_is_refused(labels, told):
     with pytest.raises(UserError, match=f"curriculum_task 'fly' is unknown; .*: {told}$"):
-        Curriculum(first("fly"), labels, action_repeat=2)
+        Curriculum(first("fly"), labels)
 
 
 @pytest.mark.parametrize("action_repeat", [1, 2, 4, 8])
