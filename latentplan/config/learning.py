@@ -37,7 +37,7 @@ class LearningConfig:
         imitation_scale: Weight of the actor's KL to the plans it was collected with; 0 leaves it out.
         target_rate: Share of the value network that its slow target takes over at each update.
         curriculum_task: Task of the same domain whose reward is learned first, on the way to the run's own; None starts
-            with that.
+            with that, and so does a run with `env.objective`.
         curriculum_frames: Simulator frames of the run for which it is, counted before action repeat.
     """
 

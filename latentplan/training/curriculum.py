@@ -18,8 +18,8 @@ class Curriculum:
     """Replaces replayed rewards by those of another task until so many frames have been collected.
 
     Args:
-        config: Settings of the run: which task comes first, and for how many simulator frames; nothing is replaced when
-            that is the run's own task.
+        config: Settings of the run: which task comes first, and for how many simulator frames. Nothing is replaced when
+            that is the run's own task, or when the run has an objective in a task's place.
         labels: Names of the quantities that come with each frame, in their order.
 
     Raises:
@@ -30,8 +30,7 @@ class Curriculum:
         self._frames, self._repeat = config.learning.curriculum_frames, config.env.action_repeat
         self._column = None
         first = config.learning.curriculum_task
-        own = config.env.task if config.env.objective is None else None
-        if first not in (None, own):
+        if first not in (None, config.env.task) and config.env.objective is None:
             tasks = [name.removeprefix(TASK_PREFIX) for name in labels if name.startswith(TASK_PREFIX)]
             if first not in tasks:
                 raise UserError(
