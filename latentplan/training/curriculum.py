@@ -6,27 +6,37 @@ The simulator tells with every frame what each task of the domain pays there, so
 from __future__ import annotations
 
 from collections.abc import Collection
+from typing import TYPE_CHECKING
 
+import lightning
 from torch import Tensor
 
 from latentplan.config import Config, UserError
 from latentplan.config.quantities import TASK_PREFIX
 from latentplan.replay import Batch
+from latentplan.training.state import RunState
+
+if TYPE_CHECKING:
+    from latentplan.training.module import Learner
 
 
-class Curriculum:
+class Curriculum(lightning.Callback):
     """Replaces replayed rewards by those of another task until so many frames have been collected.
+
+    When they have, the value begins anew: where the agent no longer goes, an old value would stay high, and lure it.
 
     Args:
         config: Settings of the run: which task comes first, and for how many simulator frames. Nothing is replaced when
             that is the run's own task, or when the run has an objective in a task's place.
         labels: Names of the quantities that come with each frame, in their order.
+        state: Clocks of the run.
 
     Raises:
         UserError: The simulator does not tell what that task pays.
     """
 
-    def __init__(self, config: Config, labels: Collection[str]) -> None:
+    def __init__(self, config: Config, labels: Collection[str], state: RunState) -> None:
+        self.state = state
         self._frames, self._repeat = config.learning.curriculum_frames, config.env.action_repeat
         self._column = None
         first = config.learning.curriculum_task
@@ -39,11 +49,20 @@ class Curriculum:
                 )
             self._column = list(labels).index(TASK_PREFIX + first)
 
-    def __call__(self, batch: Batch, env_frames: int) -> Batch:
-        """The batch as it is to be learned from after so many simulator frames of the run."""
-        if self._column is None or env_frames >= self._frames:
+    def __call__(self, batch: Batch) -> Batch:
+        """The batch as it is to be learned from now."""
+        if self._column is None or self._is_over():
             return batch
         return batch._replace(rewards=summed_reward(batch.labels[..., self._column], self._repeat))
+
+    def on_train_epoch_start(self, trainer: lightning.Trainer, learner: Learner) -> None:  # type: ignore[override]
+        """Have the value begun anew in the first epoch that learns the run's own reward."""
+        if self._column is not None and self._is_over() and not self.state.curriculum_over:
+            learner.forget_values()
+            self.state.curriculum_over = True
+
+    def _is_over(self) -> bool:
+        return self.state.env_frames >= self._frames
 
 
 def summed_reward(values: Tensor, action_repeat: int) -> Tensor:

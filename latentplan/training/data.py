@@ -34,11 +34,11 @@ class ReplayBatches(IterableDataset[Batch]):
 
     def __iter__(self) -> Iterator[Batch]:
         """Draw the batches of this epoch, each when it is asked for."""
-        learning, state = self.config.learning, self.state
-        rng = np.random.default_rng(derive_seed(self.config.run.seed, "batches", state.rounds))
+        learning = self.config.learning
+        rng = np.random.default_rng(derive_seed(self.config.run.seed, "batches", self.state.rounds))
         for _ in range(self.length):
             batch = self.replay.sample(learning.batch_size, learning.sequence_length, rng)
-            yield self.curriculum(batch, state.env_frames)
+            yield self.curriculum(batch)
 
 
 class ReplayData(lightning.LightningDataModule):

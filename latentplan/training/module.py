@@ -12,6 +12,7 @@ from torch import Tensor
 
 from latentplan.config import LearningConfig, derive_seed
 from latentplan.models import State, WorldModel
+from latentplan.models.heads import ScalarHead
 from latentplan.replay import Batch, Replay
 from latentplan.training.augmentation import quarter_turns
 from latentplan.training.losses import Learned, imagine, imitation_loss, lambda_return, value_loss, world_model_loss
@@ -83,6 +84,18 @@ class Learner(lightning.LightningModule):
     def catch_up(self) -> None:
         """Let behaviour learn from what the model has learned from; due before weights are used or saved."""
         self._finish_behaviour(self._start_behaviour())
+
+    def forget_values(self) -> None:
+        """Begin the value anew, as a run does: what it has learned are sums of another reward. Due between epochs."""
+        head, config = self.model.value_head, self.model.config
+        with torch.random.fork_rng(devices=[]):
+            torch.manual_seed(derive_seed(self.seed, "values", self.updates))
+            fresh = ScalarHead(config.deter_dim + config.latent_dim, config.hidden_dim, config.num_bins)
+        head.load_state_dict(fresh.state_dict())
+        self.target_value.load_state_dict(fresh.state_dict())
+        self.return_range.zero_()
+        for parameter in head.parameters():
+            self._optimizers()[1].state.pop(parameter, None)
 
     def teardown(self, stage: str) -> None:
         """End the thread."""

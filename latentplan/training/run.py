@@ -151,7 +151,6 @@ class _Run:
         self.replay = Replay(capacity, model.action_dim, config.model.deter_dim, config.env.num_envs, on, num_labels)
         own_seed = derive_seed(seed, "learner")
         self.learner = Learner(model, config.learning, self.description.discount, self.replay, own_seed)
-        self.curriculum = Curriculum(config, model.labels)
         self.state = RunState()
         self._saved_optimizers: list[Any] = []
         if resume:
@@ -159,6 +158,7 @@ class _Run:
             self.replay.load(self.folder / "resume" / "replay")
             self.learner.load_state_dict(saved["weights"])
             self.learner.updates = saved["updates"]
+        self.curriculum = Curriculum(config, model.labels, self.state)
 
     def execute(self) -> Result:
         """Learn until the budget is spent, then evaluate."""
@@ -176,7 +176,7 @@ class _Run:
         save = Save(self.folder, config, experience, self.state, self._facts())
         stop = Stop(config, self.state)
         record = Record(self.folder / "metrics.csv", self.state, experience, self.console)
-        trainer = self._trainer([experience, record, save, stop])
+        trainer = self._trainer([experience, self.curriculum, record, save, stop])
         batches = ReplayBatches(self.replay, config, self.curriculum, self.state)
         if not stop.is_spent():
             self.console.start(self.learner.updates)

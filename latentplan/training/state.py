@@ -28,6 +28,7 @@ class RunState:
         next_evaluation: Value of `env_frames` at which the next evaluation is due.
         best_return: Best mean return of the planner so far.
         evaluations: One entry per evaluation: env_frames, updates, minutes, planner, actor.
+        curriculum_over: Whether the values of the curriculum's task have been forgotten.
         interrupted: Whether the user asked to stop.
     """
 
@@ -38,6 +39,7 @@ class RunState:
     next_evaluation: int = 0
     best_return: float = float("-inf")
     evaluations: list[dict[str, Any]] = field(default_factory=list)
+    curriculum_over: bool = False
     interrupted: bool = False
     started: float = field(default_factory=time.monotonic)
 

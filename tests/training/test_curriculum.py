@@ -7,6 +7,7 @@ import torch
 from latentplan.config import Config, EnvConfig, LearningConfig, UserError
 from latentplan.envs import make_env
 from latentplan.training.curriculum import Curriculum, summed_reward
+from latentplan.training.state import RunState
 
 LABELS = ("height", "task.stand", "task.walk")
 
@@ -17,6 +18,10 @@ def first(name, action_repeat=1, **env):
     return Config(env=EnvConfig(action_repeat=action_repeat, **env), learning=learning)
 
 
+def at(env_frames):
+    return RunState(env_frames=env_frames)
+
+
 @pytest.fixture
 def labelled(batch):
     labels = torch.rand(4, 6, 3, generator=torch.Generator().manual_seed(0))
@@ -24,29 +29,31 @@ def labelled(batch):
 
 
 def test_rewards_are_the_sibling_task_s_until_its_frames_are_over(labelled):
-    curriculum = Curriculum(first("stand"), LABELS)
-    assert torch.equal(curriculum(labelled, 0).rewards, labelled.labels[:, 1:, 1])
-    assert torch.equal(curriculum(labelled, 99).rewards, labelled.labels[:, 1:, 1])
-    assert curriculum(labelled, 100) is labelled
+    state = at(0)
+    curriculum = Curriculum(first("stand"), LABELS, state)
+    for state.env_frames in (0, 99):
+        assert torch.equal(curriculum(labelled).rewards, labelled.labels[:, 1:, 1])
+    state.env_frames = 100
+    assert curriculum(labelled) is labelled
 
 
 def test_nothing_but_the_rewards_changes(labelled):
-    changed = Curriculum(first("walk", action_repeat=2), LABELS)(labelled, 0)
+    changed = Curriculum(first("walk", action_repeat=2), LABELS, at(0))(labelled)
     for name in set(labelled._fields) - {"rewards"}:
         assert getattr(changed, name) is getattr(labelled, name)
 
 
 def test_without_another_task_the_batch_is_what_it_was(labelled):
-    assert Curriculum(first(None), LABELS)(labelled, 0) is labelled
-    assert Curriculum(first("walk", task="walk"), LABELS)(labelled, 0) is labelled
-    assert Curriculum(first("walk", task="walk"), ())(labelled, 0) is labelled
-    assert Curriculum(first("walk", task="stand", objective="speed -> 2.0"), LABELS)(labelled, 0) is labelled
+    assert Curriculum(first(None), LABELS, at(0))(labelled) is labelled
+    assert Curriculum(first("walk", task="walk"), LABELS, at(0))(labelled) is labelled
+    assert Curriculum(first("walk", task="walk"), (), at(0))(labelled) is labelled
+    assert Curriculum(first("walk", task="stand", objective="speed -> 2.0"), LABELS, at(0))(labelled) is labelled
 
 
 @pytest.mark.parametrize(("labels", "told"), [(LABELS, "stand, walk"), ((), "none")])
 def test_a_task_that_the_simulator_does_not_tell_of_is_refused(labels, told):
     with pytest.raises(UserError, match=f"curriculum_task 'fly' is unknown; .*: {told}$"):
-        Curriculum(first("fly"), labels)
+        Curriculum(first("fly"), labels, at(0))
 
 
 @pytest.mark.parametrize("action_repeat", [1, 2, 4, 8])
@@ -73,3 +80,26 @@ def test_it_comes_to_what_the_task_pays(action_repeat, error):
         env.close()
     walk = torch.tensor(np.array(labels), dtype=torch.float32)[None, :, column]
     assert (summed_reward(walk, action_repeat)[0] - torch.tensor(rewards)).abs().mean() < error
+
+
+class Learner:
+    """Counts how often it forgets."""
+
+    forgotten = 0
+
+    def forget_values(self):
+        self.forgotten += 1
+
+
+@pytest.mark.parametrize(("task", "times"), [("stand", 1), (None, 0)])
+def test_values_of_another_reward_are_forgotten_once_also_by_a_run_that_is_resumed(task, times):
+    learner, state = Learner(), at(99)
+    curriculum = Curriculum(first(task), LABELS, state)
+    curriculum.on_train_epoch_start(None, learner)
+    assert learner.forgotten == 0
+    state.env_frames = 101
+    curriculum.on_train_epoch_start(None, learner)
+    resumed = Curriculum(first(task), LABELS, RunState(**state.to_dict()))
+    for each in (curriculum, resumed):
+        each.on_train_epoch_start(None, learner)
+    assert learner.forgotten == times

@@ -65,3 +65,22 @@ def test_beliefs_of_turned_sequences_are_not_kept(batch, tiny, share):
     learner = standalone(tiny, turned_share=share)
     learner.training_step(batch, 0)
     assert (learner.replay.deter[batch.rows] == 0.0).all() == (share == 1.0)
+
+
+def test_a_value_that_is_forgotten_begins_anew_and_nothing_else_does(batch, tiny):
+    learner = standalone(tiny)
+    for _ in range(3):
+        learner.training_step(batch, 0)
+        learner.catch_up()
+    before = {name: value.clone() for name, value in learner.model.state_dict().items()}
+    learner.forget_values()
+    changed = {name for name, value in learner.model.state_dict().items() if not torch.equal(value, before[name])}
+    assert changed and all(name.startswith("value_head") for name in changed)
+    twin = learner.model.value_head.state_dict()
+    assert all(torch.equal(value, twin[name]) for name, value in learner.target_value.state_dict().items())
+    held = set(learner.optimizers()[1].state)
+    assert held == set(learner.model.actor.parameters())
+    assert learner.model.value_head.mean(learner.model.value_head(torch.ones(1, 48))).abs() < 1e-3
+    learner.training_step(batch, 0)
+    learner.catch_up()
+    assert set(learner.optimizers()[1].state) > held
