@@ -31,6 +31,9 @@ class Curriculum(lightning.Callback):
         labels: Names of the quantities that come with each frame, in their order.
         state: Clocks of the run.
 
+    Attributes:
+        note: What there is to say of it, to be appended to the run's task; empty without another task.
+
     Raises:
         UserError: The simulator does not tell what that task pays.
     """
@@ -38,9 +41,9 @@ class Curriculum(lightning.Callback):
     def __init__(self, config: Config, labels: Collection[str], state: RunState) -> None:
         self.state = state
         self._frames, self._repeat = config.learning.curriculum_frames, config.env.action_repeat
-        self._column = None
+        self._column, self.note = None, ""
         first = config.learning.curriculum_task
-        if first not in (None, config.env.task) and config.env.objective is None:
+        if self._frames > 0 and first not in (None, config.env.task) and config.env.objective is None:
             tasks = [name.removeprefix(TASK_PREFIX) for name in labels if name.startswith(TASK_PREFIX)]
             if first not in tasks:
                 raise UserError(
@@ -48,6 +51,7 @@ class Curriculum(lightning.Callback):
                     f"these tasks pay: {', '.join(tasks) or 'none'}"
                 )
             self._column = list(labels).index(TASK_PREFIX + first)
+            self.note = f"; first {first}, for {self._frames:,} frames"
 
     def __call__(self, batch: Batch) -> Batch:
         """The batch as it is to be learned from now."""

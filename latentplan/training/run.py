@@ -246,7 +246,7 @@ class _Run:
         renderer = ", ".join(f"{name} {value}" for name, value in description.renderer.items())
         rows = self.replay.lane_size * self.replay.num_lanes
         lines = {
-            "task": f"{_task_name(config)}, action repeat {config.env.action_repeat}",
+            "task": f"{_task_name(config)}, action repeat {config.env.action_repeat}{self.curriculum.note}",
             **({} if config.env.objective is None else {"objective": config.env.objective}),
             "device": f"{self.device}, {torch.get_num_threads()} threads",
             "renderer": f"{renderer}; {description.render_ms:.1f} ms per frame, quality {config.env.render_quality}",

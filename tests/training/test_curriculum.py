@@ -12,9 +12,9 @@ from latentplan.training.state import RunState
 LABELS = ("height", "task.stand", "task.walk")
 
 
-def first(name, action_repeat=1, **env):
+def first(name, action_repeat=1, frames=100, **env):
     """The settings of a run whose first 100 frames are for a task."""
-    learning = LearningConfig(curriculum_task=name, curriculum_frames=100)
+    learning = LearningConfig(curriculum_task=name, curriculum_frames=frames)
     return Config(env=EnvConfig(action_repeat=action_repeat, **env), learning=learning)
 
 
@@ -91,15 +91,20 @@ class Learner:
         self.forgotten += 1
 
 
-@pytest.mark.parametrize(("task", "times"), [("stand", 1), (None, 0)])
-def test_values_of_another_reward_are_forgotten_once_also_by_a_run_that_is_resumed(task, times):
+@pytest.mark.parametrize(("task", "frames", "times"), [("stand", 100, 1), ("stand", 0, 0), (None, 100, 0)])
+def test_values_of_another_reward_are_forgotten_once_also_by_a_run_that_is_resumed(task, frames, times):
     learner, state = Learner(), at(99)
-    curriculum = Curriculum(first(task), LABELS, state)
+    curriculum = Curriculum(first(task, frames=frames), LABELS, state)
     curriculum.on_train_epoch_start(None, learner)
     assert learner.forgotten == 0
     state.env_frames = 101
     curriculum.on_train_epoch_start(None, learner)
-    resumed = Curriculum(first(task), LABELS, RunState(**state.to_dict()))
+    resumed = Curriculum(first(task, frames=frames), LABELS, RunState(**state.to_dict()))
     for each in (curriculum, resumed):
         each.on_train_epoch_start(None, learner)
     assert learner.forgotten == times
+
+
+def test_a_run_says_what_comes_first():
+    assert Curriculum(first("stand", frames=40_000), LABELS, at(0)).note == "; first stand, for 40,000 frames"
+    assert Curriculum(first("stand", frames=0), LABELS, at(0)).note == ""
