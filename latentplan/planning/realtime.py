@@ -100,10 +100,10 @@ class PlanBuffer:
         action, age = self._action(found=0, tick=tick)
         return action, "plan" if age <= self.fresh_ticks else "tail", age
 
-    def peek(self, tick: int) -> Tensor | None:
-        """The action (..., action) that a later tick would take, judged from the plans held now."""
+    def peek(self, tick: int) -> tuple[Tensor, int] | None:
+        """The action (..., action) that a later tick would take, and its age, judged from the plans held now."""
         found = self._find(tick)
-        return None if found is None else self._action(found, tick)[0]
+        return None if found is None else self._action(found, tick)
 
     def remaining(self, tick: int) -> Tensor | None:
         """The actions (..., ticks, action) of the plan in use, from this tick to the plan's end."""

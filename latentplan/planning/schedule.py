@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from latentplan.planning.cem import CEMPlanner
+from latentplan.planning.course import Course
 from latentplan.planning.model import (
     Model,
     State,
@@ -74,7 +75,9 @@ class PlanScheduler:
     decision that is executed, in order, and
 
         1. polls the executor, and puts a finished plan into the buffer at the tick it was asked for;
-        2. takes this tick's action from the buffer, or from the model's policy (zeros without one) if it has none;
+        2. takes this tick's action from the buffer, or from the model's policy (zeros without one) if it has none; an
+           action from the buffer gets what the policy does differently here than where the plan expected to be (see
+           `latentplan.planning.course`; nothing without a policy);
         3. if the executor is idle, asks for the next plan: it predicts how many ticks that takes, rolls the state
            forward by the actions these ticks will take (this one, then the buffer's, then the policy's), and requests
            a plan from there, warm-started from the last one shifted to the same tick.
@@ -90,7 +93,7 @@ class PlanScheduler:
 
     Args:
         planner: Settings of the search: horizon and action bounds. Only the executor calls it.
-        model: Rolls the state forward; its `policy`, if any, acts where there is no plan.
+        model: Rolls the state forward; its `policy`, if any, acts where there is no plan, and holds to plans.
         executor: What computes plans.
         max_age: See `PlanBuffer`.
         fresh_ticks: See `PlanBuffer`; None follows the predicted latency.
@@ -113,7 +116,8 @@ class PlanScheduler:
         self._follows_latency = fresh_ticks is None
         self._latencies: deque[int] = deque(maxlen=NUM_LATENCIES)
         self._is_warmed_up = False
-        self._asked: tuple[int, int] | None = None  # tick of the request in work, and the tick it is for
+        self._asked: tuple[int, int, State] | None = None  # tick of the request in work, the tick and state it is for
+        self._courses: dict[int, Course] = {}  # by the tick of the plan's first action
         self._last: tuple[int, Plan] | None = None
 
     @property
@@ -136,8 +140,10 @@ class PlanScheduler:
         """
         self._collect()
         action, source, age = self.buffer.choose(self.tick)
-        if action is None or source is None:
+        if age is None or source is None:
             action, source = self._act_alone(state), "actor"
+        else:
+            action = self._follow(state, self.tick, age)
         if self.executor.is_idle:
             self._ask(state, action)
         self.tick += 1
@@ -150,6 +156,7 @@ class PlanScheduler:
     def reset(self) -> None:
         """Forget all plans, the one in work too: what it was asked for is over."""
         self.buffer.clear()
+        self._courses = {}
         self._asked = self._last = None
 
     def _collect(self) -> None:
@@ -168,6 +175,10 @@ class PlanScheduler:
         if asked is None or asked[1] != tick:  # asked for before a reset
             return
         self.buffer.submit(plan.actions, tick)
+        self._courses = {
+            first: held for first, held in self._courses.items() if first + self.planner.horizon > self.tick
+        }
+        self._courses[tick] = Course(self.model, asked[2], plan.actions)
         self._last = finished
         if self._follows_latency:
             self.buffer.fresh_ticks = self.latency_ticks
@@ -180,13 +191,13 @@ class PlanScheduler:
             state, _ = take_step(self.model, state, action)
             if tick < due:
                 planned = self.buffer.peek(tick)
-                action = self._act_alone(state) if planned is None else planned
+                action = self._act_alone(state) if planned is None else self._follow(state, tick, planned[1])
         seed = None
         if self.generator is not None:
             device = self.generator.device
             seed = int(torch.randint(2**62, (1,), generator=self.generator, device=device))
         if self.executor.request(state, due, self._warm_start(due), seed):
-            self._asked = (self.tick, due)
+            self._asked = (self.tick, due, state)
 
     def _warm_start(self, due: int) -> Plan | None:
         if self._last is None or due - self._last[0] >= self.planner.horizon:
@@ -194,10 +205,21 @@ class PlanScheduler:
         first_tick, plan = self._last
         return plan.executed(torch.full_like(plan.elapsed, due - first_tick))
 
+    def _follow(self, state: State, tick: int, age: int) -> Tensor:
+        """The action (batch, action) at a tick of the plan that is of this age there, held to it by the policy."""
+        course = self._courses[tick - age]
+        if not supports(self.model, "policy"):
+            return course.actions[:, age]
+        return course.correct(age, state, self._act_alone).clamp(*self._bounds(state))
+
     def _act_alone(self, state: State) -> Tensor:
+        low, high = self._bounds(state)
+        if not supports(self.model, "policy"):
+            return torch.zeros(count_rows(state), len(low), device=low.device, dtype=low.dtype).clamp(low, high)
+        return self.model.policy(state, None).to(low.dtype).clamp(low, high)  # type: ignore[attr-defined,no-any-return]
+
+    def _bounds(self, state: State) -> tuple[Tensor, Tensor]:
         planner, dtype, device = self.planner, action_dtype(state), state_device(state)
         bounds: Any = (planner.action_low, planner.action_high)
         low, high = (per_dimension(bound, planner.action_dim, "bounds").to(device, dtype) for bound in bounds)
-        if not supports(self.model, "policy"):
-            return torch.zeros(count_rows(state), planner.action_dim, device=device, dtype=dtype).clamp(low, high)
-        return self.model.policy(state, None).to(dtype).clamp(low, high)  # type: ignore[attr-defined,no-any-return]
+        return low, high
