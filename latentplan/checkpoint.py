@@ -13,6 +13,7 @@ from safetensors.torch import load_file, save_file
 from latentplan.agent import ActorAgent, Agent, PlanningAgent, RandomAgent
 from latentplan.background import BackgroundAgent
 from latentplan.config import Config, PlannerConfig, UserError, from_dict, to_dict
+from latentplan.config.planner import override_planner
 from latentplan.gate import GatedAgent
 from latentplan.models import WorldModel
 
@@ -120,7 +121,7 @@ def load_agent(
     kind: Any = {"planner": PlanningAgent, "gated": GatedAgent, "background": BackgroundAgent}[mode]
     try:
         agent: Agent | BackgroundAgent = kind(
-            model, config, info["discount"], planner=PlannerConfig(**(known | settings)), **options
+            model, config, info["discount"], planner=PlannerConfig(**override_planner(known, settings)), **options
         )
     except (TypeError, ValueError) as error:
         raise UserError(f"planner settings: {error}") from None

@@ -17,6 +17,7 @@ from typing import Any
 from latentplan.cli import read_flags, run_guarded, use_device
 from latentplan.compose import build_config, field_names, raise_unknown
 from latentplan.config import DEVICES, DistillConfig, PlannerConfig, UserError, from_dict, to_dict
+from latentplan.config.planner import override_planner
 
 FLAGS = {
     "--checkpoint": ("DIR", "folder of a trained agent, or of a run (its best checkpoint)"),
@@ -120,7 +121,7 @@ def _planner(request: DistillRequest, info: dict[str, Any]) -> PlannerConfig:
         trained = to_dict(from_dict(info["config"]).planner)
     except ValueError as error:
         raise UserError(f"{request.checkpoint} has settings of another version: {error}") from None
-    return build_config({"planner": {**trained, **request.planner}}).planner
+    return build_config({"planner": override_planner(trained, request.planner)}).planner
 
 
 def _setting_kinds() -> dict[str, type]:

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 from latentplan.cli import run_guarded, use_device
 from latentplan.compose import build_config
 from latentplan.config import EnvConfig, PlannerConfig, UserError, from_dict, to_dict
+from latentplan.config.planner import override_planner
 from latentplan.evaluation_request import (
     PLANNING_MODES,
     EvaluationRequest,
@@ -70,7 +71,7 @@ def _evaluate(argv: Sequence[str]) -> int:
         config = from_dict(info["config"])
     except ValueError as error:
         raise UserError(f"{request.checkpoint} has settings of another version: {error}") from None
-    planner = build_config({"planner": {**to_dict(config.planner), **request.planner}}).planner
+    planner = build_config({"planner": override_planner(to_dict(config.planner), request.planner)}).planner
     overrides = {name: getattr(planner, name) for name in request.planner}
     if request.planning_budget is not None:
         overrides["planning_budget"] = request.planning_budget
@@ -89,7 +90,8 @@ def _evaluate(argv: Sequence[str]) -> int:
             flush=True,
         )
         played = env if goals is None else score_env(env, goals, agent if request.mode in PLANNING_MODES else None)
-        return _play_and_report(request, played, agent, about, planner.horizon, clock)
+        horizon = planner.goal_horizon if goals is not None and goals.phases else None
+        return _play_and_report(request, played, agent, about, horizon or planner.horizon, clock)
     except OSError as error:
         raise UserError(f"an output could not be written: {error}") from error
     finally:

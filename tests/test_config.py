@@ -17,6 +17,7 @@ from latentplan.config import (
     from_dict,
     to_dict,
 )
+from latentplan.config.planner import override_planner
 
 CHANGED = Config(
     env=EnvConfig(domain="cartpole", task="swingup", num_envs=3),
@@ -81,3 +82,11 @@ def test_a_derived_seed_is_a_digest_of_run_stream_and_counter():
 def test_streams_of_a_run_differ():
     seeds = {derive_seed(seed, name, count) for seed in (0, 1) for name in ("a", "b") for count in (0, 1)}
     assert len(seeds) == 8
+
+
+def test_a_horizon_that_is_given_holds_for_goals_too():
+    trained = {"horizon": 5, "goal_horizon": 20, "num_samples": 64}
+    assert override_planner(trained, {"num_samples": 8}) == trained | {"num_samples": 8}
+    assert override_planner(trained, {"horizon": 9}) == trained | {"horizon": 9, "goal_horizon": None}
+    both = {"horizon": 9, "goal_horizon": 12}
+    assert override_planner(trained, both) == trained | both

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 from latentplan.config.checks import above_zero, at_least, one_of, within
 
@@ -13,6 +15,7 @@ class PlannerConfig:
 
     Attributes:
         horizon: Model steps that a plan looks ahead.
+        goal_horizon: The same for goals that are set after training; null takes `horizon`.
         num_samples: Candidate sequences per iteration.
         num_elites: Best candidates that refit the search distribution.
         num_iterations: Refits of a cold start.
@@ -34,6 +37,7 @@ class PlannerConfig:
     """
 
     horizon: int = 8
+    goal_horizon: int | None = None
     num_samples: int = 128
     num_elites: int = 16
     num_iterations: int = 4
@@ -56,10 +60,16 @@ class PlannerConfig:
     def __post_init__(self) -> None:
         at_least(self, horizon=1, num_samples=2, num_elites=1, num_iterations=1, warm_start_iterations=1)
         at_least(self, num_policy_samples=0, init_std=0.0, min_std=0.0, noise_beta=0.0)
-        above_zero(self, "smoothing", "deadline_ms")
+        above_zero(self, "goal_horizon", "smoothing", "deadline_ms")
         within(self, smoothing=(0.0, 1.0), keep_elite_fraction=(0.0, 1.0))
         one_of(self, start=("shifted", "policy", "both"), tail=("zero", "hold", "policy"))
         one_of(self, warm_start_variance=("reset", "keep", "inflate"), final=("mean", "best"))
         for name in ("num_elites", "num_policy_samples"):
             if getattr(self, name) > self.num_samples - (name == "num_policy_samples"):
                 raise ValueError(f"{name} ({getattr(self, name)}) is too many for num_samples ({self.num_samples})")
+
+
+def override_planner(trained: Mapping[str, Any], given: Mapping[str, Any]) -> dict[str, Any]:
+    """An agent's settings of the search with others in their place; a horizon that is given holds for goals too."""
+    goal_horizon = {"goal_horizon": None} if "horizon" in given else {}
+    return {**trained, **goal_horizon, **given}

@@ -32,9 +32,11 @@ from latentplan.goals.expression import (
     walk,
 )
 from latentplan.goals.parser import parse_constraints, parse_objective
-from latentplan.planning.objectives import Constraint, Objective, Rollout, Term, predicted_return
+from latentplan.planning.model import supports
+from latentplan.planning.objectives import Constraint, Objective, Rollout, Term, predicted_return, terminal_value
 
 CAUTION = 0.1  # margins that a plan stays away from where a constraint would break
+GUIDANCE = 0.05  # weight of the learned value at the end of a plan that pursues something else
 GOAL_DISTANCE = 1.0  # root mean square distance of latents that counts as one margin
 
 
@@ -54,7 +56,7 @@ def plan_goals(
         constraints: Inequalities separated by `;`; functions of imagined rollouts stay.
         model: The world model, with `labels` and `label_names`.
         env: Settings of the environment.
-        use_value: Whether `return` has a value at its end; None where the model has one.
+        use_value: Whether rollouts have a value at their end; None where the model has one.
         encode_goal: See `plan_objective`.
 
     Raises:
@@ -65,9 +67,10 @@ def plan_goals(
         objective = parse_objective(objective, known)
     if isinstance(objective, Expression):
         require_labels([node for _, node in objective.terms], model.label_names)
-        learned = predicted_return(model, use_value)
-        wanted = objective
-        objective = None if wanted.is_return else plan_objective(wanted, env.action_repeat, learned, encode_goal)
+        wanted, learned = objective, predicted_return(model, use_value)
+        has_value = supports(model, "value") if use_value is None else use_value
+        guide = GUIDANCE * terminal_value() if has_value else None
+        objective = None if wanted.is_return else plan_objective(wanted, env.action_repeat, learned, guide, encode_goal)
     if isinstance(constraints, str):
         clauses = parse_constraints(constraints, known)
         require_labels(clauses, model.label_names)
@@ -76,16 +79,22 @@ def plan_goals(
 
 
 def plan_objective(
-    expression: Expression, frames_per_step: int, learned: Objective, encode_goal: Callable[[str], Tensor]
+    expression: Expression,
+    frames_per_step: int,
+    learned: Objective,
+    guide: Objective | None,
+    encode_goal: Callable[[str], Tensor],
 ) -> Objective:
     """The predicted worth of an expression, summed over the env frames of each imagined rollout with its weights.
 
-    Only the learned return looks beyond the rollout: the learned value belongs to the task of the training.
+    Nothing tells what an expression is worth beyond the rollout. Where a body can do what it was trained for, though,
+    it has not fallen, and can do most other things as well: a guide of little weight tells those ends from others.
 
     Args:
         expression: What to maximise.
         frames_per_step: Env frames that one imagined step stands for.
         learned: What `return` stands for.
+        guide: Added once where the expression holds no `return`.
         encode_goal: Gives the latent (latent,) of a picture's path; called once per goal.
     """
     objectives: list[Objective] = []
@@ -98,6 +107,8 @@ def plan_objective(
             objectives.append(weight * frames_per_step * closeness)
         else:
             quantities.append((weight * frames_per_step, term))
+    if guide is not None and not any(isinstance(term, LearnedReturn) for _, term in expression.terms):
+        objectives.append(guide)
     if quantities:
         objectives.append(Objective(partial(_worth, tuple(quantities)), needs_states=True, needs=("probe",)))
     return sum(objectives[1:], objectives[0])

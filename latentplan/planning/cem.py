@@ -38,6 +38,7 @@ class CEMPlanner:
     Attributes:
         action_dim: Numbers in an action.
         horizon: Model steps that a plan looks ahead.
+        goal_horizon: The same where `plan` is given an objective, which may know no value; None takes `horizon`.
         num_samples: Candidates per iteration, proposals included; those kept from earlier iterations come on top.
         num_elites: Best candidates that refit the search distribution.
         num_iterations: Refits of a cold start.
@@ -71,6 +72,7 @@ class CEMPlanner:
 
     action_dim: int
     horizon: int
+    goal_horizon: int | None = None
     num_samples: int = 256
     num_elites: int = 32
     num_iterations: int = 4
@@ -179,8 +181,9 @@ def _validate(planner: CEMPlanner) -> None:
     for name in ("action_dim", "horizon", "num_samples", "num_elites", "num_iterations"):
         if getattr(planner, name) < 1:
             raise ValueError(f"{name} must be at least 1, got {getattr(planner, name)}")
-    if planner.warm_start_iterations is not None and planner.warm_start_iterations < 1:
-        raise ValueError(f"warm_start_iterations must be at least 1, got {planner.warm_start_iterations}")
+    for name in ("warm_start_iterations", "goal_horizon"):
+        if getattr(planner, name) is not None and getattr(planner, name) < 1:
+            raise ValueError(f"{name} must be at least 1, got {getattr(planner, name)}")
     if planner.num_elites > planner.num_samples:
         raise ValueError(f"num_elites ({planner.num_elites}) must not exceed num_samples ({planner.num_samples})")
     if not 0 <= planner.num_policy_samples < planner.num_samples:

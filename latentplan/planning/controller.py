@@ -52,8 +52,9 @@ class ModelPredictiveController:
         generator: Generators = None,
         replan_every: int = 1,
     ) -> None:
-        if not 1 <= replan_every <= planner.horizon:
-            raise ValueError(f"replan_every ({replan_every}) must lie in 1 to the horizon ({planner.horizon})")
+        horizon = min(planner.horizon, planner.goal_horizon or planner.horizon)
+        if not 1 <= replan_every <= horizon:
+            raise ValueError(f"replan_every ({replan_every}) must lie in 1 to the horizon ({horizon})")
         self.planner = planner
         self.model = model
         self.objective = objective
@@ -97,7 +98,8 @@ class ModelPredictiveController:
         action = self._act(tree_map(lambda leaf: leaf[rows.to(leaf.device)], state), generator)
         assert self.plan is not None
         spread = self.plan.spread(where)
-        self.plan = spread if whole is None else whole.updated(where, spread)
+        is_alike = whole is not None and whole.mean.shape == spread.mean.shape  # else it was for another objective
+        self.plan = whole.updated(where, spread) if whole is not None and is_alike else spread
         return action
 
     def skip(self) -> None:

@@ -118,6 +118,7 @@ class WarmStart:
 def shift_plan(
     previous: Plan,
     *,
+    horizon: int,
     tail: str,
     variance: str,
     initial_var: Tensor,
@@ -127,18 +128,19 @@ def shift_plan(
     """Moves a plan forward by the actions executed since, and fills what that leaves open at its end.
 
     Args:
-        previous: The last plan.
+        previous: The last plan, of any length.
+        horizon: Actions of the next one.
         tail: `zero`, `hold` (the last action again) or `policy`.
         variance: `reset` to the initial variance, `keep`, or `inflate` halfway between the two.
         initial_var: Variance of a cold start, (action,).
         bounds: Lowest and highest action, each (action,).
         policy_tail: `policy_tail(sequence, is_tail) -> sequence` fills by the model's policy.
     """
-    batch, horizon, _ = previous.mean.shape
+    length = previous.mean.shape[1]
     device, low, high = previous.mean.device, *bounds
     position = torch.arange(horizon)[None] + previous.elapsed[:, None]
-    is_tail = (position >= horizon).to(device)[..., None]  # (batch, horizon, 1)
-    index = position.clamp_max(horizon - 1).to(device)[..., None]
+    is_tail = (position >= length).to(device)[..., None]  # (batch, horizon, 1)
+    index = position.clamp_max(length - 1).to(device)[..., None]
 
     def move(sequence: Tensor) -> Tensor:
         return torch.take_along_dim(sequence, index, dim=1)  # past its end this repeats the last action: `hold`

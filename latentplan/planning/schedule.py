@@ -175,9 +175,8 @@ class PlanScheduler:
         if asked is None or asked[1] != tick:  # asked for before a reset
             return
         self.buffer.submit(plan.actions, tick)
-        self._courses = {
-            first: held for first, held in self._courses.items() if first + self.planner.horizon > self.tick
-        }
+        now, courses = self.tick, self._courses.items()
+        self._courses = {first: course for first, course in courses if now - first < course.actions.shape[1]}
         self._courses[tick] = Course(self.model, asked[2], plan.actions)
         self._last = finished
         if self._follows_latency:
@@ -200,7 +199,7 @@ class PlanScheduler:
             self._asked = (self.tick, due, state)
 
     def _warm_start(self, due: int) -> Plan | None:
-        if self._last is None or due - self._last[0] >= self.planner.horizon:
+        if self._last is None or due - self._last[0] >= self._last[1].mean.shape[1]:
             return None
         first_tick, plan = self._last
         return plan.executed(torch.full_like(plan.elapsed, due - first_tick))

@@ -57,12 +57,13 @@ class Search:
         self.batch, self.device, self.dtype = count_rows(state), state_device(state), action_dtype(state)
         self.low = self._constant(options.action_low, "action_low")
         self.high = self._constant(options.action_high, "action_high")
+        self.horizon = options.horizon if objective is None else options.goal_horizon or options.horizon
         half_range = (self.high - self.low) / 2
         self.init_std = half_range if options.init_std is None else self._constant(options.init_std, "init_std")
         # Only what the policy was trained for is its business.
         self.may_follow_policy = options.num_policy_samples > 0 and objective is None and not constraints
         self.streams = Streams(generator, self.batch, self.device)
-        discounts = options.discount ** torch.arange(options.horizon + 1, dtype=self.dtype, device=self.device)
+        discounts = options.discount ** torch.arange(self.horizon + 1, dtype=self.dtype, device=self.device)
         self.scorer = Scorer.build(
             model,
             objective,
@@ -72,7 +73,7 @@ class Search:
             use_continues=options.use_continues,
             penalty=options.constraint_penalty,
         )
-        size = (self.batch, self.scorer.objective.num_particles, self.dtype, self.device)
+        size = (self.batch, self.horizon, self.scorer.objective.num_particles, self.dtype, self.device)
         seconds = None if deadline_ms is None else deadline_ms / 1000
         self.budget = Budget(options.pace, size, options.clock or time.perf_counter, started, seconds, self.device)
 
@@ -199,7 +200,7 @@ class Search:
 
     def _sample(self, centre: Tensor, spread: Tensor, num: int) -> Tensor:
         options = self.options
-        noise = self.streams.noise(num, options.horizon, options.action_dim, options.noise_beta, self.dtype)
+        noise = self.streams.noise(num, self.horizon, options.action_dim, options.noise_beta, self.dtype)
         samples = torch.addcmul(centre, spread, noise)
         return torch.minimum(torch.maximum(samples, self.low, out=samples), self.high, out=samples)
 
@@ -266,16 +267,18 @@ class Search:
         )
 
     def _cold_start(self) -> WarmStart:
-        shape = (self.batch, self.options.horizon, self.options.action_dim)
+        shape = (self.batch, self.horizon, self.options.action_dim)
         mean = torch.zeros_like(self.low).clamp(self.low, self.high).expand(shape)
         return WarmStart(mean, self.init_std.square().expand(shape), None, torch.zeros(self.batch, dtype=torch.bool))
 
     def _shift(self, previous: Plan) -> WarmStart:
-        shape, bounds = (self.batch, self.options.horizon, self.options.action_dim), (self.low, self.high)
-        if previous.mean.shape != shape:
-            raise ValueError(f"the last plan has shape {tuple(previous.mean.shape)}, this search {shape}")
+        (batch, _, dim), bounds = previous.mean.shape, (self.low, self.high)
+        if (batch, dim) != (self.batch, self.options.action_dim):
+            ours = f"{self.batch} environments and actions of {self.options.action_dim}"
+            raise ValueError(f"the last plan is for {batch} environments and actions of {dim}, this search for {ours}")
         return shift_plan(
             previous,
+            horizon=self.horizon,
             tail=self.options.tail,
             variance=self.options.warm_start_variance,
             initial_var=self.init_std.square(),

@@ -6,11 +6,11 @@ import pytest
 import torch
 from torch import Tensor
 
-from latentplan.config import UserError
-from latentplan.goals.objective import plan_constraint, plan_degree, plan_objective, require_labels
+from latentplan.config import EnvConfig, UserError
+from latentplan.goals.objective import plan_constraint, plan_degree, plan_goals, plan_objective, require_labels
 from latentplan.goals.parser import parse_constraints, parse_objective
 from latentplan.planning import CEMPlanner
-from latentplan.planning.objectives import Objective, Rollout, learned_return, predicted_return
+from latentplan.planning.objectives import Objective, Rollout, learned_return, predicted_return, terminal_value
 
 SCALES = {"cart": 0.5, "cart_speed": 1.0, "task.right": 0.5}
 
@@ -42,9 +42,9 @@ class Cart:
         return torch.cat([features, torch.sigmoid(5 * cart)], dim=-1)
 
 
-def objective(text, frames_per_step=1, encode_goal=None):
-    model = Cart()
-    return plan_objective(parse_objective(text, SCALES), frames_per_step, predicted_return(model, None), encode_goal)
+def objective(text, frames_per_step=1, encode_goal=None, guide=None):
+    learned = predicted_return(Cart(), None)
+    return plan_objective(parse_objective(text, SCALES), frames_per_step, learned, guide, encode_goal)
 
 
 def plan_cart(text=None, constraints=(), start=(0.0, 0.0), **options):
@@ -99,6 +99,24 @@ def test_return_is_reward_and_value_and_can_be_weighted():
 def test_an_expression_alone_ends_with_the_rollout():
     assert "value" not in objective("cart > 0.3").needs
     assert "value" in objective("return + cart").needs
+
+
+def test_the_learned_value_guides_where_the_expression_does_not_hold_it():
+    rollout = rollout_of(torch.tensor([[[1.0, 0.0]], [[2.0, 0.0]]]), rewards=torch.tensor([[3.0, 4.0]]))
+    guide = 0.1 * terminal_value()
+    assert objective("cart > 0", guide=guide)(rollout).item() == pytest.approx(1.5 + 0.1 * 0.25 * -20.0)
+    with_return = "return + 2 * (cart > 0)"
+    assert objective(with_return, guide=guide)(rollout).item() == objective(with_return)(rollout).item()
+
+
+@pytest.mark.parametrize(("use_value", "needs"), [(None, True), (True, True), (False, False)])
+def test_goals_are_guided_where_the_search_may_use_the_value(use_value, needs):
+    model = Cart()
+    model.labels = SCALES
+    goals = {"model": model, "env": EnvConfig(domain="cartpole", task="swingup"), "encode_goal": None}
+    pursued, _ = plan_goals("cart > 0.3", (), use_value=use_value, **goals)
+    assert ("value" in pursued.needs) == needs
+    assert plan_goals("return", (), use_value=use_value, **goals)[0] is None
 
 
 def test_a_goal_image_draws_the_latent_near_its_own():

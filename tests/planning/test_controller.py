@@ -154,3 +154,34 @@ def test_deciding_for_some_first_leaves_the_others_cold(states, make_controller,
     assert controller.plan.is_warm.tolist() == [False, False, True, False, False]
     with pytest.raises(ValueError, match="at least one"):
         controller.act_where(states, torch.zeros(5))
+
+
+def test_an_objective_is_planned_for_as_far_ahead_as_it_asks_for(states, make_controller):
+    """What is left of the last plan is where the next search starts, cut or filled with zeros."""
+    controller = make_controller(goal_horizon=9, init_std=0.0, num_iterations=1)
+    controller.act(states)
+    own = controller.plan.actions
+    controller.set_objective(action_penalty())
+    controller.act(states)
+    assert controller.plan.actions.shape == (5, 9, 2)
+    torch.testing.assert_close(controller.plan.mean[:, :5], own[:, 1:])
+    assert (controller.plan.mean[:, 5:] == 0).all()
+    further = controller.plan.actions
+    controller.set_objective(None)
+    controller.act(states)
+    torch.testing.assert_close(controller.plan.mean, further[:, 1:7])
+
+
+def test_a_plan_of_another_length_is_no_plan_of_the_other_environments(states, make_controller):
+    controller = make_controller(goal_horizon=9)
+    controller.act(states)
+    controller.set_objective(action_penalty())
+    some = torch.tensor([1, 0, 0, 1, 0]).bool()
+    controller.act_where(states, some)
+    assert controller.plan.is_warm.tolist() == some.tolist()
+    assert controller.follow()[1].tolist() == some.tolist()
+
+
+def test_no_more_is_executed_than_the_shorter_plan_holds(make_controller):
+    with pytest.raises(ValueError, match="horizon \\(3\\)"):
+        make_controller(replan_every=4, goal_horizon=3)

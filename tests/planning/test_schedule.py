@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from latentplan.planning import CEMPlanner, FunctionModel, PlanBuffer, PlanScheduler
+from latentplan.planning import CEMPlanner, FunctionModel, PlanBuffer, PlanScheduler, learned_return
 
 HORIZON = 4
 
@@ -80,6 +80,7 @@ class VirtualExecutor:
     def __init__(self, planner, model, durations):
         self.planner, self.model, self.durations = planner, model, iter(durations)
         self.now, self.requests, self.work = 0.0, [], None
+        self.plan_for = None
 
     @property
     def is_idle(self):
@@ -88,7 +89,7 @@ class VirtualExecutor:
     def request(self, state, tick, previous=None, seed=None):
         self.requests.append((state, tick, previous, seed))
         generator = None if seed is None else torch.Generator().manual_seed(seed)
-        plan = self.planner.plan(self.model, state, previous, generator=generator)
+        plan = self.planner.plan(self.model, state, previous, objective=self.plan_for, generator=generator)
         self.work = (self.now + next(self.durations), tick, plan)
         return True
 
@@ -235,3 +236,13 @@ def test_equal_streams_and_durations_give_equal_decisions(model):
         scheduler, executor = make(model, [1.3] * 100)
         runs.append(torch.cat([decision.action for decision in drive(scheduler, executor, 20)[0]]))
     assert torch.equal(*runs)
+
+
+def test_plans_for_an_objective_are_used_to_their_end(model):
+    """They may be longer than those for the model's own return."""
+    planner = CEMPlanner(action_dim=1, horizon=2, goal_horizon=6, num_samples=32, num_elites=4)
+    executor = VirtualExecutor(planner, model, [0.5, 1e9])
+    executor.plan_for = learned_return()
+    scheduler = PlanScheduler(planner, model, executor)
+    decisions, _ = drive(scheduler, executor, 9)
+    assert [decision.source for decision in decisions] == ["actor", "plan", "plan", *["tail"] * 4, "actor", "actor"]
