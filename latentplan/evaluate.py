@@ -90,7 +90,8 @@ def _evaluate(argv: Sequence[str]) -> int:
             flush=True,
         )
         played = env if goals is None else score_env(env, goals, agent if request.mode in PLANNING_MODES else None)
-        horizon = planner.goal_horizon if goals is not None and goals.phases else None
+        is_foreign = goals is not None and any(not phase.objective.is_return for phase in goals.phases)
+        horizon = planner.goal_horizon if is_foreign else None
         return _play_and_report(request, played, agent, about, horizon or planner.horizon, clock)
     except OSError as error:
         raise UserError(f"an output could not be written: {error}") from error
