@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from latentplan.planning import FunctionModel, icem_planner, mppi_planner, refit
+from latentplan.planning import FunctionModel, icem_planner, learned_return, mppi_planner, refit
 from latentplan.planning.sampling import Streams
 
 CHANGES = [
@@ -52,6 +52,14 @@ def test_option_changes_a_cold_plan(model, states, make_planner, seeded, options
     assert plain.mean.shape != changed.mean.shape or not torch.equal(plain.mean, changed.mean)
 
 
+def test_the_goal_horizon_changes_plans_for_objectives_alone(model, states, make_planner, seeded):
+    plain, changed = make_planner(), make_planner(goal_horizon=9)
+    own, same = (planner.plan(model, states, generator=seeded()) for planner in (plain, changed))
+    assert torch.equal(own.mean, same.mean)
+    given = {"objective": learned_return(), "generator": seeded()}
+    assert changed.plan(model, states, **given).actions.shape[1] == 9 != plain.horizon
+
+
 @pytest.mark.parametrize("options", CHANGES_OF_THE_CHOICE, ids=str)
 def test_option_changes_what_is_executed_and_not_the_search(model, states, make_planner, seeded, options):
     plain = make_planner().plan(model, states, generator=seeded())
@@ -72,6 +80,7 @@ def test_every_option_is_covered_here(make_planner):
     import dataclasses
 
     named = {name for options in CHANGES + CHANGES_OF_THE_CHOICE + CHANGES_WHEN_WARM for name in options}
+    named |= {"goal_horizon"}  # changes nothing but plans that are given an objective
     elsewhere = {"action_dim", "constraint_penalty", "gradient_step_size", "deadline_ms", "clock"}
     assert {field.name for field in dataclasses.fields(make_planner())} == named | elsewhere
 
