@@ -10,7 +10,6 @@ import torch
 from torch import Tensor
 
 from latentplan.planning.cem import CEMPlanner
-from latentplan.planning.course import Course
 from latentplan.planning.model import (
     Model,
     State,
@@ -21,6 +20,7 @@ from latentplan.planning.model import (
     supports,
     take_step,
 )
+from latentplan.planning.nominal import NominalTrajectory
 from latentplan.planning.objectives import Constraint, Term
 from latentplan.planning.plan import Plan
 from latentplan.planning.realtime import PlanBuffer
@@ -77,7 +77,7 @@ class PlanScheduler:
         1. polls the executor, and puts a finished plan into the buffer at the tick it was asked for;
         2. takes this tick's action from the buffer, or from the model's policy (zeros without one) if it has none; an
            action from the buffer gets what the policy does differently here than where the plan expected to be (see
-           `latentplan.planning.course`; nothing without a policy);
+           `latentplan.planning.nominal`; nothing without a policy);
         3. if the executor is idle, asks for the next plan: it predicts how many ticks that takes, rolls the state
            forward by the actions these ticks will take (this one, then the buffer's, then the policy's), and requests
            a plan from there, warm-started from the last one shifted to the same tick.
@@ -117,7 +117,7 @@ class PlanScheduler:
         self._latencies: deque[int] = deque(maxlen=NUM_LATENCIES)
         self._is_warmed_up = False
         self._asked: tuple[int, int, State] | None = None  # tick of the request in work, the tick and state it is for
-        self._courses: dict[int, Course] = {}  # by the tick of the plan's first action
+        self._nominals: dict[int, NominalTrajectory] = {}  # by the tick of the plan's first action
         self._last: tuple[int, Plan] | None = None
 
     @property
@@ -156,7 +156,7 @@ class PlanScheduler:
     def reset(self) -> None:
         """Forget all plans, the one in work too: what it was asked for is over."""
         self.buffer.clear()
-        self._courses = {}
+        self._nominals = {}
         self._asked = self._last = None
 
     def _collect(self) -> None:
@@ -175,9 +175,9 @@ class PlanScheduler:
         if asked is None or asked[1] != tick:  # asked for before a reset
             return
         self.buffer.submit(plan.actions, tick)
-        now, courses = self.tick, self._courses.items()
-        self._courses = {first: course for first, course in courses if now - first < course.actions.shape[1]}
-        self._courses[tick] = Course(self.model, asked[2], plan.actions)
+        now, nominals = self.tick, self._nominals.items()
+        self._nominals = {first: nominal for first, nominal in nominals if now - first < nominal.actions.shape[1]}
+        self._nominals[tick] = NominalTrajectory(self.model, asked[2], plan.actions)
         self._last = finished
         if self._follows_latency:
             self.buffer.fresh_ticks = self.latency_ticks
@@ -206,10 +206,10 @@ class PlanScheduler:
 
     def _follow(self, state: State, tick: int, age: int) -> Tensor:
         """The action (batch, action) at a tick of the plan that is of this age there, held to it by the policy."""
-        course = self._courses[tick - age]
+        nominal = self._nominals[tick - age]
         if not supports(self.model, "policy"):
-            return course.actions[:, age]
-        return course.correct(age, state, self._act_alone).clamp(*self._bounds(state))
+            return nominal.actions[:, age]
+        return nominal.correct(age, state, self._act_alone).clamp(*self._bounds(state))
 
     def _act_alone(self, state: State) -> Tensor:
         low, high = self._bounds(state)

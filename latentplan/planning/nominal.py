@@ -1,4 +1,4 @@
-"""Where a plan leads, and how a policy holds a body on it.
+"""The nominal trajectory of a plan, and how a policy holds a body on it.
 
 A plan that was made for a predicted state is executed where the world has come to instead. What the policy does
 differently at these two states is a feedback law that somebody has learned already: added to the planned action it
@@ -18,7 +18,7 @@ from torch.utils._pytree import tree_map
 from latentplan.planning.model import Model, State, take_step
 
 
-class Course:
+class NominalTrajectory:
     """The states that a plan expects, imagined as far as they are asked for.
 
     Args:

@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from latentplan.planning import CEMPlanner, FunctionModel, PlanScheduler
-from latentplan.planning.course import Course
+from latentplan.planning.nominal import NominalTrajectory
 
 GAIN = -0.5
 PLAN = torch.tensor([[[0.4], [-0.2], [0.1]], [[0.0], [0.3], [0.9]]])
@@ -24,32 +24,32 @@ def linear(state, generator=None):
 
 
 @pytest.fixture
-def course():
-    return Course(FunctionModel(dynamics, no_reward, policy=linear), START, PLAN)
+def nominal():
+    return NominalTrajectory(FunctionModel(dynamics, no_reward, policy=linear), START, PLAN)
 
 
-def test_states_are_those_that_the_actions_lead_to(course):
+def test_states_are_those_that_the_actions_lead_to(nominal):
     for age in (2, 0, 1, 3):
-        torch.testing.assert_close(course.state_at(age), START + PLAN[:, :age].sum(dim=1))
+        torch.testing.assert_close(nominal.state_at(age), START + PLAN[:, :age].sum(dim=1))
 
 
 @pytest.mark.parametrize("age", [0, 1, 2])
-def test_where_the_world_goes_as_imagined_the_plan_stands(course, age):
-    torch.testing.assert_close(course.correct(age, course.state_at(age), linear), PLAN[:, age])
+def test_where_the_world_goes_as_imagined_the_plan_stands(nominal, age):
+    torch.testing.assert_close(nominal.correct(age, nominal.state_at(age), linear), PLAN[:, age])
 
 
 @pytest.mark.parametrize("age", [0, 2])
-def test_the_policy_answers_the_difference(course, age):
+def test_the_policy_answers_the_difference(nominal, age):
     push = torch.tensor([[0.3], [-0.7]])
-    corrected = course.correct(age, course.state_at(age) + push, linear)
+    corrected = nominal.correct(age, nominal.state_at(age) + push, linear)
     torch.testing.assert_close(corrected, PLAN[:, age] + GAIN * push)
 
 
-def test_where_the_policy_is_not_finite_the_plan_stands(course):
+def test_where_the_policy_is_not_finite_the_plan_stands(nominal):
     def broken(state):
         return torch.where(state > 5.0, float("nan"), linear(state))
 
-    corrected = course.correct(0, START + torch.tensor([[9.0], [1.0]]), broken)
+    corrected = nominal.correct(0, START + torch.tensor([[9.0], [1.0]]), broken)
     torch.testing.assert_close(corrected, PLAN[:, 0] + torch.tensor([[0.0], [GAIN]]))
 
 
