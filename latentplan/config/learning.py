@@ -88,6 +88,10 @@ class CollectionConfig:
         noise_std: Standard deviation of the noise added to the planner's action.
         noise_correlation: Of the planner's and the actor's noise between one decision and the next, in [0, 1).
         noise_share: Share of the rounds with that noise; in the others planner and actor act as they are evaluated.
+        goals: Expressions such as `speed -> 2.0 and height > 1.1` that the planner pursues in turn in some rounds, so
+            that the model knows more than the way to the reward.
+        goal_share: Share of all rounds in which it does; planner and actor have the others.
+        goals_after: Simulator frames collected before the first of them.
         episode_decisions: After how many a collected episode is cut short; None plays on. Evaluations are whole.
         prefill_decisions: Random decisions before learning starts.
         round_decisions: Decisions per epoch: this many are collected, then learned from.
@@ -99,6 +103,9 @@ class CollectionConfig:
     noise_std: float = 0.2
     noise_correlation: float = 0.0
     noise_share: float = 1.0
+    goals: tuple[str, ...] = ()
+    goal_share: float = 0.0
+    goals_after: int = 0
     episode_decisions: int | None = None
     prefill_decisions: int = 1000
     round_decisions: int = 250
@@ -107,6 +114,8 @@ class CollectionConfig:
 
     def __post_init__(self) -> None:
         one_of(self, behaviour=BEHAVIOURS)
-        at_least(self, noise_std=0.0, prefill_decisions=1, round_decisions=1)
-        within(self, noise_correlation=(0.0, 0.99), noise_share=(0.0, 1.0))
+        at_least(self, noise_std=0.0, prefill_decisions=1, round_decisions=1, goals_after=0)
+        within(self, noise_correlation=(0.0, 0.99), noise_share=(0.0, 1.0), goal_share=(0.0, 1.0))
+        if self.goal_share > 0.0 and not self.goals:
+            raise ValueError("goal_share needs goals; name at least one expression in collection.goals")
         above_zero(self, "updates_per_decision", "episode_decisions")

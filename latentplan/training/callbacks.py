@@ -64,10 +64,10 @@ class Experience(lightning.Callback):
             self._take_round()
         self.take()
         weights = {name: value.detach().cpu().numpy().copy() for name, value in learner.model.state_dict().items()}
-        behaviour, noisy = turn(settings, state.rounds)
+        behaviour, noisy, goal = turn(settings, state.rounds, state.env_frames)
         decisions = min(settings.round_decisions, self._decisions_left())
         if decisions > 0:
-            self.worker.submit("collect", weights, behaviour, decisions, state.rounds, noisy)
+            self.worker.submit("collect", weights, behaviour, decisions, state.rounds, noisy, goal)
             self._asked_round = True
         if self._asked_round and state.env_frames >= state.next_evaluation:
             self._ask_evaluation(learner.updates)
@@ -114,13 +114,25 @@ class Experience(lightning.Callback):
         self.episode_returns.extend(collected.episode_returns)
 
 
-def turn(settings: CollectionConfig, rounds: int) -> tuple[str, bool]:
-    """Who collects after so many rounds, and whether with noise: both take turns, and share the noise evenly."""
-    own, behaviour = rounds, settings.behaviour
+def turn(settings: CollectionConfig, rounds: int, env_frames: int) -> tuple[str, bool, str | None]:
+    """Who collects after so many rounds and simulator frames, whether with noise, and for which goal if for one.
+
+    Planner and actor take turns in the rounds without a goal; all three share the noise evenly.
+    """
+    goals, share = 0, settings.goal_share
+    if share > 0.0 and env_frames >= settings.goals_after:
+        goals = int(rounds * share)
+        if int((rounds + 1) * share) > goals:
+            return "planner", _has_noise(settings, goals), settings.goals[goals % len(settings.goals)]
+    own, behaviour = rounds - goals, settings.behaviour
     if behaviour == "both":
-        own, who = divmod(rounds, 2)
+        own, who = divmod(own, 2)
         behaviour = ("planner", "actor")[who]
-    return behaviour, int((own + 1) * settings.noise_share) > int(own * settings.noise_share)
+    return behaviour, _has_noise(settings, own), None
+
+
+def _has_noise(settings: CollectionConfig, own: int) -> bool:
+    return int((own + 1) * settings.noise_share) > int(own * settings.noise_share)
 
 
 class Record(lightning.Callback):

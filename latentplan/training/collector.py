@@ -86,12 +86,18 @@ class Collector:
         self.labels: dict[str, float] = getattr(self._eval_env.unwrapped, "labels", {})
         self.model = WorldModel(config.model, action_dim, self.labels).to(device)
         noise, correlation = config.collection.noise_std, config.collection.noise_correlation
+        planners = {
+            (who, noisy): PlanningAgent(
+                self.model, config, discount, noise_std=noise if noisy else 0.0, noise_correlation=correlation
+            )
+            for who in ("planner", "goal")
+            for noisy in (True, False)
+        }
+        for goal in config.collection.goals:
+            planners["goal", True].set_objective(goal)  # to be refused now, if at all
         self._agents: dict[tuple[str, bool], ModelAgent] = {
-            ("planner", True): PlanningAgent(
-                self.model, config, discount, noise_std=noise, noise_correlation=correlation
-            ),
+            **planners,
             ("actor", True): ActorAgent(self.model, config, explore=True, noise_correlation=correlation),
-            ("planner", False): PlanningAgent(self.model, config, discount),
             ("actor", False): ActorAgent(self.model, config),
         }
         self._judged: dict[str, ModelAgent] = {
@@ -104,6 +110,7 @@ class Collector:
         self._ended = np.ones(config.env.num_envs, dtype=bool)
         self._returns = np.zeros(config.env.num_envs)
         self._acting: object = None
+        self._pursues_goal = False
 
     def describe(self) -> Description:
         """What the learner has to know of the environment."""
@@ -117,7 +124,13 @@ class Collector:
         return Description(self.model.action_dim, self.discount, render_ms, renderer, self.labels)
 
     def collect(
-        self, weights: dict[str, np.ndarray] | None, behaviour: str, decisions: int, counter: int, noisy: bool = True
+        self,
+        weights: dict[str, np.ndarray] | None,
+        behaviour: str,
+        decisions: int,
+        counter: int,
+        noisy: bool = True,
+        goal: str | None = None,
     ) -> Collected:
         """Take `decisions` decisions in all, with new weights; continues the episodes of the last round.
 
@@ -127,10 +140,14 @@ class Collector:
             decisions: Rounded up to a multiple of the number of environments.
             counter: Number of the round, from which its random stream derives.
             noisy: Whether it explores, or acts as it is evaluated.
+            goal: What the planner pursues in place of the reward; its plans are not kept for the actor to imitate.
         """
-        agent = self._random if weights is None else self._agents[behaviour, noisy]
+        agent = self._random if weights is None else self._agents[behaviour if goal is None else "goal", noisy]
         if weights is not None:
             self._load(weights)
+        if isinstance(agent, PlanningAgent) and goal is not None:
+            agent.set_objective(goal)
+        self._pursues_goal = goal is not None
         if agent is not self._acting:
             agent.reset()
             self._acting = agent
@@ -195,7 +212,7 @@ class Collector:
         actions = agent.act(frames)
         state = agent.state if isinstance(agent, ModelAgent) else None
         deter = None if state is None else state.deter.float().cpu().numpy()
-        plan = agent.planned_action() if isinstance(agent, PlanningAgent) else None
+        plan = agent.planned_action() if isinstance(agent, PlanningAgent) and not self._pursues_goal else None
         self._frames, rewards, terminated, truncated, info = self.envs.step(actions)
         if not np.isfinite(rewards).all():
             raise UserError(f"the environment gave rewards that are not finite: {rewards.tolist()}")

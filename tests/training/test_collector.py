@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from latentplan.config import CollectionConfig
+from latentplan.config import CollectionConfig, UserError
 from latentplan.models import WorldModel
 from latentplan.training.callbacks import turn
 from latentplan.training.collector import Collector
@@ -123,7 +123,25 @@ def test_a_round_without_noise_acts_as_agents_are_judged(make_collector, tiny, b
 
 
 def _turns(count, **settings):
-    return [turn(CollectionConfig(**settings), rounds) for rounds in range(count)]
+    return [turn(CollectionConfig(**settings), rounds, 100 * rounds)[:2] for rounds in range(count)]
+
+
+def test_goals_take_their_share_in_turn_and_leave_the_rest_as_it_was():
+    settings = CollectionConfig(behaviour="both", noise_share=0.5, goals=("a", "b"), goal_share=0.2, goals_after=1000)
+    turns = [turn(settings, rounds, 100 * rounds) for rounds in range(60)]
+    assert all(goal is None for _, _, goal in turns[:10])
+    pursued = [entry for entry in turns[10:] if entry[2] is not None]
+    assert [goal for _, _, goal in pursued] == ["a", "b"] * 5
+    assert {who for who, _, _ in pursued} == {"planner"} and sum(noisy for _, noisy, _ in pursued) == 5
+    others = [entry[:2] for entry in turns[10:] if entry[2] is None]
+    assert {entry: others.count(entry) for entry in others} == {
+        (who, noisy): 10 for who in ("planner", "actor") for noisy in (True, False)
+    }
+
+
+def test_a_share_of_no_goals_is_refused():
+    with pytest.raises(ValueError, match="goal_share needs goals"):
+        CollectionConfig(goal_share=0.1)
 
 
 def test_planner_and_actor_share_the_noise_evenly():
@@ -135,6 +153,42 @@ def test_planner_and_actor_share_the_noise_evenly():
         "actor": 20,
     }
     assert [sum(noisy for who, noisy in turns if who == name) for name in ("planner", "actor")] == [5, 5]
+
+
+@pytest.fixture
+def make_cart(tiny):
+    collectors = []
+
+    def make(**collection):
+        config = tiny("", env={"domain": "cartpole", "task": "swingup"}, collection=collection)
+        collectors.append(Collector(config, None, "cpu"))
+        return collectors[-1]
+
+    yield make
+    for collector in collectors:
+        collector.close()
+
+
+def test_a_round_for_a_goal_plans_for_it_and_leaves_nothing_to_imitate(make_cart):
+    goals = ("cart -> 0.8", "cart -> -0.8")
+    both = make_cart(goals=goals, noise_std=0.0)
+    weights = {name: value.numpy().copy() for name, value in both.model.state_dict().items()}
+    plain, *pursued = (
+        make_cart(goals=goals, noise_std=0.0).collect(weights, "planner", 8, 0, True, goal).rows[0]
+        for goal in (None, *goals)
+    )
+    assert (plain.plan != 0.0).any() and all((rows.plan == 0.0).all() for rows in pursued)
+    assert not np.array_equal(plain.actions, pursued[0].actions)
+    assert not np.array_equal(pursued[0].actions, pursued[1].actions)
+    both.collect(weights, "planner", 8, 0, True, goals[0])
+    (after,) = both.collect(weights, "planner", 8, 1).rows
+    assert (after.plan != 0.0).any()
+
+
+@pytest.mark.parametrize(("goal", "said"), [("cart -> ", "expected"), ("height > 1.0", "height")])
+def test_goals_that_cannot_be_pursued_are_refused_before_anything_is_collected(make_cart, goal, said):
+    with pytest.raises(UserError, match=said):
+        make_cart(goals=("cart -> 0.5", goal), goal_share=0.5)
 
 
 def test_judging_neither_explores_nor_disturbs_the_collection(make_collector, tiny):
