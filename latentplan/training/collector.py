@@ -110,7 +110,6 @@ class Collector:
         self._ended = np.ones(config.env.num_envs, dtype=bool)
         self._returns = np.zeros(config.env.num_envs)
         self._acting: object = None
-        self._pursues_goal = False
 
     def describe(self) -> Description:
         """What the learner has to know of the environment."""
@@ -147,7 +146,6 @@ class Collector:
             self._load(weights)
         if isinstance(agent, PlanningAgent) and goal is not None:
             agent.set_objective(goal)
-        self._pursues_goal = goal is not None
         if agent is not self._acting:
             agent.reset()
             self._acting = agent
@@ -212,7 +210,9 @@ class Collector:
         actions = agent.act(frames)
         state = agent.state if isinstance(agent, ModelAgent) else None
         deter = None if state is None else state.deter.float().cpu().numpy()
-        plan = agent.planned_action() if isinstance(agent, PlanningAgent) and not self._pursues_goal else None
+        plan = None
+        if isinstance(agent, PlanningAgent) and agent.controller.objective is None:
+            plan = agent.planned_action()
         self._frames, rewards, terminated, truncated, info = self.envs.step(actions)
         if not np.isfinite(rewards).all():
             raise UserError(f"the environment gave rewards that are not finite: {rewards.tolist()}")
