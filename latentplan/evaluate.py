@@ -77,14 +77,15 @@ def _evaluate(argv: Sequence[str]) -> int:
         overrides["planning_budget"] = request.planning_budget
     device = use_device(request.device, request.threads or (1 if request.mode in ON_ONE_THREAD else None))
     from latentplan.envs import make_env
-    from latentplan.scoring import read_goals, score_env
+    from latentplan.scoring import goal_env, read_goals, score_env
 
     goals = read_goals(request.objective, request.constraint, config.env.domain)
-    env = make_env(config.env)
+    world = config.env if goals is None else goal_env(config.env)
+    env = make_env(world)
     try:
         clock = VirtualClock(request.control_hz, request.latency)
         agent = load_timed_agent(request.checkpoint, request.mode, clock, device, **overrides)
-        about = _describe(request, info, config.env, planner)
+        about = _describe(request, info, world, planner)
         print(
             f"{about['domain']}-{about['task']}, {request.mode} on {device}, pictures by {about['renderer']}",
             flush=True,
@@ -151,6 +152,7 @@ def _describe(
         "seed": request.seed,
         "env_frames_trained": int(info["env_frames"]),
         "render_quality": env.render_quality,
+        "floor": env.floor,
         "renderer": render_info()["renderer"],
     }
     return {**described, "planner": to_dict(planner)} if request.mode in PLANNING_MODES else described

@@ -7,13 +7,14 @@ for a goal image from the camera's own pictures. It is the same whoever acts.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
+from latentplan.config import EnvConfig
 from latentplan.config.quantities import scales
 from latentplan.envs.quantities import clause_degree, quantity_names
 from latentplan.goals.expression import (
@@ -64,6 +65,14 @@ class Score:
 
     objective_return: float
     violation_rate: float
+
+
+def goal_env(config: EnvConfig) -> EnvConfig:
+    """Where goals are pursued: the world of the training, the floor drawn behind the start as well.
+
+    What moves away from its start backwards would soon see nothing pass by, and could not tell its own speed.
+    """
+    return replace(config, floor="endless")
 
 
 def read_goals(objective: str | None, constraint: str | None, domain: str) -> Goals | None:

@@ -161,11 +161,13 @@ def test_every_mode_reports_scores_on_the_same_objective(tmp_path, checkpoint, m
     assert result["objective_return"] == pytest.approx(np.mean(result["objective_returns"]))
     assert 0.0 < result["objective_return"] <= 1000.0
     assert 0.0 <= result["violation_rate"] <= 1.0
+    assert result["floor"] == "endless"
 
 
 def test_results_without_goals_hold_no_scores(tmp_path, checkpoint):
     result = evaluate_agent(checkpoint, tmp_path, "--mode", "random")
     assert not {"objective", "objective_return", "violation_rate"} & result.keys()
+    assert result["floor"] == "suite"
 
 
 @pytest.mark.parametrize("mode", ["planner", "background"])

@@ -34,6 +34,7 @@ __all__ = [
 
 LATENT_DIM = 32
 RENDER_QUALITIES = ("exact", "fast", "fastest")
+FLOORS = ("suite", "endless")
 DEVICES = ("auto", "cpu", "cuda")
 
 
@@ -48,6 +49,8 @@ class EnvConfig:
         camera: Camera id of the MuJoCo model.
         render_quality: `exact` (dm_control's default), `fast` (small shadow map) or `fastest`
             (no shadows, reflections or anti-aliasing: a visibly easier picture).
+        floor: `suite` ends the picture of the floor where the suite does, two metres behind a walker's start; `endless`
+            draws it there as well, for goals that lead backwards. Physics and the picture ahead are the same.
         num_envs: Environments that collect at once; more than one runs each in its own process.
         objective: Expression over the body's quantities that pays in place of the task's reward, once per control step,
             such as `speed -> 2.0 and height > 1.1`; None leaves the task's.
@@ -58,12 +61,13 @@ class EnvConfig:
     action_repeat: int = 2
     camera: int = 0
     render_quality: str = "fast"
+    floor: str = "suite"
     num_envs: int = 1
     objective: str | None = None
 
     def __post_init__(self) -> None:
         at_least(self, action_repeat=1, num_envs=1, camera=-1)
-        one_of(self, render_quality=RENDER_QUALITIES)
+        one_of(self, render_quality=RENDER_QUALITIES, floor=FLOORS)
 
 
 @dataclass(frozen=True)

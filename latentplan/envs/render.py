@@ -91,6 +91,21 @@ class FrameRenderer:
         mujoco.mjr_readPixels(self._pixels, None, self._rectangle, self._context.ptr)
 
 
+def draw_floor_behind(physics: Physics) -> None:
+    """Move every floor that begins just behind the start so far back that its middle lies where it began.
+
+    A plane's size is for drawing only: bodies meet it everywhere. Moved by half its length, its pattern and its light
+    fall on the same places as before; half of what was drawn ahead is left, 48 m and more.
+    """
+    import mujoco
+
+    model = physics.model
+    for geom in range(model.ngeom):
+        centre, half = model.geom_pos[geom][0], model.geom_size[geom][0]
+        if model.geom_type[geom] == mujoco.mjtGeom.mjGEOM_PLANE and centre > 0.0 and half > centre:
+            model.geom_pos[geom][0] -= half
+
+
 def _make_context(physics: Physics, gl: object, size: int, quality: str) -> Any:
     """MuJoCo's drawing context; it reads its settings from the model, which is left as it was."""
     from dm_control.mujoco import wrapper

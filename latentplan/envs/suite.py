@@ -15,7 +15,7 @@ from gymnasium.error import ResetNeeded
 from latentplan.config import EnvConfig, UserError
 from latentplan.envs.gl import explain_gl_errors, require_backend
 from latentplan.envs.quantities import measure, scales, true_values
-from latentplan.envs.render import FrameRenderer
+from latentplan.envs.render import FrameRenderer, draw_floor_behind
 from latentplan.envs.reward import ObjectiveReward
 from latentplan.envs.schedule import control_step, split_schedule
 
@@ -96,6 +96,8 @@ class SuiteEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         task = default_task(config.domain) if config.task is None else config.task
         self._task_env = _load(config.domain, task)
         self._camera = _checked_camera(self.physics, config)
+        if config.floor == "endless":
+            draw_floor_behind(self.physics)
         self.domain, self._quality = config.domain, config.render_quality
         self.labels = scales(config.domain)
         self._renderers: dict[int, FrameRenderer] = {}

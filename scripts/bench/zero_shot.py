@@ -144,14 +144,14 @@ def play_job(conditions: Conditions, job: Job) -> dict[str, Any]:
     from latentplan.checkpoint import load_model
     from latentplan.envs import make_env
     from latentplan.rollout import run_episodes, summarize
-    from latentplan.scoring import read_goals, score_env
+    from latentplan.scoring import goal_env, read_goals, score_env
 
     torch.set_num_threads(1)
     _, config, _ = load_model(conditions.checkpoint)
     agent = make_player(job.player, conditions.checkpoint, conditions.device, conditions.planner)
     goals = read_goals(job.objective, job.constraint, config.env.domain)
     assert goals is not None, "a job names an objective or a constraint"
-    env = make_env(config.env)
+    env = make_env(goal_env(config.env))
     try:
         scored = score_env(env, goals, agent if job.player in PURSUERS else None)
         result = summarize(run_episodes(scored, agent, conditions.seeds, on_step=_pusher(env, conditions)))

@@ -155,6 +155,25 @@ def test_the_exact_picture_is_dm_controls_own():
     assert np.array_equal(frame, expected)
 
 
+@pytest.mark.parametrize("domain", ["walker", "cheetah"])
+def test_an_endless_floor_changes_nothing_but_what_is_seen_behind_the_start(domain):
+    """Behind, the suite draws no floor: pictures differ there; ahead they are the same, to rounding."""
+    envs = [make_env(config(domain=domain, floor=floor), seed=0) for floor in ("suite", "endless")]
+    differences = {}
+    for place in (-8.0, 8.0):
+        for env in envs:
+            env.reset(seed=1)
+            env.physics.named.data.qpos["rootx"] = place
+            env.physics.forward()
+        differences[place] = np.abs(envs[0].render().astype(int) - envs[1].render()).max()
+    states = [(env.step(np.ones(6)), env.true_state())[1] for env in envs]
+    for env in envs:
+        env.close()
+    assert differences[-8.0] > 20
+    assert differences[8.0] <= 1
+    assert np.array_equal(*states)
+
+
 def test_large_pictures_show_the_same_view(env):
     frame, _ = env.reset(seed=0)
     large = env.unwrapped.render_large(256)
