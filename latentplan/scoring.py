@@ -61,10 +61,12 @@ class Score:
     Attributes:
         objective_return: Worth of the objective summed over env frames; 0 without one.
         violation_rate: Share of the env frames at which a constraint was broken; 0 without one.
+        quantities: Mean of every true quantity over the env frames.
     """
 
     objective_return: float
     violation_rate: float
+    quantities: dict[str, float]
 
 
 def goal_env(config: EnvConfig) -> EnvConfig:
@@ -121,10 +123,12 @@ class ScoredEnv(gymnasium.Wrapper[Any, Any, Any, Any]):
         self._pictures = {path: read_goal(path) for phase in goals.phases for path in _goal_paths(phase.objective)}
         self._present: Phase | None = None
         self._num_frames = self._num_violated = 0
+        self._totals = np.zeros(len(self._names))
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         """Begins an episode and a score."""
         self._num_frames = self._num_violated = 0
+        self._totals = np.zeros(len(self._names))
         self.worth, self.clauses, self._present = [], [], None
         self._announce()
         return self.env.reset(seed=seed, options=options)
@@ -137,6 +141,7 @@ class ScoredEnv(gymnasium.Wrapper[Any, Any, Any, Any]):
         """As `SuiteEnv.step_schedule`, and scores each control step."""
         frame, reward, terminated, truncated, info = self._suite_env.step_schedule(schedule)
         for quantities, frame_reward in zip(info["quantities"], info["rewards"], strict=True):
+            self._totals += quantities
             self._score(dict(zip(self._names, quantities, strict=True)), frame_reward, frame)
         if terminated or truncated:
             self.scores.append(self._finished())
@@ -149,10 +154,12 @@ class ScoredEnv(gymnasium.Wrapper[Any, Any, Any, Any]):
 
         Returns:
             With an objective `objective`, `objective_returns` and their mean `objective_return`; with constraints
-            `constraint`, `violation_rates` and their mean `violation_rate`.
+            `constraint`, `violation_rates` and their mean `violation_rate`. Always `quantities`: the mean of each true
+            quantity over the env frames of all episodes.
         """
-        found: dict[str, Any] = {}
         scores = self.scores[:episodes]
+        means = {name: float(np.mean([score.quantities[name] for score in scores])) for name in self._names}
+        found: dict[str, Any] = {"quantities": means}
         if self.goals.phases:
             returns = [score.objective_return for score in scores]
             found |= {"objective": self.goals.objective_text, "objective_return": float(np.mean(returns))}
@@ -198,7 +205,8 @@ class ScoredEnv(gymnasium.Wrapper[Any, Any, Any, Any]):
         self._present = phase
 
     def _finished(self) -> Score:
-        return Score(float(np.sum(self.worth)), self._num_violated / self._num_frames)
+        means = dict(zip(self._names, (self._totals / self._num_frames).tolist(), strict=True))
+        return Score(float(np.sum(self.worth)), self._num_violated / self._num_frames, means)
 
 
 def score_env(env: SuiteEnv, goals: Goals, planner: Any | None) -> ScoredEnv:

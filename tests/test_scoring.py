@@ -162,6 +162,8 @@ def test_every_mode_reports_scores_on_the_same_objective(tmp_path, checkpoint, m
     assert 0.0 < result["objective_return"] <= 1000.0
     assert 0.0 <= result["violation_rate"] <= 1.0
     assert result["floor"] == "endless"
+    assert -1.8 <= result["quantities"]["cart"] <= 1.8
+    assert 1000.0 * result["quantities"]["task.swingup"] == pytest.approx(result["mean_return"])
 
 
 def test_results_without_goals_hold_no_scores(tmp_path, checkpoint):
