@@ -54,6 +54,18 @@ def test_every_goal_is_measured_with_every_player(tmp_path, checkpoint, capsys):
     assert "cart < 0.01 (constraint)" in capsys.readouterr().out
 
 
+def test_some_players_are_compared_with_an_agent_trained_for_the_goal(tmp_path, checkpoint):
+    path = tmp_path / "result.json"
+    flags = ["--objectives", "cart -> 1.0", "--players", "random, actor", "--trained", str(checkpoint)]
+    flags += ["--episodes", "2", "--json", str(path), "--device", "cpu"]
+    assert benchmark.main(["zero-shot", "--checkpoint", str(checkpoint), *flags]) == 0
+    rows = json.loads(path.read_text())["rows"]
+    assert [row["player"] for row in rows] == ["actor", "random", "trained planner", "trained actor"]
+    by_player = {row["player"]: row for row in rows}
+    assert by_player["trained actor"]["scores"] == by_player["actor"]["scores"]  # the same agent here
+    assert 1000.0 * by_player["actor"]["quantities"]["task.swingup"] == pytest.approx(by_player["actor"]["mean_return"])
+
+
 def test_kicks_are_the_same_for_every_player_and_change_what_they_earn(checkpoint):
     from bench.zero_shot import Conditions, Job, play_job
 
@@ -97,6 +109,8 @@ def test_goals_are_listed_once_in_order():
         ((), "give --objectives"),
         (("--objectives", "crat > 1"), "Did you mean 'cart'"),
         (("--constraints", "cart"), "ineq"),
+        (("--objectives", "cart > 1", "--players", "planer"), "'planner'"),
+        (("--objectives", "cart > 1", "--trained", "nowhere"), "nowhere"),
     ],
 )
 def test_bad_goals_are_one_line(capsys, checkpoint, flags, reason):

@@ -17,7 +17,7 @@ from bench.options import (
     whole_number,
 )
 from bench.report import format_table, interval, number, write_json
-from latentplan.compose import build_config
+from latentplan.compose import build_config, raise_unknown
 from latentplan.config import UserError, to_dict
 
 if TYPE_CHECKING:
@@ -28,6 +28,11 @@ FLAGS = {
     "--checkpoint": ("DIR", "trained agent, or run (its best checkpoint)"),
     "--objectives": ("A | B", "objectives as in eval.py, separated by |"),
     "--constraints": ("A | B", "constraints as in eval.py, separated by |, each with the objective of the training"),
+    "--players": (
+        "A, B",
+        "rows of each goal: some of planner, gated, random moments, random gate, unconstrained, actor, random (all)",
+    ),
+    "--trained": ("DIR", "agent trained for the objectives, to compare with: two rows more, its planner and its actor"),
     "--episodes": ("N", "episodes of each row, on the same starts (10)"),
     "--seed": ("S", "episode i starts from a state that depends only on S and i (0)"),
     "--push": ("STD", "of kicks to all joint velocities, one decision in 25, the same for every player (none)"),
@@ -40,6 +45,7 @@ PUSH_PROBABILITY = 0.04  # per decision
 PURSUERS = ("planner", "gated", "random moments", "random gate")
 OBJECTIVE_PLAYERS = (*PURSUERS, "actor", "random")
 CONSTRAINT_PLAYERS = (*PURSUERS, "unconstrained", "actor", "random")
+TRAINED_PLAYERS = ("trained planner", "trained actor")  # of another checkpoint, after its own reward
 
 
 class Job(NamedTuple):
@@ -48,7 +54,8 @@ class Job(NamedTuple):
     Attributes:
         objective: What is scored, or None.
         constraint: What is scored, or None.
-        player: Who plays; see `make_player`. `unconstrained` is a planner that does not know of the constraint.
+        player: Who plays; see `make_player`. `unconstrained` is a planner that does not know of the constraint,
+            `trained planner` and `trained actor` are another checkpoint's, which are told nothing.
     """
 
     objective: str | None
@@ -65,6 +72,7 @@ class Conditions(NamedTuple):
         device: Where the agent computes.
         planner: Settings of the search that differ from the agent's.
         push: Standard deviation of kicks to the joints' velocities, in m/s or rad/s; 0 for none.
+        trained: Folder of the agent that was trained for the objectives, or None.
     """
 
     checkpoint: str
@@ -72,6 +80,7 @@ class Conditions(NamedTuple):
     device: str
     planner: dict[str, Any]
     push: float = 0.0
+    trained: str | None = None
 
 
 def run(flags: Flags) -> int:
@@ -86,6 +95,11 @@ def run(flags: Flags) -> int:
     jobs = list_jobs(flags)
     info, trained = check_checkpoint(Path(checkpoint))
     _check_goals(jobs, info["config"]["env"]["domain"])
+    trained_for = flags.get("--trained")
+    if trained_for is not None:
+        domain = check_checkpoint(Path(trained_for))[0]["domain"]
+        if domain != info["domain"]:
+            raise UserError(f"--trained {trained_for!r} controls {domain}, --checkpoint {info['domain']}")
     typed = settings_layer(flags).get("planner", {})
     planner = build_config({"planner": {**to_dict(trained), **typed}}).planner
     overrides = {name: getattr(planner, name) for name in typed}
@@ -103,10 +117,11 @@ def run(flags: Flags) -> int:
         "seed": seed,
         "episodes": episodes,
         "push": push,
+        "trained": trained_for,
     }
     print(f"{about['domain']}-{about['task']}, {episodes} episodes per row, {workers} at once", flush=True)
     rows: list[dict[str, Any]] = []
-    for row in _play(Conditions(checkpoint, seeds, device, overrides, push), jobs, workers):
+    for row in _play(Conditions(checkpoint, seeds, device, overrides, push, trained_for), jobs, workers):
         rows.append(row)
         print(f"{row['goal']}, {row['player']}: {number(row['mean'], row['digits'])}", flush=True)
         write_json(json_path, {**about, "rows": rows})
@@ -118,14 +133,25 @@ def list_jobs(flags: Flags) -> list[Job]:
     """The rows that the flags ask for.
 
     Raises:
-        UserError: They ask for none.
+        UserError: They ask for none, or for a player that there is not.
     """
     objectives, constraints = _parts(flags.get("--objectives", "")), _parts(flags.get("--constraints", ""))
     if not objectives and not constraints:
         raise UserError("give --objectives 'height > 1.2 | speed -> 2.0' or --constraints 'cart < 0.5', or both")
+    known = (*OBJECTIVE_PLAYERS, "unconstrained")
+    wanted = [name.strip() for name in flags["--players"].split(",")] if "--players" in flags else list(known)
+    for name in wanted:
+        if name not in known:
+            raise_unknown("player", name, known)
+    trained = TRAINED_PLAYERS if "--trained" in flags else ()
     return [
-        *(Job(text, None, player) for text in objectives for player in OBJECTIVE_PLAYERS),
-        *(Job(None, text, player) for text in constraints for player in CONSTRAINT_PLAYERS),
+        *(
+            Job(text, None, name)
+            for text in objectives
+            for name in OBJECTIVE_PLAYERS + trained
+            if name in (*wanted, *trained)
+        ),
+        *(Job(None, text, name) for text in constraints for name in CONSTRAINT_PLAYERS if name in wanted),
     ]
 
 
@@ -134,8 +160,8 @@ def play_job(conditions: Conditions, job: Job) -> dict[str, Any]:
 
     Returns:
         The row: `goal`, `kind` (`objective` or `constraint`), `player`, the score of each episode in `scores`
-        (objective return, or violation rate), their `mean` and `ci95`, the task's `returns` and `mean_return` with
-        `return_ci95`, `planned_fraction` and `decision_ms`.
+        (objective return, or violation rate), their `mean` and `ci95`, the mean of every true quantity in
+        `quantities`, the task's `returns` and `mean_return` with `return_ci95`, `planned_fraction` and `decision_ms`.
     """
     import torch
 
@@ -147,8 +173,12 @@ def play_job(conditions: Conditions, job: Job) -> dict[str, Any]:
     from latentplan.scoring import goal_env, read_goals, score_env
 
     torch.set_num_threads(1)
-    _, config, _ = load_model(conditions.checkpoint)
-    agent = make_player(job.player, conditions.checkpoint, conditions.device, conditions.planner)
+    checkpoint, player, search = conditions.checkpoint, job.player, conditions.planner
+    if job.player in TRAINED_PLAYERS:
+        assert conditions.trained is not None, "asked for by --trained"
+        checkpoint, player, search = conditions.trained, job.player.removeprefix("trained "), {}
+    _, config, _ = load_model(checkpoint)
+    agent = make_player(player, checkpoint, conditions.device, search)
     goals = read_goals(job.objective, job.constraint, config.env.domain)
     assert goals is not None, "a job names an objective or a constraint"
     env = make_env(goal_env(config.env))
@@ -168,6 +198,7 @@ def play_job(conditions: Conditions, job: Job) -> dict[str, Any]:
         "mean": estimate.mean,
         "ci95": [estimate.low, estimate.high],
         "digits": 1 if is_objective else 4,
+        "quantities": scored.summarize(len(conditions.seeds))["quantities"],
         "returns": result["returns"],
         "mean_return": result["mean_return"],
         "return_ci95": result["ci95"],
