@@ -130,7 +130,7 @@ class ModelAgent:
             constraints,
             model=self.model,
             env=self.config.env,
-            use_value=planner.terminal_value,
+            planner=planner,
             encode_goal=lambda path: torch.as_tensor(self.encode(read_goal(path)), device=self.model.device),
         )
 

@@ -32,11 +32,14 @@ from latentplan.goals.expression import (
     walk,
 )
 from latentplan.goals.parser import parse_constraints, parse_objective
+from latentplan.planning.cem import CEMPlanner
 from latentplan.planning.model import supports
 from latentplan.planning.objectives import Constraint, Objective, Rollout, Term, predicted_return, terminal_value
 
 CAUTION = 0.1  # margins that a plan stays away from where a constraint would break
-GUIDANCE = 0.05  # weight of the learned value at the end of a plan that pursues something else
+GUIDANCE = (
+    0.25  # what the end of a plan for something else counts, of what the plan would at the learned rate of reward
+)
 GOAL_DISTANCE = 1.0  # root mean square distance of latents that counts as one margin
 
 
@@ -46,7 +49,7 @@ def plan_goals(
     *,
     model: Any,
     env: EnvConfig,
-    use_value: bool | None,
+    planner: CEMPlanner,
     encode_goal: Callable[[str], Tensor],
 ) -> tuple[Term | None, Sequence[Constraint]]:
     """What a planner is given for goals written as text.
@@ -56,7 +59,7 @@ def plan_goals(
         constraints: Inequalities separated by `;`; functions of imagined rollouts stay.
         model: The world model, with `labels` and `label_names`.
         env: Settings of the environment.
-        use_value: Whether rollouts have a value at their end; None where the model has one.
+        planner: Who searches: its horizon for goals, its discount, and whether rollouts have a value at their end.
         encode_goal: See `plan_objective`.
 
     Raises:
@@ -67,9 +70,11 @@ def plan_goals(
         objective = parse_objective(objective, known)
     if isinstance(objective, Expression):
         require_labels([node for _, node in objective.terms], model.label_names)
-        wanted, learned = objective, predicted_return(model, use_value)
-        has_value = supports(model, "value") if use_value is None else use_value
-        guide = GUIDANCE * terminal_value() if has_value else None
+        wanted, learned = objective, predicted_return(model, planner.terminal_value)
+        has_value = supports(model, "value") if planner.terminal_value is None else planner.terminal_value
+        # A value of v is a reward of v (1 - discount) in every step there will ever be; the plan has `horizon` of them.
+        horizon = planner.goal_horizon or planner.horizon
+        guide = GUIDANCE * horizon * (1.0 - planner.discount) * terminal_value() if has_value else None
         objective = None if wanted.is_return else plan_objective(wanted, env.action_repeat, learned, guide, encode_goal)
     if isinstance(constraints, str):
         clauses = parse_constraints(constraints, known)

@@ -114,9 +114,23 @@ def test_goals_are_guided_where_the_search_may_use_the_value(use_value, needs):
     model = Cart()
     model.labels = SCALES
     goals = {"model": model, "env": EnvConfig(domain="cartpole", task="swingup"), "encode_goal": None}
-    pursued, _ = plan_goals("cart > 0.3", (), use_value=use_value, **goals)
+    goals["planner"] = CEMPlanner(action_dim=1, horizon=3, discount=0.9, terminal_value=use_value)
+    pursued, _ = plan_goals("cart > 0.3", (), **goals)
     assert ("value" in pursued.needs) == needs
-    assert plan_goals("return", (), use_value=use_value, **goals)[0] is None
+    assert plan_goals("return", (), **goals)[0] is None
+
+
+@pytest.mark.parametrize(("horizon", "discount"), [(2, 0.9), (20, 0.99)])
+def test_the_guide_is_a_quarter_of_what_the_plan_would_earn_at_the_learned_rate(horizon, discount):
+    model = Cart()
+    model.labels = SCALES
+    planner = CEMPlanner(action_dim=1, horizon=3, goal_horizon=horizon, discount=discount)
+    env = EnvConfig(domain="cartpole", task="swingup")
+    pursued, _ = plan_goals("0 * cart", (), model=model, env=env, planner=planner, encode_goal=None)
+    end = [-0.1 / (1.0 - discount), 0.0]  # its value is that of a reward of one in every step there will be
+    rollout = rollout_of(torch.tensor([[[0.0, 0.0]], [end]]))
+    beyond = terminal_value()(rollout).item() * (1.0 - discount)  # as far as this rollout discounts its end
+    assert pursued(rollout).item() == pytest.approx(0.25 * horizon * beyond)
 
 
 def test_a_goal_image_draws_the_latent_near_its_own():
