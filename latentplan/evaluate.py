@@ -167,7 +167,7 @@ def _report(request: EvaluationRequest, result: dict[str, Any]) -> None:
         print(f"objective return {result['objective_return']:.1f}  ({result['objective']})")
     if "violation_rate" in result:
         print(f"violation rate {result['violation_rate']:.4f}  ({result['constraint']})")
-    if "quantities" in result:
+    if result.get("quantities"):  # some domains have none
         means = "   ".join(f"{name} {value:.2f}" for name, value in result["quantities"].items())
         print(f"on average   {means}")
     print(f"decision ms  {latency}", flush=True)

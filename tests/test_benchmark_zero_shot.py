@@ -110,6 +110,7 @@ def test_goals_are_listed_once_in_order():
         (("--objectives", "crat > 1"), "Did you mean 'cart'"),
         (("--constraints", "cart"), "ineq"),
         (("--objectives", "cart > 1", "--players", "planer"), "'planner'"),
+        (("--objectives", "cart > 1", "--players", "unconstrained"), "nobody"),
         (("--objectives", "cart > 1", "--trained", "nowhere"), "nowhere"),
     ],
 )

@@ -37,9 +37,7 @@ from latentplan.planning.model import supports
 from latentplan.planning.objectives import Constraint, Objective, Rollout, Term, predicted_return, terminal_value
 
 CAUTION = 0.1  # margins that a plan stays away from where a constraint would break
-GUIDANCE = (
-    0.25  # what the end of a plan for something else counts, of what the plan would at the learned rate of reward
-)
+GUIDANCE = 0.25  # what the end of a plan counts, of what the plan would earn at the learned rate of reward
 GOAL_DISTANCE = 1.0  # root mean square distance of latents that counts as one margin
 
 

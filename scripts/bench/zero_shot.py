@@ -144,15 +144,14 @@ def list_jobs(flags: Flags) -> list[Job]:
         if name not in known:
             raise_unknown("player", name, known)
     trained = TRAINED_PLAYERS if "--trained" in flags else ()
-    return [
-        *(
-            Job(text, None, name)
-            for text in objectives
-            for name in OBJECTIVE_PLAYERS + trained
-            if name in (*wanted, *trained)
-        ),
+    asked = [name for name in (*OBJECTIVE_PLAYERS, *trained) if name in (*wanted, *trained)]
+    jobs = [
+        *(Job(text, None, name) for text in objectives for name in asked),
         *(Job(None, text, name) for text in constraints for name in CONSTRAINT_PLAYERS if name in wanted),
     ]
+    if not jobs:
+        raise UserError("--players names nobody who plays for an objective; unconstrained is for constraints")
+    return jobs
 
 
 def play_job(conditions: Conditions, job: Job) -> dict[str, Any]:
