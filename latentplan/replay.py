@@ -173,7 +173,10 @@ class Replay:
         self.deter[index] = deter.flatten(0, 1).to(self.deter)[last]
 
     def save(self, folder: Path) -> None:
-        """Write what is new since the last save; `load` restores exactly what the last whole save held."""
+        """Write what is new since the last save; `load` restores exactly what the last whole save held.
+
+        Unless the capacity has been exceeded: then a save that is cut off leaves new frames beside the older rows.
+        """
         folder.mkdir(parents=True, exist_ok=True)
         for lane in range(self.num_lanes):
             first = max(self._saved[lane], self.written[lane] - self.lane_size)

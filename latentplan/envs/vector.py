@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import multiprocessing
 import os
+import signal
 from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
+import gymnasium
 import numpy as np
 from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv, VectorEnv
 from gymnasium.wrappers import TimeLimit
@@ -17,8 +20,6 @@ from latentplan.envs.user import make_from
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
-
-    import gymnasium
 
 _THREAD_SETTINGS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 
@@ -80,9 +81,24 @@ class _Builder:
     episode_decisions: int | None
 
     def __call__(self) -> gymnasium.Env[np.ndarray, np.ndarray]:
+        if multiprocessing.parent_process() is not None:
+            signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches the whole group; the parent decides
         build = make_env if self.factory is None else make_from(self.factory)
-        env = build(self.config, self.seed)
+        env: gymnasium.Env[np.ndarray, np.ndarray] = build(self.config, self.seed)
+        env = env if self.factory is None else _WithoutInfo(env)
         return env if self.episode_decisions is None else TimeLimit(env, self.episode_decisions)
+
+
+class _WithoutInfo(gymnasium.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarray]):
+    """A user's environment without what else it tells: not everything can be put into one array for all."""
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        frame, info = self.env.reset(seed=seed, options=options)
+        return frame, {"env_frames": info["env_frames"]}
+
+    def step(self, action: np.ndarray) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
+        frame, reward, terminated, truncated, info = self.env.step(action)
+        return frame, reward, terminated, truncated, {"env_frames": info["env_frames"]}
 
 
 def _derived_seed(seed: int | None, index: int) -> int | None:

@@ -120,10 +120,13 @@ def _call(
     rewards: Tensor | None = None,
     values: Tensor | None = None,
 ) -> None:
-    library = load()
+    library, model, (rows, time) = load(), packed.model, actions.shape[:2]
     assert library is not None
+    wanted = ((rows, model.deter), (rows, model.latent))
+    if (deter.shape, stoch.shape) != wanted or (time and actions.shape[2] != model.action):
+        given = ", ".join(str(tuple(tensor.shape)) for tensor in (deter, stoch, actions))
+        raise ValueError(f"deter, stoch and actions have shapes {given}; the model has {wanted} and {model.action}")
     written = [None if tensor is None else tensor.data_ptr() for tensor in (deter, stoch, actions, rewards, values)]
-    rows, time = actions.shape[:2]
     if library.imagine(ctypes.addressof(packed.model), *written, rows, time, torch.get_num_threads()):
         raise MemoryError("no memory for an imagined rollout")
 

@@ -174,6 +174,7 @@ static long padded(long size) { return (size + BLOCK - 1) / BLOCK * BLOCK; }
 static size_t desk_floats(const Model *model) {
     long widest = 3 * model->deter;
     widest = widest > model->hidden ? widest : model->hidden;
+    widest = widest > model->latent ? widest : model->latent;
     widest = widest > model->head.output.outputs ? widest : model->head.output.outputs;
     widest = widest > model->actor.output.outputs ? widest : model->actor.output.outputs;
     long width = padded(model->action) + model->latent + model->deter + model->hidden;

@@ -62,7 +62,7 @@ class ModelPredictiveController:
         self.generator = generator
         self.replan_every = replan_every
         self.plan: Plan | None = None
-        self._is_stale = False
+        self._is_stale: Tensor | None = None  # whose plans were made for another objective, (batch,) bool
         self._latencies_ms: deque[float] = deque(maxlen=10_000)
 
     def act(self, state: State) -> Tensor:
@@ -92,6 +92,8 @@ class ModelPredictiveController:
             raise ValueError("act_where() needs at least one environment; skip() lets others act everywhere")
         whole = None if self.plan is None or len(self.plan.is_warm) != len(where) else self.plan.aged()
         self.plan = None if whole is None or self.plan is None else self.plan.take(rows)
+        stale = None if whole is None else self._is_stale
+        self._is_stale = None if stale is None else stale[rows]
         generator = self.generator
         if not (generator is None or isinstance(generator, torch.Generator)):
             generator = [generator[row] for row in rows.tolist()]
@@ -100,6 +102,7 @@ class ModelPredictiveController:
         spread = self.plan.spread(where)
         is_alike = whole is not None and whole.mean.shape == spread.mean.shape  # else it was for another objective
         self.plan = whole.updated(where, spread) if whole is not None and is_alike else spread
+        self._is_stale = None if stale is None else stale & ~where
         return action
 
     def skip(self) -> None:
@@ -116,7 +119,7 @@ class ModelPredictiveController:
             return None
         batch, horizon = self.plan.actions.shape[:2]
         index = self.plan.elapsed.clamp_max(horizon - 1)
-        is_left = self.plan.is_warm & (self.plan.elapsed < horizon) & (not self._is_stale)
+        is_left = self.plan.is_warm & (self.plan.elapsed < horizon) & ~self._stale()
         return self.plan.actions[torch.arange(batch), index], is_left
 
     def _act(self, state: State, generator: Generators) -> Tensor:
@@ -125,12 +128,12 @@ class ModelPredictiveController:
             self.plan = self._search(state, None, generator)
             is_due = torch.ones(count_rows(state), dtype=torch.bool)
         else:
-            is_due = ~self.plan.is_warm | (self.plan.elapsed >= self.replan_every) | self._is_stale
+            is_due = ~self.plan.is_warm | (self.plan.elapsed >= self.replan_every) | self._stale()
             if bool(is_due.all()):
                 self.plan = self._search(state, self.plan, generator)
             elif bool(is_due.any()):
                 self.plan = self.plan.updated(is_due, self._search(state, self.plan, generator))
-        self._is_stale = False
+        self._is_stale = None
         action = self.plan.actions[torch.arange(len(is_due)), self.plan.elapsed]
         self.plan = self.plan.executed(self.plan.elapsed + 1)
         if state_device(state).type == "cuda":
@@ -159,7 +162,8 @@ class ModelPredictiveController:
         self.objective = objective
         if constraints is not None:
             self.constraints = constraints
-        self._is_stale = True  # what was planned for the old objective is not executed further
+        if self.plan is not None:  # what was planned for the old objective is not executed further
+            self._is_stale = torch.ones_like(self.plan.is_warm)
 
     @property
     def source(self) -> str:
@@ -177,6 +181,10 @@ class ModelPredictiveController:
         times = torch.tensor(list(self._latencies_ms), dtype=torch.float64)
         p50, p95, p99 = torch.quantile(times, torch.tensor([0.5, 0.95, 0.99], dtype=torch.float64)).tolist()
         return {"mean_ms": float(times.mean()), "p50_ms": p50, "p95_ms": p95, "p99_ms": p99}
+
+    def _stale(self) -> Tensor:
+        assert self.plan is not None
+        return torch.zeros_like(self.plan.is_warm) if self._is_stale is None else self._is_stale
 
     def _search(self, state: State, previous: Plan | None, generator: Generators) -> Plan:
         plan = self.planner.plan(

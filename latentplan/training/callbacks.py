@@ -53,7 +53,7 @@ class Experience(lightning.Callback):
         self.config, self.replay, self.state, self.worker, self.videos = config, replay, state, worker, videos
         self.episode_returns: list[float] = []
         self.evaluated_weights: dict[str, np.ndarray] = {}
-        self._asked_evaluation: dict[str, Any] | None = None
+        self._asked_evaluation: tuple[dict[str, Any], dict[str, np.ndarray]] | None = None
         self._asked_round = False
 
     def on_train_epoch_start(self, trainer: lightning.Trainer, learner: Learner) -> None:  # type: ignore[override]
@@ -70,8 +70,7 @@ class Experience(lightning.Callback):
             self.worker.submit("collect", weights, behaviour, decisions, state.rounds, noisy, goal)
             self._asked_round = True
         if self._asked_round and state.env_frames >= state.next_evaluation:
-            self._ask_evaluation(learner.updates)
-            self.evaluated_weights = weights
+            self._ask_evaluation(learner.updates, weights)
 
     def on_train_epoch_end(self, trainer: lightning.Trainer, learner: Learner) -> None:  # type: ignore[override]
         """Bring the behaviour up to date before anything else looks at the learner."""
@@ -84,7 +83,8 @@ class Experience(lightning.Callback):
             self._asked_round = False
         if self._asked_evaluation is not None:
             returns = self.worker.result()
-            entry = self._asked_evaluation | {mode: float(np.mean(values)) for mode, values in returns.items()}
+            clocks, self.evaluated_weights = self._asked_evaluation
+            entry = clocks | {mode: float(np.mean(values)) for mode, values in returns.items()}
             self.state.evaluations.append(entry)
             # Only now: an evaluation that an interruption cuts off is due again.
             every = self.config.evaluation.every_frames
@@ -97,10 +97,10 @@ class Experience(lightning.Callback):
             return sys.maxsize
         return -(-(frames - self.state.env_frames) // self.config.env.action_repeat)
 
-    def _ask_evaluation(self, updates: int) -> None:
+    def _ask_evaluation(self, updates: int, weights: dict[str, np.ndarray]) -> None:
         state, settings = self.state, self.config.evaluation
-        self._asked_evaluation = {"env_frames": state.env_frames, "decisions": state.decisions, "updates": updates}
-        self._asked_evaluation["minutes"] = round(state.minutes, 3)
+        clocks = {"env_frames": state.env_frames, "decisions": state.decisions, "updates": updates}
+        self._asked_evaluation = clocks | {"minutes": round(state.minutes, 3)}, weights
         film = self.videos / f"{state.env_frames:09d}.webm" if settings.video else None
         self.worker.submit("evaluate", settings.episodes, film)
 
@@ -194,9 +194,16 @@ class Save(lightning.Callback):
     """Keeps the last agent, the best one, and what it takes to resume."""
 
     def __init__(
-        self, folder: Path, config: Config, experience: Experience, state: RunState, facts: dict[str, Any]
+        self,
+        folder: Path,
+        config: Config,
+        experience: Experience,
+        state: RunState,
+        facts: dict[str, Any],
+        optimizers: list[Any],
     ) -> None:
         self.folder, self.config, self.experience, self.state, self.facts = folder, config, experience, state, facts
+        self._loaded_optimizers = optimizers
         self._kept_evaluations = len(state.evaluations)
 
     def on_train_epoch_end(self, trainer: lightning.Trainer, learner: Learner) -> None:  # type: ignore[override]
@@ -220,7 +227,7 @@ class Save(lightning.Callback):
 
     def save_run(self, trainer: lightning.Trainer, learner: Learner) -> None:
         """Save what it takes to resume."""
-        optimizers = [optimizer.state_dict() for optimizer in trainer.optimizers]
+        optimizers = [optimizer.state_dict() for optimizer in trainer.optimizers] or self._loaded_optimizers
         saved = {"weights": learner.state_dict(), "updates": learner.updates}
         save_state(self.folder / "resume", self.state, saved, optimizers, self.experience.replay)
 

@@ -23,6 +23,7 @@ from latentplan.rollout import episode_seed, run_episodes
 
 TIMED_FRAMES = 5
 FILMED_FRAMES = 250
+CLOSING_SECONDS = 5.0
 
 EnvFactory = Callable[[], gymnasium.Env[Any, Any]]
 
@@ -186,7 +187,7 @@ class Collector:
 
     def close(self) -> None:
         """Free simulators and processes."""
-        self.envs.close()
+        self.envs.close(timeout=CLOSING_SECONDS)  # without, a step that failed is waited for again, for ever
         self._eval_env.close()
 
     def _load(self, weights: dict[str, np.ndarray]) -> None:
@@ -222,7 +223,8 @@ class Collector:
             self._labels = np.array(info["labels"], np.float32)
         log.append(frames, deter, actions, rewards, ~terminated, first, labels, np.asarray(info["env_frames"]), plan)
         for lane in np.flatnonzero(self._ended):
-            log.finish(int(lane), self._frames[lane].copy(), self._labels[lane], float(self._returns[lane]))
+            frame, row = self._frames[lane].copy(), self._labels[lane].copy()  # both are written over by a restart
+            log.finish(int(lane), frame, row, float(self._returns[lane]))
 
 
 def _discount_for(decisions: int | None) -> float:

@@ -11,7 +11,7 @@ from torch.utils.data import DataLoader, IterableDataset
 from latentplan.config import Config, derive_seed
 from latentplan.replay import Batch, Replay
 from latentplan.training.curriculum import Curriculum
-from latentplan.training.state import RunState
+from latentplan.training.module import Learner
 
 
 class ReplayBatches(IterableDataset[Batch]):
@@ -21,11 +21,11 @@ class ReplayBatches(IterableDataset[Batch]):
         replay: Where sequences are drawn from.
         config: Settings of the run.
         curriculum: What their rewards are.
-        state: Clocks of the run.
+        learner: Whose updates they are: an epoch after a resumption draws other sequences than the one before.
     """
 
-    def __init__(self, replay: Replay, config: Config, curriculum: Curriculum, state: RunState) -> None:
-        self.replay, self.config, self.curriculum, self.state = replay, config, curriculum, state
+    def __init__(self, replay: Replay, config: Config, curriculum: Curriculum, learner: Learner) -> None:
+        self.replay, self.config, self.curriculum, self.learner = replay, config, curriculum, learner
         self.length = max(1, round(config.collection.round_decisions * config.collection.updates_per_decision))
 
     def __len__(self) -> int:
@@ -35,7 +35,7 @@ class ReplayBatches(IterableDataset[Batch]):
     def __iter__(self) -> Iterator[Batch]:
         """Draw the batches of this epoch, each when it is asked for."""
         learning = self.config.learning
-        rng = np.random.default_rng(derive_seed(self.config.run.seed, "batches", self.state.rounds))
+        rng = np.random.default_rng(derive_seed(self.config.run.seed, "batches", self.learner.updates))
         for _ in range(self.length):
             batch = self.replay.sample(learning.batch_size, learning.sequence_length, rng)
             yield self.curriculum(batch)

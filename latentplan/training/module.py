@@ -183,11 +183,13 @@ class Learner(lightning.LightningModule):
         return value_loss(self.model.value_head, seen, targets, torch.ones_like(targets))
 
     def _return_scale(self, returns: Tensor) -> Tensor:
-        """Spread of returns between their 5th and 95th percentile, smoothed, at least 1 (Hafner et al. 2023, eq. 7)."""
+        """Spread of returns between their 5th and 95th percentile, smoothed from 0 on, at least 1.
+
+        Hafner et al. 2023, eq. 7.
+        """
         flat = returns.flatten()
         spread = torch.quantile(flat, 0.95) - torch.quantile(flat, 0.05)
-        rate = 1.0 if self.updates == 0 else RETURN_RANGE_RATE
-        self.return_range.lerp_(spread, rate)
+        self.return_range.lerp_(spread, RETURN_RANGE_RATE)
         return self.return_range.clamp_min(1.0)
 
     def _descend(self, optimizer: torch.optim.Optimizer, loss: Tensor) -> Tensor:

@@ -173,11 +173,11 @@ class _Run:
         videos = self.folder / "videos"
         videos.mkdir(exist_ok=True)
         experience = Experience(config, self.replay, self.state, self.worker, videos)
-        save = Save(self.folder, config, experience, self.state, self._facts())
+        save = Save(self.folder, config, experience, self.state, self._facts(), self._saved_optimizers)
         stop = Stop(config, self.state)
         record = Record(self.folder / "metrics.csv", self.state, experience, self.console)
         trainer = self._trainer([experience, self.curriculum, record, save, stop])
-        batches = ReplayBatches(self.replay, config, self.curriculum, self.state)
+        batches = ReplayBatches(self.replay, config, self.curriculum, self.learner)
         if not stop.is_spent():
             self.console.start(self.learner.updates)
             try:

@@ -152,3 +152,24 @@ def test_other_sizes_and_other_precisions_are_left_to_torch():
         fused.pack(WEIGHTS._replace(gates=WEIGHTS.gates.float()), (WEIGHTS.head, WEIGHTS.logits, WEIGHTS.logits_shift))
         is None
     )
+
+
+@compiled
+def test_a_latent_may_be_the_widest_layer():
+    sizes = ModelConfig(deter_dim=32, hidden_dim=32, latent_dim=512, num_bins=31)
+    weights = weights_of(build(sizes))
+    state, actions = State(draw(ROWS, 32).tanh(), draw(ROWS, 512, seed=1)), draw(ROWS, TIME, ACTION, seed=2)
+    assert weights.packed is not None
+    rewards, last = imagine(weights, state, actions)
+    expected, reached = imagine(weights._replace(packed=None), state, actions)
+    torch.testing.assert_close(rewards, expected, atol=0.1, rtol=0.1)
+    torch.testing.assert_close(last.stoch, reached.stoch, atol=0.1, rtol=0.1)
+
+
+@compiled
+@pytest.mark.parametrize("wrong", ["actions", "rows", "deter"])
+def test_what_does_not_fit_the_model_is_refused(wrong):
+    state, actions = start(), draw(ROWS, TIME, ACTION + (wrong == "actions"))
+    state = State(state.deter[:, : 32 if wrong == "deter" else 64], state.stoch[: 5 if wrong == "rows" else ROWS])
+    with pytest.raises(ValueError, match="deter, stoch and actions have shapes"):
+        imagine(WEIGHTS, state, actions)

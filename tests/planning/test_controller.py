@@ -122,6 +122,17 @@ def test_deciding_for_some_environments_leaves_the_others_plans_to_age(states, m
     assert torch.equal(controller.plan.actions[~where], before.actions[~where])
 
 
+def test_plans_for_an_old_objective_are_not_followed_where_nobody_planned_since(states, make_controller):
+    controller = make_controller()
+    controller.act(states)
+    controller.set_objective(action_penalty())
+    controller.act_where(states, torch.tensor([0, 1, 0, 0, 1]).bool())
+    _, is_left = controller.follow()
+    assert is_left.tolist() == [False, True, False, False, True]
+    controller.act(states)
+    assert controller.follow()[1].all()
+
+
 def test_the_warm_start_skips_what_others_did(states, make_controller):
     controller = make_controller()
     controller.act(states)

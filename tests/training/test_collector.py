@@ -20,7 +20,7 @@ def weights_of(config, seed=0):
 def make_collector(tiny, dot):
     collectors = []
 
-    def make(env=dot, **changes):
+    def make(env=dot, /, **changes):
         collectors.append(Collector(tiny("", **changes), env, "cpu"))
         return collectors[-1]
 
@@ -202,3 +202,29 @@ def test_judging_neither_explores_nor_disturbs_the_collection(make_collector, ti
     following = [collector.collect(weights, "planner", 7, 1).rows[0] for collector in (judged, plain)]
     assert np.array_equal(following[0].actions, following[1].actions)
     assert np.array_equal(following[0].frames, following[1].frames)
+
+
+def test_the_last_frame_of_an_episode_has_labels_of_its_own(make_cart):
+    alone, followed = (make_cart(episode_decisions=5).collect(None, "random", n, 0).rows[0] for n in (5, 10))
+    assert followed.is_first[6] and np.array_equal(followed.labels[:6], alone.labels)
+    assert not np.array_equal(followed.labels[5], followed.labels[6])
+
+
+def test_several_environments_may_tell_lists_of_any_length(make_collector, dot):
+    class Telling(dot):
+        def step(self, action):
+            *rest, _ = super().step(action)
+            return *rest, {"trace": np.zeros(self.steps + int(10 * abs(self.place)))}
+
+    (first, second) = make_collector(Telling, env={"num_envs": 2}).collect(None, "random", 12, 0).rows
+    assert len(first.frames) == len(second.frames) == 6
+
+
+def test_a_step_that_failed_is_not_waited_for(make_collector, monkeypatch):
+    monkeypatch.setattr("latentplan.training.collector.CLOSING_SECONDS", 0.2)
+    collector = make_collector(env={"num_envs": 2})
+    collector.collect(None, "random", 4, 0)
+    monkeypatch.setattr(collector.envs, "_add_info", lambda *_: 1 / 0)
+    with pytest.raises(ZeroDivisionError):
+        collector.collect(None, "random", 4, 1)
+    collector.close()

@@ -1,5 +1,9 @@
 """Workers: the same answers in this process and in another, in order, and nothing left behind."""
 
+import multiprocessing
+import os
+import signal
+
 import numpy as np
 import pytest
 
@@ -29,6 +33,17 @@ def test_several_environments_in_another_process_leave_nothing_behind(tiny, dot,
     assert not np.array_equal(collected.rows[0].frames, collected.rows[1].frames)
     assert not process.is_alive()
     assert "Traceback" not in capfd.readouterr().err
+
+
+def test_an_interruption_is_not_for_the_environments(tiny, dot):
+    worker = LocalWorker(tiny("", env={"num_envs": 2}), dot, "cpu")
+    children = multiprocessing.active_children()
+    assert len(children) == 2
+    for child in children:
+        os.kill(child.pid, signal.SIGINT)
+    worker.submit("collect", None, "random", 6, 0)
+    assert worker.result().decisions == 6
+    worker.close()
 
 
 def test_what_the_user_got_wrong_stays_a_user_error(tiny, dot):
