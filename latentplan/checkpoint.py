@@ -8,6 +8,8 @@ import json
 from pathlib import Path
 from typing import Any
 
+import torch
+from safetensors import SafetensorError
 from safetensors.torch import load_file, save_file
 
 from latentplan.agent import ActorAgent, Agent, PlanningAgent, RandomAgent
@@ -21,6 +23,10 @@ WEIGHTS = "weights.safetensors"
 INFO = "info.json"
 MODES = ("planner", "gated", "background", "actor", "random")
 OPTIONS = {"gated": ("planning_budget", "signal"), "background": ("worker", "max_age", "fresh_ticks", "make_executor")}
+KINDS: dict[str, type | tuple[type, ...]] = {
+    **{"env_frames": int, "action_dim": int, "discount": (int, float), "sha256": str},
+    "labels": (dict, type(None)),
+}
 REQUIRED = ("domain", "task", "env_frames", "discount", "action_dim", "config", "sha256")
 
 
@@ -32,10 +38,16 @@ def save_checkpoint(folder: Path, model: WorldModel, config: Config, info: dict[
         model: What to keep; optimizer state is not part of an agent.
         config: Settings of the run.
         info: Facts beside them: domain, task, discount, env_frames, metrics and the like.
+
+    Raises:
+        FloatingPointError: A weight is not finite, or beyond what float16 holds.
     """
     folder.mkdir(parents=True, exist_ok=True)
     part = folder / f"{WEIGHTS}.part"
-    save_file({name: value.detach().cpu().half().contiguous() for name, value in model.state_dict().items()}, part)
+    state = {name: value.detach().cpu().half().contiguous() for name, value in model.state_dict().items()}
+    if broken := _not_finite(state):
+        raise FloatingPointError(f"{broken} is not finite in float16: {folder} is left as it was")
+    save_file(state, part)
     digest = hashlib.sha256(part.read_bytes()).hexdigest()
     facts = info | {"action_dim": model.action_dim, "labels": model.labels, "config": to_dict(config), "sha256": digest}
     part.replace(folder / WEIGHTS)
@@ -60,6 +72,9 @@ def read_info(path: str | Path) -> dict[str, Any]:
     missing = [key for key in REQUIRED if not isinstance(info, dict) or key not in info]
     if missing:
         raise UserError(f"{folder} is not a latentplan checkpoint: {INFO} lacks {', '.join(missing)}")
+    for key, kinds in KINDS.items():
+        if not isinstance(info.get(key), kinds):
+            raise UserError(f"{folder / INFO} cannot be used: {key} is {info.get(key)!r}")
     return info
 
 
@@ -77,12 +92,14 @@ def load_model(path: str | Path, device: str = "cpu") -> tuple[WorldModel, Confi
         config = from_dict(info["config"])
     except (AttributeError, TypeError, ValueError) as error:
         raise UserError(f"the settings in {folder / INFO} cannot be used: {error}") from None
-    model = WorldModel(config.model, info["action_dim"], info.get("labels"))
-    state = {name: value.float() for name, value in load_file(weights).items()}
     try:
+        model = WorldModel(config.model, info["action_dim"], info.get("labels"))
+        state = {name: value.float() for name, value in load_file(weights).items()}
         model.load_state_dict(state)
-    except RuntimeError as error:
+    except (RuntimeError, SafetensorError, TypeError, ValueError) as error:
         raise UserError(f"{weights} does not fit its own settings: {str(error).splitlines()[0]}") from None
+    if broken := _not_finite(state):
+        raise UserError(f"{weights} cannot be used: {broken} is not finite")
     try:
         return model.to(device), config, info
     except (AssertionError, RuntimeError) as error:
@@ -107,6 +124,8 @@ def load_agent(
     """
     if mode not in MODES:
         raise UserError(f"mode must be one of {', '.join(MODES)}, got {mode!r}")
+    if settings and mode in ("actor", "random"):
+        raise UserError(f"{next(iter(settings))} has no effect in mode {mode}: it does not plan")
     model, config, info = load_model(path, device)
     if mode == "random":
         return RandomAgent(model.action_dim)
@@ -144,6 +163,11 @@ def resolve_checkpoint(path: str | Path) -> Path:
     parents = [parent for parent in (Path("checkpoints"), root.parent) if parent.is_dir()]
     known = {path.name: str(path) for parent in parents for path in sorted(parent.iterdir()) if _find(path)}
     raise UserError(f"no checkpoint at {root}: {reason}{_suggestion(root.name, known)}")
+
+
+def _not_finite(state: dict[str, torch.Tensor]) -> str | None:
+    """The name of the first of these that holds NaN or infinity."""
+    return next((name for name, value in state.items() if not bool(torch.isfinite(value).all())), None)
 
 
 def _find(root: Path) -> Path | None:

@@ -48,6 +48,7 @@ EXPORT_FLAGS = {
     "--out": ("FILE", "the file to write"),
     "--format": ("pt2|onnx", "program of torch.export, or ONNX where onnx and onnxscript are installed (pt2)"),
 }
+MAX_THREADS = 1024
 METAVARS = {"--frames": "N", "--minutes": "M", "--run-dir": "DIR", "--resume": "DIR", "--config": "FILE"}
 
 
@@ -201,6 +202,9 @@ def _export(argv: Sequence[str]) -> int:
 
 
 def _doctor(argv: Sequence[str]) -> int:
+    if "-h" in argv or "--help" in argv:
+        print("usage: latentplan doctor\n\nReports versions, device, renderer and milliseconds per frame.")
+        return 0
     read_flags(argv, [])
     from latentplan import doctor
 
@@ -248,6 +252,8 @@ def use_device(name: str, threads: int | None) -> str:
     import torch
 
     if threads is not None:
+        if not 1 <= threads <= MAX_THREADS:
+            raise UserError(f"--threads must lie in 1 to {MAX_THREADS}, got {threads}")
         torch.set_num_threads(threads)
     if name == "cuda" and not torch.cuda.is_available():
         raise UserError("device 'cuda' is not usable here; give --device cpu")

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 from latentplan.cli import run_guarded, use_device
 from latentplan.compose import build_config
-from latentplan.config import EnvConfig, PlannerConfig, UserError, from_dict, to_dict
+from latentplan.config import USER_DOMAIN, EnvConfig, PlannerConfig, UserError, from_dict, to_dict
 from latentplan.config.planner import override_planner
 from latentplan.evaluation_request import (
     PLANNING_MODES,
@@ -69,8 +69,13 @@ def _evaluate(argv: Sequence[str]) -> int:
     info = read_info(request.checkpoint)
     try:
         config = from_dict(info["config"])
-    except ValueError as error:
+    except (AttributeError, TypeError, ValueError) as error:
         raise UserError(f"{request.checkpoint} has settings of another version: {error}") from None
+    if config.env.domain == USER_DOMAIN:
+        raise UserError(
+            "this agent learned in an environment of your own, which a command cannot make: play it from Python, "
+            "agent = load_agent(DIR)"
+        )
     planner = build_config({"planner": override_planner(to_dict(config.planner), request.planner)}).planner
     overrides = {name: getattr(planner, name) for name in request.planner}
     if request.planning_budget is not None:
@@ -171,6 +176,9 @@ def _report(request: EvaluationRequest, result: dict[str, Any]) -> None:
         means = "   ".join(f"{name} {value:.2f}" for name, value in result["quantities"].items())
         print(f"on average   {means}")
     print(f"decision ms  {latency}", flush=True)
+    tails = result["action_source"]["tail"]
+    if tails and request.mode == "planner" and "deadline_ms" not in request.planner:
+        print(f"warning: at {tails} decisions the search found nothing finite", file=sys.stderr, flush=True)
     if result["control_hz"] is not None:
         sources = "   ".join(f"{name} {count}" for name, count in result["action_source"].items())
         print(f"at {result['control_hz']:g} Hz  deadline misses {result['deadline_misses']}   {sources}", flush=True)

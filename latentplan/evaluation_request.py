@@ -99,6 +99,8 @@ def parse_arguments(argv: Sequence[str]) -> EvaluationRequest:
     from latentplan.latency import read_clock_flags
 
     control_hz, latency = read_clock_flags(flags)
+    if flags.get("--video") is not None and flags.get("--video") == flags.get("--json"):
+        raise UserError("--video and --json name the same file; give two")
     return EvaluationRequest(
         checkpoint=Path(flags["--checkpoint"]),
         episodes=_whole_number(flags, "--episodes", 10, 1),

@@ -74,6 +74,9 @@ def export_actor(agent_or_checkpoint: ModelAgent | str | Path, path: str | Path,
     if missing:
         raise UserError(f"format onnx needs {' and '.join(missing)}: pip install onnx onnxscript, or --format pt2")
     target = Path(path)
+    other = next((name for name in FORMATS if name != format and target.suffix == f".{name}"), None)
+    if other is not None:
+        raise UserError(f"{target} would hold a program in format {format}: give --format {other}, or another name")
     if target.is_dir() or not target.absolute().parent.is_dir():
         raise UserError(f"cannot write {target}: give a file in a folder that exists")
     if isinstance(agent_or_checkpoint, ModelAgent):

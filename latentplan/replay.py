@@ -11,7 +11,8 @@ import os
 import sys
 from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple
+from pickle import UnpicklingError
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -197,11 +198,11 @@ class Replay:
         """Restore what `save` wrote; where the capacity is smaller now, the newest rows of it.
 
         Raises:
-            UserError: The folder holds no whole replay of the same lanes, actions and beliefs.
+            UserError: The folder holds no whole replay, or not one of the same lanes, actions and beliefs.
         """
         if not (folder / "rows.pt").exists():
             raise UserError(f"no replay found in {folder}")
-        state = torch.load(folder / "rows.pt", weights_only=True)
+        state = read_saved(folder / "rows.pt")
         columns = ("actions", "deter", "labels")
         saved = (len(state["episode"]), *(state[name].shape[1] for name in columns))
         own = (self.num_lanes, *(getattr(self, name).shape[1] for name in columns))
@@ -250,6 +251,18 @@ class Replay:
             if len(starts) >= count:
                 return lanes[:count], starts[:count]
         raise UserError(too_short)
+
+
+def read_saved(path: Path, device: torch.device | str = "cpu") -> Any:
+    """What `torch.save` wrote.
+
+    Raises:
+        UserError: The file is damaged.
+    """
+    try:
+        return torch.load(path, map_location=device, weights_only=True)
+    except (OSError, RuntimeError, EOFError, KeyError, ValueError, UnpicklingError) as error:
+        raise UserError(f"{path} is damaged: {str(error).splitlines()[0]}") from None
 
 
 def replay_bytes(num_rows: int, action_dim: int, deter_dim: int, num_labels: int = 0) -> int:

@@ -1,10 +1,13 @@
 """Checkpoints: the same agent comes back, or the user hears in one line why not."""
 
+import copy
+import hashlib
 import json
 
 import numpy as np
 import pytest
 import torch
+from safetensors.torch import load_file, save_file
 
 import latentplan
 from latentplan.checkpoint import load_agent, load_model, read_info, resolve_checkpoint, save_checkpoint
@@ -140,6 +143,46 @@ def test_a_missing_fact_is_named(folder, key):
 def test_settings_that_cannot_be_used_are_named(folder, config, word):
     change_info(folder, config=config)
     assert_refused(lambda: load_agent(folder), "info.json", word)
+
+
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [("env_frames", None), ("action_dim", "two"), ("discount", "high"), ("labels", [1]), ("sha256", 3)],
+)
+def test_facts_of_another_kind_are_refused(folder, key, value):
+    change_info(folder, **{key: value})
+    assert_refused(lambda: load_agent(folder), "info.json", key)
+
+
+@pytest.mark.parametrize("action_dim", [-1, 0])
+def test_sizes_that_cannot_be_are_refused(folder, action_dim):
+    change_info(folder, action_dim=action_dim)
+    assert_refused(lambda: load_agent(folder), "does not fit")
+
+
+@pytest.mark.parametrize("number", ["nan", "inf"])
+def test_weights_that_are_not_finite_are_refused(folder, number):
+    path = folder / "weights.safetensors"
+    weights = load_file(path)
+    weights["reward_head.mlp.output.bias"][0] = float(number)
+    save_file(weights, path)
+    change_info(folder, sha256=hashlib.sha256(path.read_bytes()).hexdigest())
+    assert_refused(lambda: load_agent(folder), "reward_head.mlp.output.bias", "not finite")
+
+
+def test_what_float16_cannot_hold_is_not_saved(model, folder):
+    before = {path.name: path.read_bytes() for path in folder.iterdir()}
+    large = copy.deepcopy(model)
+    with torch.no_grad():
+        large.actor.mlp.output.weight[0, 0] = 1e5
+    with pytest.raises(FloatingPointError, match=r"actor\.mlp\.output\.weight"):
+        save_checkpoint(folder, large, CONFIG, INFO)
+    assert {path.name: path.read_bytes() for path in folder.iterdir()} == before
+
+
+@pytest.mark.parametrize("mode", ["actor", "random"])
+def test_settings_of_a_search_are_refused_where_nothing_is_searched(folder, mode):
+    assert_refused(lambda: load_agent(folder, mode=mode, horizon=3), "horizon has no effect", mode)
 
 
 def test_weights_of_other_sizes_are_refused(folder):

@@ -4,6 +4,7 @@ import signal
 import subprocess
 import sys
 import time
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -12,8 +13,8 @@ import torch
 
 from latentplan import evaluate, evaluation_request
 from latentplan.agent import RandomAgent
-from latentplan.checkpoint import save_checkpoint
-from latentplan.config import Config, EnvConfig, ModelConfig, PlannerConfig, UserError
+from latentplan.checkpoint import load_model, save_checkpoint
+from latentplan.config import USER_DOMAIN, Config, EnvConfig, ModelConfig, PlannerConfig, UserError
 from latentplan.envs import make_env
 from latentplan.models import WorldModel
 
@@ -165,6 +166,10 @@ def test_evaluate_agent_pairs_agents_by_episode():
         (("--mode", "gated", "--planning-budget", "30%"), ("--planning-budget", "0 to 1", "'30%'")),
         (("--video", "film.avi"), (".mp4", "'film.avi'")),
         (("--json",), ("--json", "value")),
+        (("--json", "a.mp4", "--video", "a.mp4"), ("--video and --json", "same file")),
+        (("--threads", "1000000000000"), ("--threads", "1 to 1024")),
+        (("--objective", "1e200 * 1e200 * cart > 1"), ("1e+200 * 1e+200", "not finite")),
+        (("--constraint", "cart < 1e308 * 1e308"), ("not finite",)),
     ],
 )
 def test_bad_flags_get_one_line_that_names_them(capsys, checkpoint, flags, words):
@@ -188,6 +193,19 @@ def test_a_foreign_checkpoint_is_one_line(capsys, tmp_path, foreign):
         (tmp_path / "weights.safetensors").write_bytes(b"no weights")
         (tmp_path / "info.json").write_text("{" if foreign == "unreadable" else '{"architectures": ["Bert"]}')
     assert str(tmp_path) in error_line(capsys, "--checkpoint", tmp_path)
+
+
+def test_an_agent_of_the_users_own_environment_is_played_from_python(capsys, tmp_path, checkpoint):
+    model, config, info = load_model(checkpoint)
+    own = replace(config, env=replace(config.env, domain=USER_DOMAIN, task="Dot"))
+    save_checkpoint(tmp_path / "own", model, own, info)
+    assert "load_agent" in error_line(capsys, "--checkpoint", tmp_path / "own")
+
+
+def test_a_search_that_finds_nothing_finite_is_told(capsys, checkpoint, monkeypatch):
+    monkeypatch.setattr(WorldModel, "rollout", lambda self, state, actions: (actions[..., 0] * torch.nan, state))
+    assert run(checkpoint, "--episodes", "1") == 0
+    assert "at 10 decisions the search found nothing finite" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("flag", ["--video", "--json"])

@@ -131,6 +131,7 @@ def test_an_agent_in_memory_is_exported_as_it_is(tmp_path, program):
         (["--checkpoint", "{checkpoint}", "--out", "a.pt2", "--format", "onx"], ["'onx'", "'onnx'"]),
         (["--checkpoint", "{checkpoint}", "--out", "nowhere/a.pt2"], ["nowhere/a.pt2"]),
         (["--checkpoint", "nothing", "--out", "a.pt2"], ["nothing"]),
+        (["--checkpoint", "{checkpoint}", "--out", "a.onnx"], ["--format onnx"]),
         (["--chekpoint", "nothing", "--out", "a.pt2"], ["'--chekpoint'", "'--checkpoint'"]),
     ],
 )

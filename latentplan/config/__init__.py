@@ -10,7 +10,7 @@ import dataclasses
 from dataclasses import dataclass, field
 from typing import Any
 
-from latentplan.config.checks import UserError, above_zero, at_least, derive_seed, one_of
+from latentplan.config.checks import UserError, above_zero, at_least, derive_seed, make_folder, one_of
 from latentplan.config.distill import DistillConfig
 from latentplan.config.learning import CollectionConfig, LearningConfig
 from latentplan.config.planner import PlannerConfig
@@ -29,6 +29,7 @@ __all__ = [
     "UserError",
     "derive_seed",
     "from_dict",
+    "make_folder",
     "to_dict",
 ]
 
@@ -36,6 +37,7 @@ LATENT_DIM = 32
 RENDER_QUALITIES = ("exact", "fast", "fastest")
 FLOORS = ("suite", "endless")
 DEVICES = ("auto", "cpu", "cuda")
+USER_DOMAIN = "user"  # the domain of runs in an environment of the user's own
 
 
 @dataclass(frozen=True)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+from pathlib import Path
 from typing import Any
 
 
@@ -14,6 +15,18 @@ def derive_seed(seed: int, name: str, counter: int = 0) -> int:
     """A seed in [0, 2**31) for the stream `name` of a run, the same on every machine."""
     digest = hashlib.sha256(f"{seed}/{name}/{counter}".encode()).digest()
     return int.from_bytes(digest[:4], "little") >> 1
+
+
+def make_folder(path: Path) -> None:
+    """Make a folder for results, and those above it.
+
+    Raises:
+        UserError: It cannot be made.
+    """
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise UserError(f"cannot make the folder {path}: {error.strerror}; choose another") from None
 
 
 def at_least(config: Any, **bounds: float) -> None:

@@ -7,9 +7,12 @@ compares: scales add in sums and differences, and multiply in products, where a 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Any
+
+from latentplan.config import UserError
 
 # An array or a tensor of any shape; numbers broadcast with both.
 Values = Any
@@ -145,7 +148,10 @@ def walk(node: Node) -> Iterator[Node]:
 def combine(operator: str, left: Node, right: Node) -> Node:
     """Two nodes joined by `+`, `-` or `*`; two numbers become one, so that a weight may be written as `-0.5`."""
     if isinstance(left, Number) and isinstance(right, Number):
-        return Number(_OPERATIONS[operator](left.value, right.value))
+        value = _OPERATIONS[operator](left.value, right.value)
+        if not math.isfinite(value):
+            raise UserError(f"{left.value:g} {operator} {right.value:g} is not finite")
+        return Number(value)
     return Arithmetic(operator, left, right)
 
 

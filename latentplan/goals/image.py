@@ -19,7 +19,8 @@ def read_goal(path: str, size: int = 64) -> NDArray[np.uint8]:
     import cv2  # when there is a picture to read: agents act without it
 
     if not Path(path).is_file():
-        raise UserError(f"goal image {path!r} does not exist; give a square picture such as a frame of the camera")
+        reason = "is a folder" if Path(path).is_dir() else "does not exist"
+        raise UserError(f"goal image {path!r} {reason}; give a square picture such as a frame of the camera")
     picture = cv2.imread(path, cv2.IMREAD_COLOR)
     if picture is None:
         raise UserError(f"goal image {path!r} is no picture that can be read; give a .png")

@@ -64,6 +64,10 @@ def plan_goals(
         UserError: A text is no expression, or is about what this agent does not predict.
     """
     known = model.labels or scales(env.domain)
+    if objective is not None and not isinstance(objective, str | Expression) and not callable(objective):
+        raise UserError(f"an objective is an expression or a function of rollouts, got {objective!r}")
+    if not isinstance(constraints, str) and any(isinstance(constraint, str) for constraint in constraints):
+        raise UserError("constraints are one text, inequalities separated by ';', or functions of rollouts")
     if isinstance(objective, str):
         objective = parse_objective(objective, known)
     if isinstance(objective, Expression):

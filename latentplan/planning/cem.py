@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -179,11 +180,12 @@ class CEMPlanner:
 
 def _validate(planner: CEMPlanner) -> None:
     for name in ("action_dim", "horizon", "num_samples", "num_elites", "num_iterations"):
-        if getattr(planner, name) < 1:
-            raise ValueError(f"{name} must be at least 1, got {getattr(planner, name)}")
+        _check_whole(name, getattr(planner, name), 1)
     for name in ("warm_start_iterations", "goal_horizon"):
-        if getattr(planner, name) is not None and getattr(planner, name) < 1:
-            raise ValueError(f"{name} must be at least 1, got {getattr(planner, name)}")
+        if getattr(planner, name) is not None:
+            _check_whole(name, getattr(planner, name), 1)
+    for name in ("num_policy_samples", "gradient_steps"):
+        _check_whole(name, getattr(planner, name), 0)
     if planner.num_elites > planner.num_samples:
         raise ValueError(f"num_elites ({planner.num_elites}) must not exceed num_samples ({planner.num_samples})")
     if not 0 <= planner.num_policy_samples < planner.num_samples:
@@ -197,8 +199,8 @@ def _validate(planner: CEMPlanner) -> None:
     for name in ("smoothing", "discount"):
         if not 0.0 < getattr(planner, name) <= 1.0:
             raise ValueError(f"{name} must lie in (0, 1], got {getattr(planner, name)}")
-    for name in ("min_std", "noise_beta", "stop_std", "constraint_penalty", "gradient_steps"):
-        if (getattr(planner, name) or 0.0) < 0.0:
+    for name in ("min_std", "noise_beta", "stop_std", "constraint_penalty"):
+        if not 0.0 <= (getattr(planner, name) or 0.0) < math.inf:
             raise ValueError(f"{name} must be at least 0, got {getattr(planner, name)}")
     if not 0.0 <= planner.keep_elite_fraction <= 1.0:
         raise ValueError(f"keep_elite_fraction must lie in [0, 1], got {planner.keep_elite_fraction}")
@@ -206,6 +208,11 @@ def _validate(planner: CEMPlanner) -> None:
         if getattr(planner, name) is not None and not getattr(planner, name) > 0.0:
             raise ValueError(f"{name} must be above 0, got {getattr(planner, name)}")
     _validate_bounds(planner)
+
+
+def _check_whole(name: str, value: int, least: int) -> None:
+    if value != int(value) or value < least:
+        raise ValueError(f"{name} must be a whole number, at least {least}, got {value}")
 
 
 def _validate_bounds(planner: CEMPlanner) -> None:

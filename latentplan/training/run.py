@@ -17,7 +17,7 @@ import torch
 from lightning.pytorch.loggers import TensorBoardLogger
 
 from latentplan.compose import dump_config, read_config
-from latentplan.config import Config, RunConfig, UserError, derive_seed
+from latentplan.config import USER_DOMAIN, Config, RunConfig, UserError, derive_seed, make_folder
 from latentplan.envs import default_task
 from latentplan.models import WorldModel
 from latentplan.replay import Replay
@@ -27,13 +27,12 @@ from latentplan.training.curriculum import Curriculum
 from latentplan.training.data import ReplayBatches, ReplayData
 from latentplan.training.module import Learner
 from latentplan.training.progress import Progress
-from latentplan.training.state import INTERRUPTED, RunState, load_state
+from latentplan.training.state import INTERRUPTED, RunState, load_state, restore
 from latentplan.training.worker import LocalWorker, RemoteWorker, Worker
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-USER_DOMAIN = "user"
 UNKNOWN_LENGTH_CAPACITY = 200_000
 
 
@@ -83,7 +82,7 @@ def train(config: Config, make_env: EnvFactory | None = None) -> Result:
         raise UserError(
             f"{folder} already holds a run: continue it with --resume {folder}, or choose another --run-dir"
         )
-    folder.mkdir(parents=True, exist_ok=True)
+    make_folder(folder)
     run = _Run(config, folder, make_env, resume=False)
     dump_config(config, folder / "config.yaml")
     return run.execute()
@@ -113,6 +112,8 @@ def resume(
     if not (folder / "config.yaml").exists():
         raise UserError(f"nothing to resume in {folder}: config.yaml is missing")
     config = read_config(folder / "config.yaml")
+    if config.env.domain == USER_DOMAIN and make_env is None:
+        raise UserError("this run learns in an environment of your own: resume it from Python, with make_env")
     run = config.run
     if frames is not None or minutes is not None:
         run = replace(run, frames=frames, minutes=minutes)
@@ -156,8 +157,7 @@ class _Run:
         if resume:
             self.state, saved, self._saved_optimizers = load_state(self.folder / "resume", self.device)
             self.replay.load(self.folder / "resume" / "replay")
-            self.learner.load_state_dict(saved["weights"])
-            self.learner.updates = saved["updates"]
+            restore(self.learner, saved, self.folder)
         self.curriculum = Curriculum(config, model.labels, self.state)
 
     def execute(self) -> Result:

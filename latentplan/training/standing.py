@@ -8,7 +8,8 @@ from typing import Any
 
 import torch
 
-from latentplan.config import UserError
+from latentplan.config import UserError, make_folder
+from latentplan.replay import read_saved
 
 STATE_FILE = Path("resume") / "distill.pt"
 START = -1  # stands for a round where the actor is the one it all began with
@@ -42,7 +43,7 @@ class Standing:
 def save_distillation(folder: Path, saved: dict[str, Any]) -> None:
     """Write everything that going on takes; replaced whole."""
     path = folder / STATE_FILE
-    path.parent.mkdir(parents=True, exist_ok=True)
+    make_folder(path.parent)
     part = path.with_suffix(".part")
     torch.save(saved, part)
     part.replace(path)
@@ -52,10 +53,10 @@ def load_distillation(folder: Path) -> dict[str, Any]:
     """What `save_distillation` wrote.
 
     Raises:
-        UserError: The folder holds no distillation.
+        UserError: The folder holds no distillation, or a damaged one.
     """
     path = folder / STATE_FILE
     if not path.is_file():
         raise UserError(f"nothing to resume in {folder}: {path} is missing")
-    saved: dict[str, Any] = torch.load(path, map_location="cpu", weights_only=True)
+    saved: dict[str, Any] = read_saved(path)
     return saved

@@ -5,12 +5,15 @@ from __future__ import annotations
 import time
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import torch
 
 from latentplan.config import UserError
-from latentplan.replay import Replay
+from latentplan.replay import Replay, read_saved
+
+if TYPE_CHECKING:
+    from latentplan.training.module import Learner
 
 STATE_FILE = "state.pt"
 INTERRUPTED = 130  # exit code of a run that the user ended
@@ -66,9 +69,23 @@ def load_state(folder: Path, device: torch.device) -> tuple[RunState, dict[str, 
     """The clocks, the learner's state and the optimizers' states that `save_state` wrote.
 
     Raises:
-        UserError: The folder holds no saved run.
+        UserError: The folder holds no saved run, or a damaged one.
     """
     if not (folder / STATE_FILE).exists():
         raise UserError(f"nothing to resume in {folder.parent}: {folder / STATE_FILE} is missing")
-    saved = torch.load(folder / STATE_FILE, map_location=device, weights_only=True)
+    saved = read_saved(folder / STATE_FILE, device)
     return RunState(**saved["run"]), saved["learner"], saved["optimizers"]
+
+
+def restore(learner: Learner, saved: dict[str, Any], folder: Path) -> None:
+    """Put a learner where `save_state` found it.
+
+    Raises:
+        UserError: The weights are not those of this model.
+    """
+    try:
+        learner.load_state_dict(saved["weights"])
+    except RuntimeError as error:
+        reason = str(error).splitlines()[-1].strip()
+        raise UserError(f"what {folder} holds does not fit the settings in its config.yaml: {reason}") from None
+    learner.updates = saved["updates"]

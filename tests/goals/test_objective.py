@@ -185,3 +185,18 @@ def test_what_the_model_does_not_predict_is_refused():
 def test_terms_of_the_planner_mix_with_expressions():
     mixed = objective("cart > 0.3") + 0.1 * learned_return()
     assert isinstance(mixed, Objective) and mixed.needs_states
+
+
+@pytest.mark.parametrize(("objective", "constraints"), [(5, ()), (None, ["cart < 0.5"]), (None, ("cart < 0.5", "a"))])
+def test_what_is_neither_text_nor_function_is_refused_at_once(objective, constraints):
+    model = Cart()
+    model.labels = SCALES
+    with pytest.raises(UserError, match="functions? of rollouts"):
+        plan_goals(
+            objective,
+            constraints,
+            model=model,
+            env=EnvConfig(domain="cartpole"),
+            planner=CEMPlanner(action_dim=1, horizon=2),
+            encode_goal=lambda path: torch.zeros(1),
+        )

@@ -262,6 +262,13 @@ def test_the_optimum_of_a_point_mass_is_found(point, make_planner, seeded):
         ({"temperature": 0.0}, "temperature"),
         ({"warm_start_iterations": 0}, "warm_start_iterations"),
         ({"keep_elite_fraction": 1.5}, "keep_elite_fraction"),
+        ({"min_std": float("nan")}, "min_std"),
+        ({"stop_std": float("nan")}, "stop_std"),
+        ({"noise_beta": float("nan")}, "noise_beta"),
+        ({"constraint_penalty": float("nan")}, "constraint_penalty"),
+        ({"horizon": 2.5}, "horizon"),
+        ({"goal_horizon": 2.5}, "goal_horizon"),
+        ({"gradient_steps": -1}, "gradient_steps"),
     ],
 )
 def test_bad_settings_are_named(make_planner, options, name):

@@ -177,6 +177,10 @@ def test_folders_that_do_not_fit_are_refused(finished, checkpoint, push, tmp_pat
         distill(checkpoint, finished.run_dir, SETTINGS, make_env=push)
     with pytest.raises(UserError, match="nothing to resume"):
         resume_distillation(tmp_path)
+    (tmp_path / "resume").mkdir()
+    (tmp_path / "resume" / "distill.pt").write_bytes((finished.run_dir / "resume" / "distill.pt").read_bytes()[:-100])
+    with pytest.raises(UserError, match=r"distill\.pt is damaged"):
+        resume_distillation(tmp_path)
 
 
 def test_old_labels_are_planned_again_in_each_round(finished):

@@ -2,6 +2,7 @@
 
 import csv
 import os
+import shutil
 import signal
 
 import numpy as np
@@ -125,6 +126,38 @@ def test_a_run_needs_an_end(tiny, dot, tmp_path):
 def test_an_empty_folder_cannot_be_resumed(tmp_path):
     with pytest.raises(UserError, match="nothing to resume"):
         resume(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("damage", "said"),
+    [
+        ("resume/state.pt", "state.pt is damaged"),
+        ("resume/replay/rows.pt", "rows.pt is damaged"),
+        ("latent_dim", "does not fit the settings in its config.yaml"),
+    ],
+)
+def test_what_is_damaged_is_said_in_one_line(damage, said, finished, dot, tmp_path):
+    folder = shutil.copytree(finished.run_dir, tmp_path / "run")
+    if damage == "latent_dim":
+        text = (folder / "config.yaml").read_text()
+        (folder / "config.yaml").write_text(text.replace("latent_dim: 32", "latent_dim: 16"))
+    else:
+        (folder / damage).write_bytes((folder / damage).read_bytes()[:-200])
+    with pytest.raises(UserError, match=said) as caught:
+        resume(folder, make_env=dot)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_run_in_an_environment_of_the_users_own_is_resumed_with_it(finished):
+    with pytest.raises(UserError, match="with make_env"):
+        resume(finished.run_dir)
+
+
+@pytest.mark.parametrize("place", ["file", "file/run"])
+def test_a_folder_that_cannot_be_made_is_named(place, tiny, dot, tmp_path):
+    (tmp_path / "file").touch()
+    with pytest.raises(UserError, match="cannot make the folder"):
+        train(tiny(tmp_path / place), dot)
 
 
 class Interrupting:
