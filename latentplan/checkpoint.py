@@ -23,10 +23,7 @@ WEIGHTS = "weights.safetensors"
 INFO = "info.json"
 MODES = ("planner", "gated", "background", "actor", "random")
 OPTIONS = {"gated": ("planning_budget", "signal"), "background": ("worker", "max_age", "fresh_ticks", "make_executor")}
-KINDS: dict[str, type | tuple[type, ...]] = {
-    **{"env_frames": int, "action_dim": int, "discount": (int, float), "sha256": str},
-    "labels": (dict, type(None)),
-}
+KINDS = {"env_frames": int, "action_dim": int, "discount": int | float, "sha256": str, "labels": dict | None}
 REQUIRED = ("domain", "task", "env_frames", "discount", "action_dim", "config", "sha256")
 
 

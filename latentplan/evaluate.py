@@ -177,7 +177,7 @@ def _report(request: EvaluationRequest, result: dict[str, Any]) -> None:
         print(f"on average   {means}")
     print(f"decision ms  {latency}", flush=True)
     tails = result["action_source"]["tail"]
-    if tails and request.mode == "planner" and "deadline_ms" not in request.planner:
+    if tails and request.mode == "planner" and result["planner"]["deadline_ms"] is None:
         print(f"warning: at {tails} decisions the search found nothing finite", file=sys.stderr, flush=True)
     if result["control_hz"] is not None:
         sources = "   ".join(f"{name} {count}" for name, count in result["action_source"].items())
