@@ -99,8 +99,7 @@ def parse_arguments(argv: Sequence[str]) -> EvaluationRequest:
     from latentplan.latency import read_clock_flags
 
     control_hz, latency = read_clock_flags(flags)
-    if flags.get("--video") is not None and flags.get("--video") == flags.get("--json"):
-        raise UserError("--video and --json name the same file; give two")
+    video, result = _output_paths(flags)
     return EvaluationRequest(
         checkpoint=Path(flags["--checkpoint"]),
         episodes=_whole_number(flags, "--episodes", 10, 1),
@@ -109,8 +108,8 @@ def parse_arguments(argv: Sequence[str]) -> EvaluationRequest:
         mode=mode,
         planner=planner,
         planning_budget=_share(flags, "--planning-budget") if "--planning-budget" in flags else None,
-        video=_output_path(flags, "--video"),
-        json=_output_path(flags, "--json"),
+        video=video,
+        json=result,
         control_hz=control_hz,
         latency=latency,
         seed=_whole_number(flags, "--seed", 0, 0),
@@ -150,6 +149,14 @@ def _share(flags: dict[str, str], name: str) -> float:
     if not 0.0 <= value <= 1.0:
         raise UserError(f"{name} must be a number from 0 to 1, got {flags[name]!r}")
     return value
+
+
+def _output_paths(flags: dict[str, str]) -> tuple[Path | None, Path | None]:
+    """Where film and result go."""
+    video, result = _output_path(flags, "--video"), _output_path(flags, "--json")
+    if video is not None and result is not None and video.resolve() == result.resolve():
+        raise UserError("--video and --json name the same file; give two")
+    return video, result
 
 
 def _output_path(flags: dict[str, str], name: str) -> Path | None:

@@ -188,10 +188,9 @@ def _validate(planner: CEMPlanner) -> None:
         _check_whole(name, getattr(planner, name), 0)
     if planner.num_elites > planner.num_samples:
         raise ValueError(f"num_elites ({planner.num_elites}) must not exceed num_samples ({planner.num_samples})")
-    if not 0 <= planner.num_policy_samples < planner.num_samples:
+    if planner.num_policy_samples >= planner.num_samples:
         raise ValueError(
-            f"num_policy_samples ({planner.num_policy_samples}) must lie in 0 to below "
-            f"num_samples ({planner.num_samples})"
+            f"num_policy_samples ({planner.num_policy_samples}) must lie below num_samples ({planner.num_samples})"
         )
     for name, allowed in _CHOICES.items():
         if getattr(planner, name) not in allowed:
@@ -201,7 +200,7 @@ def _validate(planner: CEMPlanner) -> None:
             raise ValueError(f"{name} must lie in (0, 1], got {getattr(planner, name)}")
     for name in ("min_std", "noise_beta", "stop_std", "constraint_penalty"):
         if not 0.0 <= (getattr(planner, name) or 0.0) < math.inf:
-            raise ValueError(f"{name} must be at least 0, got {getattr(planner, name)}")
+            raise ValueError(f"{name} must be finite and at least 0, got {getattr(planner, name)}")
     if not 0.0 <= planner.keep_elite_fraction <= 1.0:
         raise ValueError(f"keep_elite_fraction must lie in [0, 1], got {planner.keep_elite_fraction}")
     for name in ("temperature", "gradient_step_size", "deadline_ms"):
@@ -211,7 +210,7 @@ def _validate(planner: CEMPlanner) -> None:
 
 
 def _check_whole(name: str, value: int, least: int) -> None:
-    if value != int(value) or value < least:
+    if value % 1 != 0 or value < least:  # NaN and infinity leave NaN
         raise ValueError(f"{name} must be a whole number, at least {least}, got {value}")
 
 

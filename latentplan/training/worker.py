@@ -15,9 +15,7 @@ from gymnasium.vector.utils import CloudpickleWrapper
 
 from latentplan.config import Config, UserError
 from latentplan.envs import single_threaded_children
-from latentplan.training.collector import Collector, EnvFactory
-
-CLOSING_SECONDS = 5.0
+from latentplan.training.collector import CLOSING_SECONDS, Collector, EnvFactory
 
 
 class LocalWorker:

@@ -2,6 +2,7 @@
 
 import csv
 import os
+import re
 import shutil
 import signal
 
@@ -204,11 +205,23 @@ def test_a_finished_run_can_be_extended(tiny, dot, tmp_path):
 
 
 def test_resuming_a_finished_run_judges_the_same_agent(finished, dot):
-    before = saved_state(finished.run_dir)["optimizers"]
     again = resume(finished.run_dir, make_env=dot)
     assert again.summary == finished.summary
-    after = saved_state(finished.run_dir)["optimizers"]
-    assert [len(optimizer["state"]) for optimizer in after] == [len(optimizer["state"]) for optimizer in before]
+
+
+def test_a_finished_run_that_is_judged_again_can_still_be_extended(finished, dot, tmp_path):
+    folder = shutil.copytree(finished.run_dir, tmp_path / "run")
+    before = saved_state(folder)
+    before["run"]["best_return"] = float("-inf")  # so that this evaluation is the best, and saved
+    torch.save(before, folder / "resume" / "state.pt")
+    (folder / "config.yaml").write_text(
+        re.sub("run_dir: .*", f"run_dir: {folder}", (folder / "config.yaml").read_text())
+    )
+    resume(folder, make_env=dot)
+    after = saved_state(folder)
+    assert after["run"]["best_return"] > float("-inf")
+    states = [[optimizer["state"].keys() for optimizer in saved["optimizers"]] for saved in (before, after)]
+    assert states[0] == states[1] and all(states[0])
 
 
 def test_the_best_agent_is_the_one_that_was_judged(tiny, dot, tmp_path, monkeypatch):
