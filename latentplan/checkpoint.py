@@ -23,7 +23,14 @@ WEIGHTS = "weights.safetensors"
 INFO = "info.json"
 MODES = ("planner", "gated", "background", "actor", "random")
 OPTIONS = {"gated": ("planning_budget", "signal"), "background": ("worker", "max_age", "fresh_ticks", "make_executor")}
-KINDS = {"env_frames": int, "action_dim": int, "discount": int | float, "sha256": str, "labels": dict | None}
+KINDS = {
+    "env_frames": int,
+    "action_dim": int,
+    "discount": int | float,
+    "sha256": str,
+    "labels": dict | None,
+    "goal_dim": int | None,
+}
 REQUIRED = ("domain", "task", "env_frames", "discount", "action_dim", "config", "sha256")
 
 
@@ -46,7 +53,8 @@ def save_checkpoint(folder: Path, model: WorldModel, config: Config, info: dict[
         raise FloatingPointError(f"{broken} is not finite in float16: {folder} is left as it was")
     save_file(state, part)
     digest = hashlib.sha256(part.read_bytes()).hexdigest()
-    facts = info | {"action_dim": model.action_dim, "labels": model.labels, "config": to_dict(config), "sha256": digest}
+    sizes = {"action_dim": model.action_dim, "labels": model.labels, "goal_dim": model.goal_dim}
+    facts = info | sizes | {"config": to_dict(config), "sha256": digest}
     part.replace(folder / WEIGHTS)
     (folder / f"{INFO}.part").write_text(json.dumps(facts, indent=1))
     (folder / f"{INFO}.part").replace(folder / INFO)
@@ -90,7 +98,7 @@ def load_model(path: str | Path, device: str = "cpu") -> tuple[WorldModel, Confi
     except (AttributeError, TypeError, ValueError) as error:
         raise UserError(f"the settings in {folder / INFO} cannot be used: {error}") from None
     try:
-        model = WorldModel(config.model, info["action_dim"], info.get("labels"))
+        model = WorldModel(config.model, info["action_dim"], info.get("labels"), info.get("goal_dim") or 0)
         state = {name: value.float() for name, value in load_file(weights).items()}
         model.load_state_dict(state)
     except (RuntimeError, SafetensorError, TypeError, ValueError) as error:

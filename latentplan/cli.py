@@ -27,7 +27,7 @@ from latentplan.compose import (
 )
 from latentplan.config import Config, UserError
 
-COMMANDS = ("train", "eval", "distill", "export", "doctor")
+COMMANDS = ("train", "eval", "distill", "goals", "export", "doctor")
 RESUMABLE = ("--frames", "--minutes", "--device")
 SHORT_FLAGS = {
     "--domain": ("env.domain", "domain of dm_control.suite (short for --env.domain)"),
@@ -67,7 +67,7 @@ class TrainCommand(NamedTuple):
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run `latentplan train | eval | distill | export | doctor` and return the exit code."""
+    """Run `latentplan train | eval | distill | goals | export | doctor` and return the exit code."""
     arguments = list(sys.argv[1:] if argv is None else argv)
     command = arguments[0] if arguments else "--help"
     if command == "--version":
@@ -78,10 +78,12 @@ def main(argv: Sequence[str] | None = None) -> int:
         print("  train    learn to control a body from pixels (train --help lists every setting)")
         print("  eval     run a trained agent in closed loop and film it")
         print("  distill  teach a trained agent's actor what its planner does")
+        print("  goals    teach a trained agent to pursue goals that are named later")
         print("  export   write the actor as a program that runs without this package")
         print("  doctor   report versions, device and renderer, and what to do about what is wrong")
         return 0
-    commands = {"train": _train, "eval": _evaluate, "distill": _distill, "export": _export, "doctor": _doctor}
+    commands = {"train": _train, "eval": _evaluate, "distill": _distill, "goals": _goals, "export": _export}
+    commands["doctor"] = _doctor
     return run_guarded(commands.get(command, lambda _: raise_unknown("command", command, COMMANDS)), arguments[1:])
 
 
@@ -178,6 +180,12 @@ def _distill(argv: Sequence[str]) -> int:
     from latentplan.distill import main as distill_main
 
     return distill_main(argv)
+
+
+def _goals(argv: Sequence[str]) -> int:
+    from latentplan.learn_goals import main as goals_main
+
+    return goals_main(argv)
 
 
 def _export(argv: Sequence[str]) -> int:

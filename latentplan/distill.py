@@ -5,9 +5,7 @@ Torch and the simulator are imported when they are needed, so that `--help` and 
 
 from __future__ import annotations
 
-import dataclasses
 import sys
-import typing
 from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import datetime
@@ -18,6 +16,7 @@ from latentplan.cli import read_flags, run_guarded, use_device
 from latentplan.compose import build_config, field_names, raise_unknown
 from latentplan.config import DEVICES, DistillConfig, PlannerConfig, UserError, from_dict, to_dict
 from latentplan.config.planner import override_planner
+from latentplan.setting_flags import describe_settings, read_settings, read_threads, setting_kinds
 
 FLAGS = {
     "--checkpoint": ("DIR", "folder of a trained agent, or of a run (its best checkpoint)"),
@@ -63,7 +62,7 @@ def parse_arguments(argv: Sequence[str]) -> DistillRequest:
     Raises:
         UserError: A flag or value is wrong; the message says what to give.
     """
-    kinds = _setting_kinds()
+    kinds = setting_kinds(DistillConfig)
     searches = [f"--planner.{name}" for name in field_names("planner")]
     flags = read_flags(argv, [*FLAGS, *kinds, *searches])
     if "--resume" in flags:
@@ -75,13 +74,7 @@ def parse_arguments(argv: Sequence[str]) -> DistillRequest:
     device = flags.get("--device", "auto")
     if device not in DEVICES:
         raise_unknown("device", device, DEVICES)
-    settings: dict[str, Any] = {
-        _field(flag): _number(flag, flags[flag], kind) for flag, kind in kinds.items() if flag in flags
-    }
-    try:
-        DistillConfig(**settings)
-    except ValueError as error:
-        raise UserError(f"--{error}".replace("_", "-")) from None
+    settings = read_settings(DistillConfig, flags)
     paths = {
         name: Path(flags[f"--{name}"]) if f"--{name}" in flags else None for name in ("checkpoint", "out", "resume")
     }
@@ -90,7 +83,7 @@ def parse_arguments(argv: Sequence[str]) -> DistillRequest:
         settings=settings,
         planner={flag.removeprefix("--planner."): flags[flag] for flag in searches if flag in flags},
         device=device,
-        threads=_threads(flags),
+        threads=read_threads(flags),
     )
 
 
@@ -124,52 +117,10 @@ def _planner(request: DistillRequest, info: dict[str, Any]) -> PlannerConfig:
     return build_config({"planner": override_planner(trained, request.planner)}).planner
 
 
-def _setting_kinds() -> dict[str, type]:
-    """The flags that are fields of `DistillConfig`, and whether each is whole."""
-    hints = typing.get_type_hints(DistillConfig)
-    names = [field.name for field in dataclasses.fields(DistillConfig)]
-    return {f"--{name.replace('_', '-')}": int if hints[name] is int else float for name in names}
-
-
-def _field(flag: str) -> str:
-    return flag.removeprefix("--").replace("-", "_")
-
-
-def _number(flag: str, text: str, kind: type) -> int | float:
-    try:
-        number = float(text)
-        if (
-            number not in (float("inf"), float("-inf"))
-            and (kind is float or number == int(number))
-            and number == number
-        ):
-            return kind(number)
-    except ValueError:
-        pass
-    raise UserError(f"{flag} must be a {'whole ' if kind is int else ''}number, got {text!r}")
-
-
-def _threads(flags: dict[str, str]) -> int | None:
-    if "--threads" not in flags:
-        return None
-    threads = int(_number("--threads", flags["--threads"], int))
-    if threads < 1:
-        raise UserError(f"--threads must be at least 1, got {threads}")
-    return threads
-
-
 def _help() -> str:
-    """Flags with their meanings; those of the settings come from the docstring of `DistillConfig`."""
+    """Flags with their meanings."""
     rows = [(f"{flag} {metavar}", meaning) for flag, (metavar, meaning) in FLAGS.items()]
-    meanings = dict(
-        line.strip().split(": ", 1)
-        for line in (DistillConfig.__doc__ or "").partition("Attributes:")[2].splitlines()
-        if ": " in line
-    )
-    for flag in _setting_kinds():
-        default = getattr(DistillConfig, _field(flag))
-        shown = "" if default is None else f" ({default:g})"
-        rows.append((f"{flag} N", meanings[_field(flag)].rstrip(".") + shown))
+    rows += describe_settings(DistillConfig)
     rows.append(("--planner.NAME V", "setting of the search that labels, in place of the agent's; see eval.py --help"))
     lines = "\n".join(f"  {flag:<24}{meaning}" for flag, meaning in rows)
     return (

@@ -82,6 +82,7 @@ def _evaluate(argv: Sequence[str]) -> int:
         overrides["planning_budget"] = request.planning_budget
     device = use_device(request.device, request.threads or (1 if request.mode in ON_ONE_THREAD else None))
     from latentplan.envs import make_env
+    from latentplan.goals.objective import learned_box
     from latentplan.scoring import goal_env, read_goals, score_env
 
     goals = read_goals(request.objective, request.constraint, config.env.domain)
@@ -96,7 +97,10 @@ def _evaluate(argv: Sequence[str]) -> int:
             flush=True,
         )
         played = env if goals is None else score_env(env, goals, agent if request.mode in PLANNING_MODES else None)
-        is_foreign = goals is not None and any(not phase.objective.is_return for phase in goals.phases)
+        is_foreign = goals is not None and any(
+            not phase.objective.is_return and learned_box(phase.objective, getattr(agent, "model", None)) is None
+            for phase in goals.phases
+        )
         horizon = planner.goal_horizon if is_foreign else None
         return _play_and_report(request, played, agent, about, horizon or planner.horizon, clock)
     except OSError as error:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from statistics import NormalDist
+from typing import Any
 
 import numpy as np
 import torch
@@ -12,6 +13,7 @@ from torch import Tensor
 from latentplan.agent import PlanningAgent
 from latentplan.config import Config, PlannerConfig
 from latentplan.models import State, WorldModel, kl_divergence
+from latentplan.planning.conditioned import seen_for
 
 SIGNALS = ("mismatch", "value", "both", "random")
 GAP_STEPS = 2  # a step of imagination costs as much as seeing the frame
@@ -46,8 +48,9 @@ class GatedAgent(PlanningAgent):
     cold when it has run out. An actor knows nothing of an objective or a constraint that was set since: then the last
     plan goes on where none is made, and where it has run out one is made. In doubt is then what the plan did not
     foresee: the signal (but for `random`) is the sum of the mismatches since it was made, which grows until the next
-    search, the faster the less the world goes as imagined. Environments of a batch are gated one by one, and share the
-    threshold.
+    search, the faster the less the world goes as imagined. A goal that the model has learned to pursue (`conditioned`)
+    has an actor and a value of its own, which then stand for those of the task. Environments of a batch are gated one
+    by one, and share the threshold.
 
     Attributes:
         last_source: "plan", "tail" (of an older plan) or "actor", of the most recent decision; a list of these for
@@ -88,6 +91,7 @@ class GatedAgent(PlanningAgent):
         self.threshold = HEAD_START + _normal_threshold(planning_budget, len(self._names))
         self._scales = {name: RunningScale() for name in (*self._names, "drift")}
         self._num_planned = self._num_decisions = 0
+        self._acting: Any = self.model  # whose actor and value these are: the model's own, or those of a learned goal
         self._mismatch: Tensor | None = None
         self._drift: Tensor | None = None
         self._is_first: Tensor | None = None
@@ -125,7 +129,9 @@ class GatedAgent(PlanningAgent):
 
     def _choose(self, state: State) -> Tensor:
         assert self._is_first is not None and self._drift is not None
-        action, _ = self.model.actor(state.features)
+        self._acting, _ = seen_for(self.model, self.controller.objective)
+        is_own = self._acting is self.model
+        action = self.model.actor(state.features)[0] if is_own else self._acting.policy(state)
         is_due, is_tail = self._is_first, torch.zeros_like(self._is_first)
         if self._is_foreign:
             planned, is_tail = self.controller.follow() or (action, is_tail)
@@ -144,8 +150,9 @@ class GatedAgent(PlanningAgent):
 
     @property
     def _is_foreign(self) -> bool:
-        """Whether something is pursued that the actor does not know of."""
-        return self.controller.objective is not None or bool(self.controller.constraints)
+        """Whether something is pursued that no actor knows of."""
+        _, unknown = seen_for(self.model, self.controller.objective)
+        return unknown is not None or bool(self.controller.constraints)
 
     def _is_doubtful(self, state: State, action: Tensor, is_due: Tensor) -> Tensor:
         """Whether the signal exceeds the threshold and the budget allows for a plan, (batch,) bool on the CPU.
@@ -181,13 +188,13 @@ class GatedAgent(PlanningAgent):
     def _value_gap(self, state: State, action: Tensor) -> Tensor:
         """What the critic says of a state, against what the model says of the actor's way from there: (batch,)."""
         with self.model.trunk_precision():
-            gap, weight = -self.model.value(state), 1.0
+            gap, weight = -self._acting.value(state), 1.0
             for step in range(GAP_STEPS):
                 if step > 0:
-                    action = self.model.policy(state)
-                state, reward = self.model.fast_step(state, action)
+                    action = self._acting.policy(state)
+                state, reward = self._acting.fast_step(state, action)
                 gap, weight = gap + weight * reward, weight * self.discount
-            return (gap + weight * self.model.value(state)).abs()
+            return (gap + weight * self._acting.value(state)).abs()
 
     def _count(self, is_planned: Tensor, is_tail: Tensor) -> None:
         num_planned, num = int(is_planned.sum()), len(is_planned)

@@ -56,11 +56,13 @@ LAYERS = {
         {"lightning", "torch", "numpy", "einops", "rich", "tensorboard", "gymnasium", "yaml"},
     ),
     "compose": (("config",), {"jsonargparse", "yaml"}),
+    "setting_flags": (("config",), set()),
     "cli": None,
     "doctor": None,
     "evaluate": None,
     "evaluation_request": None,
     "distill": None,
+    "learn_goals": None,
     "__init__": None,
     "__main__": None,
 }

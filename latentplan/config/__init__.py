@@ -12,6 +12,7 @@ from typing import Any
 
 from latentplan.config.checks import UserError, above_zero, at_least, derive_seed, make_folder, one_of
 from latentplan.config.distill import DistillConfig
+from latentplan.config.goals import GoalsConfig
 from latentplan.config.learning import CollectionConfig, LearningConfig
 from latentplan.config.planner import PlannerConfig
 
@@ -21,6 +22,7 @@ __all__ = [
     "DistillConfig",
     "EnvConfig",
     "EvaluationConfig",
+    "GoalsConfig",
     "LearningConfig",
     "ModelConfig",
     "PlannerConfig",

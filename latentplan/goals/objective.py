@@ -8,7 +8,6 @@ hold are kept with some distance.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any
@@ -19,6 +18,7 @@ from torch import Tensor
 
 from latentplan.config import EnvConfig, UserError
 from latentplan.config.quantities import scales
+from latentplan.goals.box import BoxView, Interval, box_of, plan_degree
 from latentplan.goals.expression import (
     Clause,
     Expression,
@@ -33,6 +33,7 @@ from latentplan.goals.expression import (
 )
 from latentplan.goals.parser import parse_constraints, parse_objective
 from latentplan.planning.cem import CEMPlanner
+from latentplan.planning.conditioned import conditioned
 from latentplan.planning.model import supports
 from latentplan.planning.objectives import Constraint, Objective, Rollout, Term, predicted_return, terminal_value
 
@@ -77,12 +78,23 @@ def plan_goals(
         # A value of v is a reward of v (1 - discount) in every step there will ever be; the plan has `horizon` of them.
         horizon = planner.goal_horizon or planner.horizon
         guide = GUIDANCE * horizon * (1.0 - planner.discount) * terminal_value() if has_value else None
-        objective = None if wanted.is_return else plan_objective(wanted, env.action_repeat, learned, guide, encode_goal)
+        box = learned_box(wanted, model) if has_value else None
+        if box is not None:
+            objective = conditioned(BoxView(box, env.action_repeat))
+        elif wanted.is_return:
+            objective = None
+        else:
+            objective = plan_objective(wanted, env.action_repeat, learned, guide, encode_goal)
     if isinstance(constraints, str):
         clauses = parse_constraints(constraints, known)
         require_labels(clauses, model.label_names)
         constraints = [plan_constraint(clauses)]
     return objective, constraints
+
+
+def learned_box(expression: Expression, model: Any) -> dict[str, Interval] | None:
+    """The box that an expression asks for, if it is one and the model has learned to pursue boxes."""
+    return box_of(expression, model.goal_names) if getattr(model, "goal_dim", 0) else None
 
 
 def plan_objective(
@@ -149,19 +161,6 @@ def predicted_quantities(rollout: Rollout) -> Lookup:
     labels = rearrange(flat, "(step rows) label -> label step rows", step=len(features))
     places = {name: index for index, name in enumerate(rollout.model.label_names)}
     return lambda name: labels[places[name]]
-
-
-def plan_degree(shortfalls: Tensor) -> Tensor:
-    """How far a clause is met, in (0, 1], with a slope wherever it is not.
-
-    The mean of the Gaussian that scores and of 1 / (1 + x), which falls slowly.
-
-    Args:
-        shortfalls: In margins, any shape; 0 and below is met.
-    """
-    missing = shortfalls.clamp_min(0.0)
-    gaussian = torch.exp(math.log(0.1) * missing.square())
-    return 0.5 * (gaussian + 1.0 / (1.0 + missing))
 
 
 def _violation(clauses: Sequence[Clause], rollout: Rollout) -> Tensor:

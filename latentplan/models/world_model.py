@@ -10,10 +10,12 @@ import torch
 from torch import Tensor, nn
 
 from latentplan.config import ModelConfig
+from latentplan.config.quantities import TASK_PREFIX
 from latentplan.models import fused
 from latentplan.models.decoder import Decoder
 from latentplan.models.dynamics import Rssm, State
 from latentplan.models.encoder import Encoder
+from latentplan.models.goal_heads import GoalHeads
 from latentplan.models.heads import Actor, Mlp, ScalarHead, sample_action
 from latentplan.models.imagination import Weights, follow_actor, imagine, lay_out
 
@@ -27,6 +29,7 @@ class WorldModel(nn.Module):
         config: Sizes.
         action_dim: Size of the action, taken from the environment.
         labels: Quantities to read off the latent, and the typical size of each.
+        goal_dim: Width of the heads for goals (`GoalHeads`), which learn when all else has; 0 for none.
 
     The methods `step`, `rollout`, `value`, `policy` and `continues` are the planner's protocol. They follow the
     mean of the prior, so that a plan's return is a function of its actions alone.
@@ -34,7 +37,9 @@ class WorldModel(nn.Module):
 
     label_scales: Tensor
 
-    def __init__(self, config: ModelConfig, action_dim: int, labels: Mapping[str, float] | None = None) -> None:
+    def __init__(
+        self, config: ModelConfig, action_dim: int, labels: Mapping[str, float] | None = None, goal_dim: int = 0
+    ) -> None:
         super().__init__()
         self.config, self.action_dim, self.labels = config, action_dim, dict(labels or {})
         embedding_dim, features = config.hidden_dim, config.deter_dim + config.latent_dim
@@ -53,6 +58,9 @@ class WorldModel(nn.Module):
         self.register_buffer("label_scales", torch.tensor(list(self.labels.values())), persistent=False)
         if self.labels:
             self.probe_head = Mlp(features, max(1, config.hidden_dim // PROBE_SHARE), len(self.labels))
+        self.goal_dim = 0
+        if goal_dim:
+            self.add_goal_heads(goal_dim)
 
     def trunk_precision(self, *, cache: bool = True) -> AbstractContextManager[None]:
         """Autocast to bfloat16 for the products in the trunk; heads leave it by themselves.
@@ -72,6 +80,32 @@ class WorldModel(nn.Module):
     def label_names(self) -> tuple[str, ...]:
         """What `probe` reads, in order; empty where the environment told no quantities."""
         return tuple(self.labels)
+
+    @property
+    def goal_names(self) -> tuple[str, ...]:
+        """The quantities that goals can name, in the order of `goal_quantities`: all but the tasks' rewards."""
+        return tuple(name for name in self.labels if not name.startswith(TASK_PREFIX))
+
+    @property
+    def goal_scales(self) -> Tensor:
+        """The typical size of each of `goal_names`, (quantity,)."""
+        return self.label_scales[: len(self.goal_names)]
+
+    def add_goal_heads(self, goal_dim: int) -> None:
+        """Put fresh heads for goals beside what is there.
+
+        Raises:
+            ValueError: The model was trained without labels.
+        """
+        if not self.goal_names:
+            raise ValueError("this model was trained without labels, so it has no quantities that a goal could name")
+        features, config = self.config.deter_dim + self.config.latent_dim, self.config
+        heads = GoalHeads(features, goal_dim, self.action_dim, config.num_bins, self.goal_scales.clone())
+        self.goal_dim, self.goal_heads = goal_dim, heads.to(self.device)
+
+    def goal_quantities(self, features: Tensor) -> Tensor:
+        """The quantities `goal_names` at states with features (..., feature), float32 (..., quantity)."""
+        return self.probe(features)[..., : len(self.goal_names)].float()
 
     def probe(self, features: Tensor) -> Tensor:
         """The quantities `label_names` at states with features (..., feature), in their own units, (..., label).

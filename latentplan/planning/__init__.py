@@ -7,6 +7,7 @@ from latentplan.planning.adapters import CEMTrajectoryOptimizer
 from latentplan.planning.cem import CEMPlanner
 from latentplan.planning.check import check_model
 from latentplan.planning.compiled import compile_rollout
+from latentplan.planning.conditioned import conditioned
 from latentplan.planning.controller import ModelPredictiveController
 from latentplan.planning.elites import refit
 from latentplan.planning.family import icem_planner, mppi_planner
@@ -46,6 +47,7 @@ __all__ = [
     "at_every_state",
     "check_model",
     "compile_rollout",
+    "conditioned",
     "goal_term",
     "icem_planner",
     "learned_return",

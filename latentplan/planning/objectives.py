@@ -64,12 +64,14 @@ class Objective:
         needs_states: Whether it looks at the states on the way, which a fused rollout does not give.
         num_particles: Rollouts of each candidate that it asks for.
         needs: Methods that the model must have.
+        view: What shows the model to a search for this alone, see `conditioned`; lost where terms are composed.
     """
 
     function: Term
     needs_states: bool = False
     num_particles: int = 1
     needs: tuple[str, ...] = ()
+    view: Callable[[Model], Model] | None = None
 
     def __call__(self, rollout: Rollout) -> Tensor:
         """The term's value for each row, (rows,)."""

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from latentplan.planning.cem import CEMPlanner
+from latentplan.planning.conditioned import seen_for
 from latentplan.planning.model import (
     Model,
     State,
@@ -111,6 +112,7 @@ class PlanScheduler:
         generator: torch.Generator | None = None,
     ) -> None:
         self.planner, self.model, self.executor, self.generator = planner, model, executor, generator
+        self._acting: Any = model  # whose policy acts
         self.buffer = PlanBuffer(max_age, 1 if fresh_ticks is None else fresh_ticks)
         self.tick = 0  # of the next decision; goes on through resets, so that late plans cannot be mistaken
         self._follows_latency = fresh_ticks is None
@@ -150,8 +152,12 @@ class PlanScheduler:
         return Decision(action, source, age)
 
     def set_objective(self, objective: Term | None = None, constraints: Sequence[Constraint] = ()) -> None:
-        """Changes what plans asked for from now on pursue; those made before are followed until these come."""
+        """Changes what plans asked for from now on pursue; those made before are followed until these come.
+
+        A goal that the model has learned to pursue (`conditioned`) brings the policy that acts where there is no plan.
+        """
         self.executor.set_objective(objective, constraints)
+        self._acting, _ = seen_for(self.model, objective)
 
     def reset(self) -> None:
         """Forget all plans, the one in work too: what it was asked for is over."""
@@ -207,15 +213,15 @@ class PlanScheduler:
     def _follow(self, state: State, tick: int, age: int) -> Tensor:
         """The action (batch, action) at a tick of the plan that is of this age there, held to it by the policy."""
         nominal = self._nominals[tick - age]
-        if not supports(self.model, "policy"):
+        if not supports(self._acting, "policy"):
             return nominal.actions[:, age]
         return nominal.correct(age, state, self._act_alone).clamp(*self._bounds(state))
 
     def _act_alone(self, state: State) -> Tensor:
         low, high = self._bounds(state)
-        if not supports(self.model, "policy"):
+        if not supports(self._acting, "policy"):
             return torch.zeros(count_rows(state), len(low), device=low.device, dtype=low.dtype).clamp(low, high)
-        return self.model.policy(state, None).to(low.dtype).clamp(low, high)  # type: ignore[attr-defined,no-any-return]
+        return self._acting.policy(state, None).to(low.dtype).clamp(low, high)  # type: ignore[no-any-return]
 
     def _bounds(self, state: State) -> tuple[Tensor, Tensor]:
         planner, dtype, device = self.planner, action_dtype(state), state_device(state)

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
+from latentplan.planning.conditioned import seen_for
 from latentplan.planning.deadline import Budget
 from latentplan.planning.elites import Scores, mean_return, move_towards, select_elites
 from latentplan.planning.gradient import ascend
@@ -53,6 +54,7 @@ class Search:
         started: float,
         deadline_ms: float | None,
     ) -> None:
+        model, objective = seen_for(model, objective)
         self.options, self.state = options, state
         self.batch, self.device, self.dtype = count_rows(state), state_device(state), action_dtype(state)
         self.low = self._constant(options.action_low, "action_low")

@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from latentplan.planning import CEMPlanner
+from latentplan.planning import CEMPlanner, conditioned
 
 HORIZON = 4
 
@@ -65,6 +65,13 @@ def test_the_policy_acts_where_it_fits(planner, model, state, last):
     assert plan.info["is_fallback"].all() and plan.info["stopped"] == "deadline"
     assert plan.source == "actor" and last.source == "plan"
     assert torch.allclose(plan.action, (0.25 + 0.1 * state).clamp(-1.0, 1.0))
+
+
+def test_the_policy_of_a_learned_goal_acts_where_it_fits(planner, model, state, last):
+    own = planner.plan(model, state, last, deadline_ms=5.0)
+    plan = planner.plan(model, state, last, objective=conditioned(lambda seen: seen), deadline_ms=5.0)
+    assert plan.info["stopped"] == "deadline" and bool(plan.info["is_policy"].all())
+    assert torch.equal(plan.actions, own.actions)
 
 
 def test_else_the_last_plan_goes_on(planner, model, state, last):

@@ -1,0 +1,139 @@
+"""A run that learns goals: from the agent and the replay of a finished run to an agent that knows goals as well."""
+
+from __future__ import annotations
+
+import math
+import time
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from latentplan.checkpoint import INFO, load_model, read_info, resolve_checkpoint, save_checkpoint
+from latentplan.config import GoalsConfig, UserError, derive_seed, make_folder, to_dict
+from latentplan.models import WorldModel
+from latentplan.replay import Replay, read_saved
+from latentplan.training.goals import GoalLearner
+from latentplan.training.progress import StatusLine
+from latentplan.training.run import Result
+from latentplan.training.state import INTERRUPTED
+
+GOALS_FILE = "goals.pt"
+SAVE_SECONDS = 300.0
+
+
+def learn_goals(
+    run: Path | str, folder: Path | str, settings: GoalsConfig | None = None, *, device: str = "cpu"
+) -> Result:
+    """Teach the agent of a run to pursue goals that are named later.
+
+    Args:
+        run: Folder of the run, with its replay.
+        folder: Where the agent goes, and what it takes to resume.
+        settings: Of the learning.
+        device: `cpu` or `cuda`.
+
+    Returns:
+        Where the agent lies, and `worth`: see `GoalLearner.update`.
+
+    Raises:
+        UserError: The run or the folder cannot be used.
+    """
+    folder = Path(folder)
+    for name in (INFO, GOALS_FILE):
+        if (folder / name).exists():
+            raise UserError(f"{folder} already holds an agent: go on with --resume {folder}, or choose another --out")
+    make_folder(folder)
+    return _learn(Path(run), folder, settings or GoalsConfig(), device, None)
+
+
+def resume_goals(
+    folder: Path | str, *, updates: int | None = None, minutes: float | None = None, device: str = "cpu"
+) -> Result:
+    """Go on where `learn_goals` was last saved.
+
+    Args:
+        folder: Where its agent goes.
+        updates: New number of updates in all; None keeps the old one.
+        minutes: New budget of minutes in all; None keeps the old one.
+        device: `cpu` or `cuda`.
+
+    Raises:
+        UserError: The folder holds nothing to resume, or the agent it began with has changed.
+    """
+    path = Path(folder) / GOALS_FILE
+    if not path.exists():
+        raise UserError(f"nothing to resume in {folder}: {path} is missing")
+    saved = read_saved(path)
+    if read_info(saved["source"])["sha256"] != saved["sha256"]:
+        raise UserError(f"{saved['source']} is not the agent that {folder} began with")
+    settings = GoalsConfig(**saved["settings"])
+    settings = replace(settings, updates=updates or settings.updates, minutes=minutes or settings.minutes)
+    return _learn(Path(saved["run"]), Path(folder), settings, device, saved)
+
+
+def load_replay(run: Path, model: WorldModel, device: str) -> Replay:
+    """The replay of a run, whole.
+
+    Raises:
+        UserError: The run keeps none, or a damaged one, or one without quantities.
+    """
+    path = run / "resume" / "replay"
+    if not (path / "rows.pt").exists():
+        raise UserError(f"goals are learned from a run's replay, and {path} holds none; give the folder of a run")
+    episode = read_saved(path / "rows.pt")["episode"]
+    num_lanes, lane_size = episode.shape
+    sizes = (model.action_dim, model.config.deter_dim, num_lanes, torch.device(device), len(model.labels))
+    replay = Replay(num_lanes * lane_size, *sizes)
+    replay.load(path)
+    return replay
+
+
+def _learn(run: Path, folder: Path, settings: GoalsConfig, device: str, saved: dict[str, Any] | None) -> Result:
+    source = resolve_checkpoint(run)
+    model, config, info = load_model(source, device)
+    if not model.goal_names:
+        raise UserError(f"the agent of {run} was trained without named quantities, so there are no goals to learn")
+    model.requires_grad_(False)
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(derive_seed(settings.seed, "heads"))
+        model.add_goal_heads(settings.hidden_dim)
+    learner = GoalLearner(model, settings, info["discount"], config.env.action_repeat, load_replay(run, model, device))
+    earlier = 0.0
+    if saved is not None:
+        learner.load_state_dict(saved["learner"])
+        earlier = saved["minutes"]
+    started = last_save = time.monotonic()
+    worth, line = math.nan, StatusLine()
+
+    def minutes() -> float:
+        return earlier + (time.monotonic() - started) / 60.0
+
+    def save() -> None:
+        facts = {"updates": learner.updates, "minutes": round(minutes(), 1), "settings": to_dict(settings)}
+        save_checkpoint(folder, model, config, info | {"goals": facts | {"from_sha256": info["sha256"]}})
+        about = {"run": str(run.resolve()), "source": str(source.resolve()), "sha256": info["sha256"]}
+        state = {"settings": to_dict(settings), "minutes": minutes(), "learner": learner.state_dict()}
+        torch.save(about | state, folder / f"{GOALS_FILE}.part")
+        (folder / f"{GOALS_FILE}.part").replace(folder / GOALS_FILE)
+
+    try:
+        with line:
+            while learner.updates < settings.updates and not minutes() >= (settings.minutes or math.inf):
+                parts = learner.update()
+                worth = parts["worth"] if math.isnan(worth) else 0.99 * worth + 0.01 * parts["worth"]
+                line.update(
+                    f"update {learner.updates:,} of {settings.updates:,} | imagined worth {worth:.3f} of 1 | "
+                    f"entropy {parts['entropy']:.2f} nats | {minutes():.1f} min"
+                )
+                if time.monotonic() - last_save > SAVE_SECONDS:
+                    save()
+                    last_save = time.monotonic()
+            save()
+            line.print(f"agent: {folder}")
+        return Result(folder, 0, {"worth": worth})
+    except KeyboardInterrupt:
+        save()
+        line.print(f"stopped; to go on: python scripts/goals.py --resume {folder}")
+        return Result(folder, INTERRUPTED, {})

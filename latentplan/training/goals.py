@@ -1,0 +1,188 @@
+"""Goals learned before they are named: an actor and a value for boxes drawn at random, in the imagination of a model.
+
+The world model, and all else that an agent has, stays bit for bit. Beliefs to start from come from the run's replay,
+boxes from the quantities that were met in it. Every update draws from a random stream of its own, so that a learning
+that was interrupted goes on as if nothing had happened.
+"""
+
+from __future__ import annotations
+
+import copy
+import math
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+from latentplan.config import GoalsConfig, derive_seed
+from latentplan.goals.box import box_degree
+from latentplan.models import State, WorldModel
+from latentplan.models.heads import sample_action
+from latentplan.replay import Replay
+from latentplan.training.losses import HALF_LOG_2_PI_E, lambda_return
+from latentplan.training.module import RETURN_RANGE_RATE
+from latentplan.training.snapshot import Snapshot
+
+RANGE = (0.005, 0.995)  # quantiles of what was met, between which ends of intervals are drawn
+RANGE_ROWS = 20_000
+MAX_GRAD_NORM = 100.0
+
+
+class Boxes(NamedTuple):
+    """One box per row: ends of the intervals by quantity, (rows, quantity), infinite where open."""
+
+    low: Tensor
+    high: Tensor
+
+
+def draw_boxes(met: Tensor, span: Tensor, scales: Tensor, num: int, generator: torch.Generator) -> Boxes:
+    """Boxes around what was met, with one quantity or all of them moved elsewhere in three quarters of them.
+
+    Each begins with the quantities of a random row. In half of the boxes one quantity, in another quarter all are drawn
+    anew, uniformly from their span: what a body does rarely has to be asked for often to be learned. Then each
+    interval becomes a point, open above, open below, one of up to a scale across, or, unless it was the one to be
+    drawn anew, open on both sides.
+
+    Args:
+        met: Quantities that were met, (row, quantity).
+        span: Lowest and highest end drawn anew, (2, quantity).
+        scales: Typical size of each quantity, (quantity,).
+        num: Boxes.
+        generator: Random stream, where `met` lives.
+    """
+    size, device = (num, met.shape[1]), met.device
+
+    def uniform(*shape: int) -> Tensor:
+        return torch.rand(shape, generator=generator, device=device)
+
+    rows = torch.randint(len(met), (num,), generator=generator, device=device)
+    anew = span[0] + (span[1] - span[0]) * uniform(*size)
+    chosen = torch.randint(size[1], (num, 1), generator=generator, device=device)
+    is_chosen = torch.arange(size[1], device=device) == chosen
+    how = uniform(num, 1)
+    centre = torch.where(((how < 0.5) & is_chosen) | (how > 0.75), anew, met[rows])
+    kind = uniform(*size)
+    kind = torch.where(is_chosen, 0.3 + 0.7 * kind, kind)  # open on both sides below 0.3
+    half = 0.5 * scales * torch.where(kind >= 0.9, uniform(*size), 0.0)
+    has_low = ((kind >= 0.3) & (kind < 0.7)) | (kind >= 0.9)
+    has_high = ((kind >= 0.3) & (kind < 0.5)) | (kind >= 0.7)
+    return Boxes(
+        torch.where(has_low, centre - half, -math.inf),
+        torch.where(has_high, centre + half, math.inf),
+    )
+
+
+class GoalLearner:
+    """Learns an actor and a value for boxes by imagining, as behaviour is learned for the reward.
+
+    Args:
+        model: The world model, with heads for goals; nothing but these changes.
+        settings: Of the learning.
+        discount: Per decision.
+        frames_per_step: Env frames per decision.
+        replay: Where beliefs to start from, and the quantities met, come from.
+    """
+
+    def __init__(
+        self, model: WorldModel, settings: GoalsConfig, discount: float, frames_per_step: int, replay: Replay
+    ) -> None:
+        self.model, self.settings, self.replay = model, settings, replay
+        self.discount, self.frames_per_step = discount, frames_per_step
+        self.updates, self.return_range = 0, torch.zeros((), device=model.device)
+        self.dream = Snapshot(model).model
+        self.target = copy.deepcopy(model.goal_heads).requires_grad_(False)
+        parameters = [*model.goal_heads.requires_grad_(True).parameters()]
+        self.optimizer = torch.optim.Adam(parameters, lr=settings.learning_rate, eps=1e-6, fused=True)
+        self.rows = torch.from_numpy(replay.episode.reshape(-1) >= 0).nonzero().squeeze(1).to(replay.device)
+        self.met = replay.labels[self.rows][:, : len(model.goal_names)]
+        some = self.met[torch.randperm(len(self.met), generator=self._generator("span"))[:RANGE_ROWS]]
+        self.span = torch.quantile(some, some.new_tensor(RANGE), dim=0)
+
+    def update(self) -> dict[str, float]:
+        """One step of actor and value; what it came to.
+
+        Returns:
+            `worth`, the mean degree to which imagined states lie in their boxes, and `entropy` in nats.
+
+        Raises:
+            FloatingPointError: The gradient is not finite.
+        """
+        settings, heads, scales = self.settings, self.model.goal_heads, self.model.goal_scales
+        generator = self._generator("update", self.updates)
+        boxes = draw_boxes(self.met, self.span, scales, settings.starts, generator)
+        code = heads.encode(*boxes)
+        with self.model.trunk_precision():
+            features, entropies = self._imagine(self._starts(generator), code, generator)
+            worth = box_degree(*boxes, self.model.goal_quantities(features[1:]), scales)
+            values = self.target.value(features[1:], code)
+        discounts = torch.full_like(worth, self.discount)
+        returns = lambda_return(self.frames_per_step * worth, discounts, values, settings.lambda_)
+        reach = torch.cat([torch.ones_like(discounts[:1]), discounts[:-1]]).cumprod(0)
+        gains = returns / self._return_scale(returns.detach()) + settings.entropy_scale * entropies
+        with self.model.trunk_precision():
+            logits = heads.judge(features[:-1].detach(), code)
+        loss = (reach * (heads.value_head.loss(logits, returns.detach()) - gains)).mean()
+        self._descend(loss)
+        self.updates += 1
+        return {"worth": float(worth.detach().mean()), "entropy": float(entropies.detach().mean())}
+
+    def state_dict(self) -> dict[str, Any]:
+        """Everything that changes."""
+        return {
+            "heads": self.model.goal_heads.state_dict(),
+            "target": self.target.state_dict(),
+            "optimizer": self.optimizer.state_dict(),
+            "return_range": self.return_range,
+            "updates": self.updates,
+        }
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Take up what `state_dict` gave."""
+        self.model.goal_heads.load_state_dict(state["heads"])
+        self.target.load_state_dict(state["target"])
+        self.optimizer.load_state_dict(state["optimizer"])
+        self.return_range, self.updates = state["return_range"].to(self.model.device), state["updates"]
+
+    def _generator(self, name: str, counter: int = 0) -> torch.Generator:
+        return torch.Generator(self.model.device).manual_seed(derive_seed(self.settings.seed, name, counter))
+
+    @torch.no_grad()
+    def _starts(self, generator: torch.Generator) -> State:
+        """Beliefs at random rows of the replay."""
+        size, device = (self.settings.starts,), self.model.device
+        rows = self.rows[torch.randint(len(self.rows), size, generator=generator, device=device)]
+        return self.model.see(self.replay.deter[rows].float(), self.replay.frames[rows])
+
+    def _imagine(self, start: State, code: Tensor, generator: torch.Generator) -> tuple[Tensor, Tensor]:
+        """Features (horizon + 1, rows, feature) along the actor's way, and entropies (horizon, rows) in nats."""
+        state, features, stds = start, [start.features.float()], []
+        sizes = [self.model.action_dim, self.model.config.latent_dim]
+        shape = (self.settings.horizon, len(start.deter), sum(sizes))
+        draws = torch.randn(shape, generator=generator, device=self.model.device)
+        for action_noise, noise in zip(*(part.unbind(0) for part in draws.split(sizes, -1)), strict=True):
+            mean, std = self.model.goal_heads.act(features[-1].detach(), code)
+            stds.append(std)
+            deter = self.dream.dynamics.advance(state, sample_action(mean, std, action_noise))
+            prior = self.dream.dynamics.prior(deter)
+            state = State(deter, torch.addcmul(prior.mean, prior.std, noise))
+            features.append(state.features)
+        return torch.stack(features), (torch.stack(stds).log() + HALF_LOG_2_PI_E).sum(-1)
+
+    def _return_scale(self, returns: Tensor) -> Tensor:
+        """See `Learner`."""
+        flat = returns.flatten()
+        spread = torch.quantile(flat, 0.95) - torch.quantile(flat, 0.05)
+        self.return_range = self.return_range.lerp(spread, RETURN_RANGE_RATE)
+        return self.return_range.clamp_min(1.0)
+
+    def _descend(self, loss: Tensor) -> None:
+        self.optimizer.zero_grad(set_to_none=True)
+        loss.backward()
+        norm = torch.nn.utils.clip_grad_norm_(self.model.goal_heads.parameters(), MAX_GRAD_NORM)
+        if not torch.isfinite(norm):
+            raise FloatingPointError(f"the gradient is not finite at update {self.updates} (loss {loss.item()})")
+        self.optimizer.step()
+        with torch.no_grad():
+            pairs = zip(self.target.parameters(), self.model.goal_heads.parameters(), strict=True)
+            for slow, fast in pairs:
+                slow.lerp_(fast, self.settings.target_rate)

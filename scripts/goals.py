@@ -1,0 +1,13 @@
+"""Teach a trained agent to pursue goals that are named later: `python scripts/goals.py --run DIR`; see --help."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
+
+from latentplan.learn_goals import main  # noqa: E402
+
+if __name__ == "__main__":
+    sys.exit(main())

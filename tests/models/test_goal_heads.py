@@ -1,0 +1,88 @@
+"""Heads for goals: beside the model, without a trace in it."""
+
+import math
+
+import pytest
+import torch
+
+from latentplan.goals.box import BoxView
+from latentplan.models import WorldModel
+from latentplan.planning import CEMPlanner, check_model, conditioned
+
+LABELS = {"height": 0.5, "speed": 2.0, "task.walk": 0.5}
+GOAL = {"speed": (-1.0, -1.0)}
+
+
+@pytest.fixture(scope="module")
+def knowing(model):
+    """The model with quantities and stirred heads for goals."""
+    torch.manual_seed(1)
+    knowing = WorldModel(model.config, 3, LABELS, goal_dim=16)
+    knowing.load_state_dict(model.state_dict(), strict=False)
+    with torch.no_grad():
+        for parameter in (*knowing.goal_heads.parameters(), *knowing.probe_head.parameters()):
+            parameter.add_(0.3 * torch.randn(parameter.shape))
+    return knowing.eval()
+
+
+def test_goals_name_all_quantities_but_rewards(knowing):
+    assert knowing.goal_names == ("height", "speed") and knowing.goal_scales.tolist() == [0.5, 2.0]
+
+
+def test_a_model_without_quantities_can_have_no_goals(model):
+    with pytest.raises(ValueError, match="without labels"):
+        WorldModel(model.config, 3, goal_dim=16)
+
+
+def test_nothing_else_notices_the_heads(model, knowing, state, generator):
+    actions = torch.rand(5, 4, 3, generator=generator) * 2 - 1
+    with torch.no_grad():
+        rewards, last = model.rollout(state, actions)
+        same_rewards, same_last = knowing.rollout(state, actions)
+        assert torch.equal(rewards, same_rewards) and torch.equal(last.features, same_last.features)
+        assert torch.equal(model.value(state), knowing.value(state))
+        assert torch.equal(model.policy(state), knowing.policy(state))
+
+
+def test_a_code_tells_ends_that_are_there_from_those_that_are_not(knowing):
+    heads, inf = knowing.goal_heads, math.inf
+    ends = [((-inf, -inf), (inf, inf)), ((-inf, 0.0), (inf, inf)), ((-inf, 0.0), (inf, 0.0)), ((-inf, 1.0), (inf, inf))]
+    codes = [heads.encode(torch.tensor(low), torch.tensor(high)) for low, high in ends]
+    assert all(bool(torch.isfinite(code).all()) and code.shape == (8,) for code in codes)
+    assert len({tuple(code.tolist()) for code in codes}) == 4
+
+
+def test_the_view_of_a_box_is_a_model_that_can_be_planned_in(knowing, state, generator):
+    view = BoxView(GOAL, frames_per_step=2)(knowing)
+    check_model(view, state, action_dim=3)
+    action = torch.zeros(5, 3)
+    with torch.no_grad():
+        following, worth = view.step(state, action)
+        expected, _ = knowing.step(state, action)
+        missing = (knowing.probe(expected.features)[:, 1].float() + 1.0).abs() / 2.0
+        assert torch.equal(following.deter, expected.deter)
+        assert torch.allclose(worth, 1.0 * (0.1 ** missing.square() + 1.0 / (1.0 + missing)), atol=1e-4)
+        assert torch.equal(view.probe(state.features), knowing.probe(state.features))
+        proposals = view.propose(state, 4, 3, [torch.Generator().manual_seed(row) for row in range(5)])
+        alone = view.propose(type(state)(*(part[2:3] for part in state)), 4, 3, [torch.Generator().manual_seed(2)])
+        assert proposals.shape == (20, 3, 3) and proposals.abs().max() <= 1.0
+        assert torch.allclose(proposals[::4, 0], view.policy(state), atol=1e-2)
+        assert torch.allclose(proposals[8:12], alone, atol=1e-2)  # does not feel who shares the call
+
+
+def test_other_boxes_are_worth_and_done_otherwise(knowing, state):
+    views = [BoxView(box, 2)(knowing) for box in ({}, GOAL, {"speed": (3.0, math.inf)})]
+    with torch.no_grad():
+        for method in ("value", "policy"):
+            results = [getattr(view, method)(state) for view in views]
+            assert not any(torch.allclose(results[i], results[j]) for i, j in ((0, 1), (0, 2), (1, 2)))
+
+
+def test_plans_for_a_box_can_keep_constraints(knowing, state):
+    from latentplan.goals.objective import plan_constraint
+    from latentplan.goals.parser import parse_constraints
+
+    planner = CEMPlanner(action_dim=3, horizon=3, num_samples=16, num_elites=4, num_policy_samples=4)
+    constraint = plan_constraint(parse_constraints("height < 0.3", LABELS))
+    plan = planner.plan(knowing, state, objective=conditioned(BoxView(GOAL, 2)), constraints=[constraint])
+    assert plan.actions.shape == (5, 3, 3) and plan.info["violation"].shape == (5,)

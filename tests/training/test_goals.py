@@ -1,0 +1,163 @@
+"""Goals are learned in imagination, beside a model that stays as it is."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from latentplan.agent import PlanningAgent
+from latentplan.checkpoint import load_agent, load_model, read_info, save_checkpoint
+from latentplan.config import GoalsConfig, UserError
+from latentplan.gate import GatedAgent
+from latentplan.models import WorldModel
+from latentplan.replay import Replay, Rows
+from latentplan.training import learn_goals, resume_goals
+from latentplan.training.goal_run import GOALS_FILE, load_replay
+from latentplan.training.goals import GoalLearner, draw_boxes
+
+LABELS = {"height": 0.5, "speed": 1.0, "task.walk": 0.5}
+INFO = {"domain": "walker", "task": "walk", "env_frames": 7, "discount": 0.9, "metrics": []}
+SETTINGS = GoalsConfig(updates=6, starts=12, horizon=3, hidden_dim=8, seed=3)
+ROWS = 60
+
+
+def make_run(folder, config, labels):
+    """A run folder with an agent and a replay of noise."""
+    torch.manual_seed(0)
+    model = WorldModel(config.model, 1, labels)
+    with torch.no_grad():
+        for parameter in model.parameters():
+            parameter.copy_(parameter.half().float())
+        model.dynamics.input.linear.weight[:, -1] *= 4.0
+    save_checkpoint(folder / "checkpoints" / "last", model, config, INFO)
+    rng = np.random.default_rng(0)
+    replay = Replay(ROWS, 1, config.model.deter_dim, 1, torch.device("cpu"), len(labels))
+    is_first = np.arange(ROWS) % 20 == 0
+    replay.add(
+        0,
+        Rows(
+            frames=rng.integers(0, 256, (ROWS, 64, 64, 3), dtype=np.uint8),
+            deter=rng.normal(size=(ROWS, config.model.deter_dim)).astype(np.float32),
+            actions=np.zeros((ROWS, 1), np.float32),
+            rewards=np.zeros(ROWS, np.float32),
+            continues=np.ones(ROWS, np.float32),
+            is_first=is_first,
+            labels=rng.normal(size=(ROWS, len(labels))).astype(np.float32),
+        ),
+    )
+    replay.save(folder / "resume" / "replay")
+    return folder
+
+
+@pytest.fixture(scope="module")
+def run(tiny, tmp_path_factory):
+    return make_run(tmp_path_factory.mktemp("run"), tiny("", env={"domain": "walker", "action_repeat": 2}), LABELS)
+
+
+@pytest.fixture(scope="module")
+def finished(run, tmp_path_factory):
+    return learn_goals(run, tmp_path_factory.mktemp("out") / "agent", SETTINGS)
+
+
+def test_boxes_lie_around_what_was_met_or_within_its_span():
+    met = torch.randn(500, 3, generator=torch.Generator().manual_seed(1))
+    span, scales = torch.tensor([[-3.0] * 3, [3.0] * 3]), torch.tensor([0.5, 1.0, 2.0])
+    low, high = draw_boxes(met, span, scales, 4000, torch.Generator().manual_seed(0))
+    assert low.shape == high.shape == (4000, 3) and bool((low <= high).all())
+    is_open = torch.isinf(low) & torch.isinf(high)
+    assert not bool(is_open.all(1).any())  # each asks for something
+    closed = torch.isfinite(low) & torch.isfinite(high)
+    assert bool(((high - low)[closed] <= scales.expand_as(low)[closed] + 1e-5).all())
+    shares = [float(part.float().mean()) for part in (is_open, low == high, closed & (low < high))]
+    # A third of the intervals is never open on both sides, three tenths of the others are.
+    assert shares == pytest.approx([0.2, 0.22, 0.11], abs=0.02)
+    ends = torch.cat([low[torch.isfinite(low)], high[torch.isfinite(high)]])
+    assert float(ends.abs().max()) <= 3.0 + max(4.0, 1.0)
+    again = draw_boxes(met, span, scales, 4000, torch.Generator().manual_seed(0))
+    assert torch.equal(low, again.low)
+
+
+def test_nothing_but_the_heads_changes(run, finished):
+    before, (after, _, info) = load_model(run)[0], load_model(finished.run_dir)
+    assert finished.exit_code == 0 and 0.0 < finished.summary["worth"] < 1.0
+    state = after.state_dict()
+    assert all(torch.equal(value, state[name]) for name, value in before.state_dict().items())
+    assert {name.split(".")[0] for name in state.keys() - before.state_dict().keys()} == {"goal_heads"}
+    assert info["goals"]["updates"] == 6 and info["goals"]["settings"]["starts"] == 12 and info["goal_dim"] == 8
+
+
+def test_a_learning_that_was_cut_off_ends_with_the_same_agent(run, finished, tmp_path):
+    learn_goals(run, tmp_path / "part", GoalsConfig(**vars(SETTINGS) | {"updates": 2}))
+    resumed = resume_goals(tmp_path / "part", updates=6)
+    weights = [load_model(folder)[0].state_dict() for folder in (finished.run_dir, resumed.run_dir)]
+    assert all(torch.equal(value, weights[1][name]) for name, value in weights[0].items())
+
+
+def test_the_imagined_worth_rises(run, tiny):
+    model, config, _ = load_model(run)
+    model.requires_grad_(False)
+    torch.manual_seed(0)
+    model.add_goal_heads(16)
+    with torch.no_grad():
+        model.probe_head.output.weight.normal_(std=2.0)
+    settings = GoalsConfig(starts=64, horizon=4, learning_rate=1e-2, entropy_scale=0.0)
+    learner = GoalLearner(model, settings, 0.9, 2, load_replay(run, model, "cpu"))
+    worth = [learner.update()["worth"] for _ in range(80)]
+    assert np.mean(worth[-20:]) > np.mean(worth[:10]) + 0.01
+
+
+def test_what_is_broken_is_not_learned_from(run):
+    model, _, _ = load_model(run)
+    model.requires_grad_(False)
+    model.add_goal_heads(8)
+    with torch.no_grad():
+        model.goal_heads.actor.mlp.output.bias[0] = math.nan
+    learner = GoalLearner(model, SETTINGS, 0.9, 2, load_replay(run, model, "cpu"))
+    with pytest.raises(FloatingPointError, match="not finite at update 0"):
+        learner.update()
+
+
+@pytest.mark.parametrize("mode", ["planner", "gated"])
+def test_an_agent_plans_for_a_box_by_what_it_has_learned(finished, mode):
+    frames = np.random.default_rng(0).integers(0, 256, (3, 64, 64, 3), dtype=np.uint8)
+    agent = load_agent(finished.run_dir, mode, goal_horizon=5)
+    assert isinstance(agent, GatedAgent if mode == "gated" else PlanningAgent)
+    agent.set_objective("speed -> 1.0 and height > 0.5")
+    for frame in frames:
+        assert np.isfinite(agent.act(frame)).all()
+    assert agent.controller.plan.actions.shape[1] == agent.controller.planner.horizon == 2
+    agent.set_objective("speed + height")
+    agent.act(frames[0])
+    if mode == "planner":
+        assert agent.controller.plan.actions.shape[1] == 5
+    agent.set_objective()
+    assert agent.controller.objective is None
+
+
+def test_a_search_without_values_plans_without_these_too(finished):
+    agent = load_agent(finished.run_dir, terminal_value=False, goal_horizon=5)
+    agent.set_objective("speed -> 1.0")
+    agent.act(np.zeros((64, 64, 3), np.uint8))
+    assert agent.controller.plan.actions.shape[1] == 5
+
+
+def test_what_cannot_be_used_is_refused(run, finished, tiny, tmp_path):
+    def refused(call, *words):
+        with pytest.raises(UserError) as caught:
+            call()
+        assert all(word in str(caught.value) for word in words), caught.value
+
+    refused(lambda: learn_goals(run, finished.run_dir), "already holds an agent", "--resume")
+    refused(lambda: learn_goals(run / "checkpoints" / "last", tmp_path / "a"), "replay", "folder of a run")
+    refused(lambda: resume_goals(run), "nothing to resume", GOALS_FILE)
+    unnamed = make_run(tmp_path / "unnamed", tiny(""), {})
+    refused(lambda: learn_goals(unnamed, tmp_path / "b"), "without named quantities")
+    other = make_run(tmp_path / "other", tiny("", env={"domain": "walker"}), LABELS)
+    learn_goals(other, tmp_path / "c", GoalsConfig(**vars(SETTINGS) | {"updates": 1}))
+    model, config, info = load_model(other)
+    with torch.no_grad():
+        model.actor.mlp.output.bias.add_(0.5)
+    save_checkpoint(other / "checkpoints" / "last", model, config, INFO)
+    refused(lambda: resume_goals(tmp_path / "c"), "not the agent")
+    assert "goals" in read_info(tmp_path / "c")
