@@ -26,6 +26,7 @@ from latentplan.training.snapshot import Snapshot
 RANGE = (0.005, 0.995)  # quantiles of what was met, between which ends of intervals are drawn
 RANGE_ROWS = 20_000
 MAX_GRAD_NORM = 100.0
+SEEN_AT_ONCE = 1024
 
 
 class Boxes(NamedTuple):
@@ -86,15 +87,16 @@ class GoalLearner:
     def __init__(
         self, model: WorldModel, settings: GoalsConfig, discount: float, frames_per_step: int, replay: Replay
     ) -> None:
-        self.model, self.settings, self.replay = model, settings, replay
+        self.model, self.settings = model, settings
         self.discount, self.frames_per_step = discount, frames_per_step
         self.updates, self.return_range = 0, torch.zeros((), device=model.device)
         self.dream = Snapshot(model).model
         self.target = copy.deepcopy(model.goal_heads).requires_grad_(False)
         parameters = [*model.goal_heads.requires_grad_(True).parameters()]
         self.optimizer = torch.optim.Adam(parameters, lr=settings.learning_rate, eps=1e-6, fused=True)
-        self.rows = torch.from_numpy(replay.episode.reshape(-1) >= 0).nonzero().squeeze(1).to(replay.device)
-        self.met = replay.labels[self.rows][:, : len(model.goal_names)]
+        rows = torch.from_numpy(replay.episode.reshape(-1) >= 0).nonzero().squeeze(1).to(replay.device)
+        self.beliefs = _see_all(model, replay, rows)
+        self.met = replay.labels[rows][:, : len(model.goal_names)]
         some = self.met[torch.randperm(len(self.met), generator=self._generator("span"))[:RANGE_ROWS]]
         self.span = torch.quantile(some, some.new_tensor(RANGE), dim=0)
 
@@ -146,12 +148,11 @@ class GoalLearner:
     def _generator(self, name: str, counter: int = 0) -> torch.Generator:
         return torch.Generator(self.model.device).manual_seed(derive_seed(self.settings.seed, name, counter))
 
-    @torch.no_grad()
     def _starts(self, generator: torch.Generator) -> State:
         """Beliefs at random rows of the replay."""
         size, device = (self.settings.starts,), self.model.device
-        rows = self.rows[torch.randint(len(self.rows), size, generator=generator, device=device)]
-        return self.model.see(self.replay.deter[rows].float(), self.replay.frames[rows])
+        rows = torch.randint(len(self.met), size, generator=generator, device=device)
+        return State(*(part[rows] for part in self.beliefs))
 
     def _imagine(self, start: State, code: Tensor, generator: torch.Generator) -> tuple[Tensor, Tensor]:
         """Features (horizon + 1, rows, feature) along the actor's way, and entropies (horizon, rows) in nats."""
@@ -186,3 +187,13 @@ class GoalLearner:
             pairs = zip(self.target.parameters(), self.model.goal_heads.parameters(), strict=True)
             for slow, fast in pairs:
                 slow.lerp_(fast, self.settings.target_rate)
+
+
+@torch.no_grad()
+def _see_all(model: WorldModel, replay: Replay, rows: Tensor) -> State:
+    """The beliefs at rows of a replay: the model stays as it is, so that once is enough."""
+    seen = [
+        model.see(replay.deter[part].float().to(model.device), replay.frames[part].to(model.device))
+        for part in rows.split(SEEN_AT_ONCE)
+    ]
+    return State(*(torch.cat(part) for part in zip(*seen, strict=True)))
