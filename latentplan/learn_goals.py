@@ -18,7 +18,7 @@ from latentplan.config import DEVICES, GoalsConfig, UserError
 from latentplan.setting_flags import describe_settings, read_settings, read_threads, setting_kinds
 
 FLAGS = {
-    "--run": ("DIR", "folder of a finished run, with its replay"),
+    "--checkpoint": ("DIR", "folder of a run, whose replay is learned from, or of an agent, which then plays a while"),
     "--out": ("DIR", "folder of the agent that knows goals (runs/goals-<domain>-<task>-<date>)"),
     "--resume": ("DIR", "go on with the learning in this folder"),
     "--device": ("|".join(DEVICES), "where the agent computes (auto: cuda where usable)"),
@@ -32,7 +32,7 @@ class GoalsRequest:
     """What the command line asks for.
 
     Attributes:
-        run: Folder of the run to learn from; None when a learning resumes.
+        checkpoint: Folder of the run or the agent to begin with; None when a learning resumes.
         out: Where the agent goes, or None for a folder of its own under `runs`.
         resume: Folder of the learning to go on with, or None.
         settings: Fields of `GoalsConfig` that were given.
@@ -40,7 +40,7 @@ class GoalsRequest:
         threads: CPU threads, or None to leave it to torch.
     """
 
-    run: Path | None
+    checkpoint: Path | None
     out: Path | None
     resume: Path | None
     settings: dict[str, Any]
@@ -64,12 +64,14 @@ def parse_arguments(argv: Sequence[str]) -> GoalsRequest:
         for flag in flags:
             if flag not in ("--resume", *RESUMABLE):
                 raise UserError(f"{flag} cannot be given with --resume; only {', '.join(RESUMABLE)} can")
-    elif "--run" not in flags:
-        raise UserError("flag --run is missing; give the folder of a finished run")
+    elif "--checkpoint" not in flags:
+        raise UserError("flag --checkpoint is missing; give the folder of a run or of a trained agent")
     device = flags.get("--device", "auto")
     if device not in DEVICES:
         raise_unknown("device", device, DEVICES)
-    paths = {name: Path(flags[f"--{name}"]) if f"--{name}" in flags else None for name in ("run", "out", "resume")}
+    paths = {
+        name: Path(flags[f"--{name}"]) if f"--{name}" in flags else None for name in ("checkpoint", "out", "resume")
+    }
     return GoalsRequest(**paths, settings=read_settings(GoalsConfig, flags), device=device, threads=read_threads(flags))
 
 
@@ -85,16 +87,16 @@ def learn(argv: Sequence[str]) -> int:
     request = parse_arguments(argv)
     from latentplan.checkpoint import read_info
 
-    info = read_info(request.run) if request.run is not None else {}
+    info = read_info(request.checkpoint) if request.checkpoint is not None else {}
     device = use_device(request.device, request.threads)
     from latentplan.training import learn_goals, resume_goals
 
     if request.resume is not None:
         return resume_goals(request.resume, device=device, **request.settings).exit_code
-    assert request.run is not None
+    assert request.checkpoint is not None
     stamp = datetime.now().strftime("%Y%m%d-%H%M%S")
     out = request.out or Path("runs") / f"goals-{info['domain']}-{info['task']}-{stamp}"
-    return learn_goals(request.run, out, GoalsConfig(**request.settings), device=device).exit_code
+    return learn_goals(request.checkpoint, out, GoalsConfig(**request.settings), device=device).exit_code
 
 
 def _help() -> str:
@@ -102,7 +104,7 @@ def _help() -> str:
     rows = [(f"{flag} {metavar}", meaning) for flag, (metavar, meaning) in FLAGS.items()]
     lines = "\n".join(f"  {flag:<24}{meaning}" for flag, meaning in rows + describe_settings(GoalsConfig))
     return (
-        "usage: goals.py --run DIR [--name value ...]\n\n"
+        "usage: goals.py --checkpoint DIR [--name value ...]\n\n"
         "Teach a trained agent to pursue goals that are named later; nothing else about it changes.\n"
         f"With --resume only {', '.join(RESUMABLE)} may be given.\n\n{lines}"
     )

@@ -1,4 +1,4 @@
-"""Teach a trained agent to pursue goals that are named later: `python scripts/goals.py --run DIR`; see --help."""
+"""Teach a trained agent to pursue goals that are named later: `python scripts/goals.py --checkpoint DIR` (or --help)."""
 
 from __future__ import annotations
 

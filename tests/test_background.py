@@ -133,6 +133,23 @@ def test_a_failed_decision_loses_no_reset(model, film):
     assert np.allclose(agent.act(film[1]), fresh.act(film[1]), atol=1e-5)
 
 
+def test_a_goal_that_was_learned_is_acted_for_at_once_and_can_be_sent(film):
+    torch.manual_seed(0)
+    model = WorldModel(CONFIG.model, action_dim=2, labels={"cart": 1.0}, goal_dim=8)
+    with torch.no_grad():
+        model.goal_heads.actor.mlp.output.weight.normal_(std=1.0)
+    agent = make(model, ticks=50)
+    agent.set_objective("cart > 100")
+    goals = pickle.loads(pickle.dumps(agent.scheduler.executor.goals))
+    action = agent.act(film[0, 0])
+    with torch.no_grad():
+        wanted = goals["objective"].view(model).policy(agent.state)[0]
+    assert agent.last_source == "actor" and np.allclose(action, wanted.float(), atol=0.02)
+    agent.reset()
+    agent.set_objective()
+    assert not np.allclose(agent.act(film[0, 0]), wanted.float(), atol=0.02)
+
+
 def test_goals_reach_the_plans_and_not_the_actor(film):
     torch.manual_seed(0)
     model = WorldModel(CONFIG.model, action_dim=2, labels={"cart": 1.0})

@@ -11,16 +11,16 @@ from latentplan.config import GoalsConfig
 @pytest.mark.parametrize(
     ("flags", "words"),
     [
-        ((), ("--run",)),
-        (("--run", "nothing"), ("nothing",)),
-        (("--run", "nothing", "--updats", "3"), ("--updats", "--updates")),
-        (("--run", "nothing", "--updates", "0"), ("--updates", "at least 1")),
-        (("--run", "nothing", "--updates", "1.5"), ("--updates", "whole number", "'1.5'")),
-        (("--run", "nothing", "--minutes", "nan"), ("--minutes", "number", "'nan'")),
-        (("--run", "nothing", "--minutes", "-1"), ("--minutes", "above 0")),
-        (("--run", "nothing", "--lambda", "2"), ("--lambda ", "[0.0, 1.0]")),
-        (("--run", "nothing", "--threads", "0"), ("--threads", "at least 1")),
-        (("--run", "nothing", "--device", "cud"), ("'cud'", "'cuda'")),
+        ((), ("--checkpoint",)),
+        (("--checkpoint", "nothing"), ("nothing",)),
+        (("--checkpoint", "nothing", "--updats", "3"), ("--updats", "--updates")),
+        (("--checkpoint", "nothing", "--updates", "0"), ("--updates", "at least 1")),
+        (("--checkpoint", "nothing", "--updates", "1.5"), ("--updates", "whole number", "'1.5'")),
+        (("--checkpoint", "nothing", "--minutes", "nan"), ("--minutes", "number", "'nan'")),
+        (("--checkpoint", "nothing", "--minutes", "-1"), ("--minutes", "above 0")),
+        (("--checkpoint", "nothing", "--lambda", "2"), ("--lambda ", "[0.0, 1.0]")),
+        (("--checkpoint", "nothing", "--threads", "0"), ("--threads", "at least 1")),
+        (("--checkpoint", "nothing", "--device", "cud"), ("'cud'", "'cuda'")),
         (("--resume", "nothing"), ("nothing to resume in nothing",)),
         (("--resume", "nothing", "--starts", "3"), ("--starts", "--updates")),
     ],
@@ -35,7 +35,7 @@ def test_mistakes_are_one_line(flags, words, capsys):
 def test_every_setting_has_a_flag_of_its_type():
     fields = {field.name: field.default for field in dataclasses.fields(GoalsConfig)}
     flags = [word for name in fields for word in (f"--{name.rstrip('_').replace('_', '-')}", "1")]
-    settings = learn_goals.parse_arguments(["--run", "x", *flags]).settings
+    settings = learn_goals.parse_arguments(["--checkpoint", "x", *flags]).settings
     assert settings.keys() == fields.keys()
     for name, default in fields.items():
         assert type(settings[name]) is type(default if default is not None else 1.0)
@@ -51,5 +51,15 @@ def test_help_lists_the_flags_without_torch(run_python, root):
     )
     result = run_python("-c", code)
     assert "code 0" in result.stdout and "loaded []" in result.stdout, result.stderr
-    for flag in ("--run", "--updates", "--starts", "--minutes", "--out", "--seed", "--resume", "--device", "--lambda"):
+    for flag in (
+        "--checkpoint",
+        "--updates",
+        "--starts",
+        "--minutes",
+        "--out",
+        "--seed",
+        "--resume",
+        "--device",
+        "--lambda",
+    ):
         assert f"  {flag} " in result.stdout

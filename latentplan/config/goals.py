@@ -21,6 +21,7 @@ class GoalsConfig:
         entropy_scale: What a nat of the actor's entropy counts, of the spread of returns.
         lambda_: Mixing of returns of different lengths, in [0, 1].
         target_rate: Share of the value that the slow copy takes over with each update.
+        play_decisions: Decisions that the agent plays to begin from, where it comes without the replay of its run.
         seed: Seed of every random stream.
     """
 
@@ -33,9 +34,10 @@ class GoalsConfig:
     entropy_scale: float = 1e-3
     lambda_: float = 0.95
     target_rate: float = 0.02
+    play_decisions: int = 10_000
     seed: int = 0
 
     def __post_init__(self) -> None:
-        at_least(self, updates=1, starts=1, horizon=1, hidden_dim=1, seed=0, entropy_scale=0.0)
+        at_least(self, updates=1, starts=1, horizon=1, hidden_dim=1, play_decisions=1, seed=0, entropy_scale=0.0)
         above_zero(self, "minutes", "learning_rate")
         within(self, lambda_=(0.0, 1.0), target_rate=(0.0, 1.0))

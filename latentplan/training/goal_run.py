@@ -1,4 +1,4 @@
-"""A run that learns goals: from the agent and the replay of a finished run to an agent that knows goals as well."""
+"""A run that learns goals: from a trained agent and what it has seen to an agent that knows goals as well."""
 
 from __future__ import annotations
 
@@ -11,10 +11,11 @@ from typing import Any
 import torch
 
 from latentplan.checkpoint import INFO, load_model, read_info, resolve_checkpoint, save_checkpoint
-from latentplan.config import GoalsConfig, UserError, derive_seed, make_folder, to_dict
+from latentplan.config import USER_DOMAIN, Config, GoalsConfig, UserError, derive_seed, make_folder, to_dict
 from latentplan.models import WorldModel
 from latentplan.replay import Replay, read_saved
 from latentplan.training.goals import GoalLearner
+from latentplan.training.play import play
 from latentplan.training.progress import StatusLine
 from latentplan.training.run import Result
 from latentplan.training.state import INTERRUPTED
@@ -24,12 +25,12 @@ SAVE_SECONDS = 300.0
 
 
 def learn_goals(
-    run: Path | str, folder: Path | str, settings: GoalsConfig | None = None, *, device: str = "cpu"
+    checkpoint: Path | str, folder: Path | str, settings: GoalsConfig | None = None, *, device: str = "cpu"
 ) -> Result:
-    """Teach the agent of a run to pursue goals that are named later.
+    """Teach a trained agent to pursue goals that are named later.
 
     Args:
-        run: Folder of the run, with its replay.
+        checkpoint: Folder of a run, whose replay tells where to begin, or of an agent, which then plays a while.
         folder: Where the agent goes, and what it takes to resume.
         settings: Of the learning.
         device: `cpu` or `cuda`.
@@ -38,14 +39,14 @@ def learn_goals(
         Where the agent lies, and `worth`: see `GoalLearner.update`.
 
     Raises:
-        UserError: The run or the folder cannot be used.
+        UserError: The agent, its replay or the folder cannot be used.
     """
     folder = Path(folder)
     for name in (INFO, GOALS_FILE):
         if (folder / name).exists():
             raise UserError(f"{folder} already holds an agent: go on with --resume {folder}, or choose another --out")
     make_folder(folder)
-    return _learn(Path(run), folder, settings or GoalsConfig(), device, None)
+    return _learn(Path(checkpoint), folder, settings or GoalsConfig(), device, None)
 
 
 def resume_goals(
@@ -73,21 +74,36 @@ def resume_goals(
     return _learn(Path(saved["run"]), Path(folder), settings, device, saved)
 
 
-def load_replay(run: Path, model: WorldModel, device: str) -> Replay:
-    """The replay of a run, whole.
+def load_replay(path: Path, model: WorldModel, device: str) -> Replay:
+    """The replay in a folder, whole.
 
     Raises:
-        UserError: The run keeps none, or a damaged one, or one without quantities.
+        UserError: It is damaged, or of another kind of agent.
     """
-    path = run / "resume" / "replay"
-    if not (path / "rows.pt").exists():
-        raise UserError(f"goals are learned from a run's replay, and {path} holds none; give the folder of a run")
-    episode = read_saved(path / "rows.pt")["episode"]
-    num_lanes, lane_size = episode.shape
+    num_lanes, lane_size = read_saved(path / "rows.pt")["episode"].shape
     sizes = (model.action_dim, model.config.deter_dim, num_lanes, torch.device(device), len(model.labels))
     replay = Replay(num_lanes * lane_size, *sizes)
     replay.load(path)
     return replay
+
+
+def _begin(
+    agent: Path, folder: Path, model: WorldModel, config: Config, settings: GoalsConfig, line: StatusLine
+) -> Replay:
+    """What the agent has seen: the replay of its run, or what it saw when it played."""
+    played = folder / "replay"
+    for path in (agent / "resume" / "replay", played):
+        if (path / "rows.pt").exists():
+            return load_replay(path, model, str(model.device))
+    if config.env.domain == USER_DOMAIN:
+        raise UserError(f"{agent} has no replay, and its environment is your own: give the folder of its run")
+    line.print(f"no replay in {agent}: playing {settings.play_decisions:,} decisions to begin from")
+
+    def report(done: int) -> None:
+        line.update(f"played {done:,} of {settings.play_decisions:,} decisions")
+
+    play(config, model, settings.play_decisions, settings.seed, report).save(played)
+    return load_replay(played, model, str(model.device))
 
 
 def _learn(run: Path, folder: Path, settings: GoalsConfig, device: str, saved: dict[str, Any] | None) -> Result:
@@ -96,16 +112,18 @@ def _learn(run: Path, folder: Path, settings: GoalsConfig, device: str, saved: d
     if not model.goal_names:
         raise UserError(f"the agent of {run} was trained without named quantities, so there are no goals to learn")
     model.requires_grad_(False)
+    line = StatusLine()
+    replay = _begin(run, folder, model, config, settings, line)
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(derive_seed(settings.seed, "heads"))
         model.add_goal_heads(settings.hidden_dim)
-    learner = GoalLearner(model, settings, info["discount"], config.env.action_repeat, load_replay(run, model, device))
+    learner = GoalLearner(model, settings, info["discount"], config.env.action_repeat, replay)
     earlier = 0.0
     if saved is not None:
         learner.load_state_dict(saved["learner"])
         earlier = saved["minutes"]
     started = last_save = time.monotonic()
-    worth, line = math.nan, StatusLine()
+    worth = math.nan
 
     def minutes() -> float:
         return earlier + (time.monotonic() - started) / 60.0

@@ -73,6 +73,12 @@ def draw_boxes(met: Tensor, span: Tensor, scales: Tensor, num: int, generator: t
     )
 
 
+def span_of(met: Tensor, generator: torch.Generator) -> Tensor:
+    """Between what values nearly all quantities (row, quantity) lie that were met: (2, quantity)."""
+    some = met[torch.randperm(len(met), generator=generator, device=met.device)[:RANGE_ROWS]]
+    return torch.quantile(some, some.new_tensor(RANGE), dim=0)
+
+
 class GoalLearner:
     """Learns an actor and a value for boxes by imagining, as behaviour is learned for the reward.
 
@@ -97,8 +103,7 @@ class GoalLearner:
         rows = torch.from_numpy(replay.episode.reshape(-1) >= 0).nonzero().squeeze(1).to(replay.device)
         self.beliefs = _see_all(model, replay, rows)
         self.met = replay.labels[rows][:, : len(model.goal_names)]
-        some = self.met[torch.randperm(len(self.met), generator=self._generator("span"))[:RANGE_ROWS]]
-        self.span = torch.quantile(some, some.new_tensor(RANGE), dim=0)
+        self.span = span_of(self.met, self._generator("span"))
 
     def update(self) -> dict[str, float]:
         """One step of actor and value; what it came to.

@@ -9,12 +9,16 @@ import torch
 from latentplan.agent import PlanningAgent
 from latentplan.checkpoint import load_agent, load_model, read_info, save_checkpoint
 from latentplan.config import GoalsConfig, UserError
+from latentplan.config.quantities import QUANTITIES
 from latentplan.gate import GatedAgent
+from latentplan.goals.box import box_of
+from latentplan.goals.parser import parse_objective
 from latentplan.models import WorldModel
 from latentplan.replay import Replay, Rows
 from latentplan.training import learn_goals, resume_goals
 from latentplan.training.goal_run import GOALS_FILE, load_replay
 from latentplan.training.goals import GoalLearner, draw_boxes
+from latentplan.training.play import describe_box
 
 LABELS = {"height": 0.5, "speed": 1.0, "task.walk": 0.5}
 INFO = {"domain": "walker", "task": "walk", "env_frames": 7, "discount": 0.9, "metrics": []}
@@ -102,7 +106,7 @@ def test_the_imagined_worth_rises(run, tiny):
     with torch.no_grad():
         model.probe_head.output.weight.normal_(std=2.0)
     settings = GoalsConfig(starts=64, horizon=4, learning_rate=1e-2, entropy_scale=0.0)
-    learner = GoalLearner(model, settings, 0.9, 2, load_replay(run, model, "cpu"))
+    learner = GoalLearner(model, settings, 0.9, 2, load_replay(run / "resume" / "replay", model, "cpu"))
     worth = [learner.update()["worth"] for _ in range(80)]
     assert np.mean(worth[-20:]) > np.mean(worth[:10]) + 0.01
 
@@ -113,7 +117,7 @@ def test_what_is_broken_is_not_learned_from(run):
     model.add_goal_heads(8)
     with torch.no_grad():
         model.goal_heads.actor.mlp.output.bias[0] = math.nan
-    learner = GoalLearner(model, SETTINGS, 0.9, 2, load_replay(run, model, "cpu"))
+    learner = GoalLearner(model, SETTINGS, 0.9, 2, load_replay(run / "resume" / "replay", model, "cpu"))
     with pytest.raises(FloatingPointError, match="not finite at update 0"):
         learner.update()
 
@@ -149,7 +153,9 @@ def test_what_cannot_be_used_is_refused(run, finished, tiny, tmp_path):
         assert all(word in str(caught.value) for word in words), caught.value
 
     refused(lambda: learn_goals(run, finished.run_dir), "already holds an agent", "--resume")
-    refused(lambda: learn_goals(run / "checkpoints" / "last", tmp_path / "a"), "replay", "folder of a run")
+    mine = tiny("", env={"domain": "user"})
+    save_checkpoint(tmp_path / "mine", WorldModel(mine.model, 1, LABELS), mine, INFO)
+    refused(lambda: learn_goals(tmp_path / "mine", tmp_path / "a"), "no replay", "the folder of its run")
     refused(lambda: resume_goals(run), "nothing to resume", GOALS_FILE)
     unnamed = make_run(tmp_path / "unnamed", tiny(""), {})
     refused(lambda: learn_goals(unnamed, tmp_path / "b"), "without named quantities")
@@ -161,3 +167,22 @@ def test_what_cannot_be_used_is_refused(run, finished, tiny, tmp_path):
     save_checkpoint(other / "checkpoints" / "last", model, config, INFO)
     refused(lambda: resume_goals(tmp_path / "c"), "not the agent")
     assert "goals" in read_info(tmp_path / "c")
+
+
+def test_an_agent_without_a_replay_plays_first(tiny, tmp_path):
+    config = tiny("", env={"domain": "cartpole", "task": "swingup", "action_repeat": 50, "render_quality": "fastest"})
+    model = WorldModel(config.model, 1, {quantity.name: quantity.scale for quantity in QUANTITIES["cartpole"]})
+    save_checkpoint(tmp_path / "agent", model, config, INFO | {"domain": "cartpole", "task": "swingup"})
+    settings = GoalsConfig(**vars(SETTINGS) | {"updates": 1, "play_decisions": 500})
+    learn_goals(tmp_path / "agent", tmp_path / "out", settings)
+    replay = load_replay(tmp_path / "out" / "replay", model, "cpu")
+    assert 500 <= len(replay) <= 550 and float(replay.labels.abs().sum()) > 0.0
+    resumed = resume_goals(tmp_path / "out", updates=2)
+    assert read_info(resumed.run_dir)["goals"]["updates"] == 2
+
+
+def test_a_box_is_asked_for_in_words():
+    names, inf = ("height", "speed", "upright"), math.inf
+    text = describe_box(names, (-inf, 1.0, 0.2), (inf, 1.0, 0.5))
+    box = box_of(parse_objective(text, {name: 1.0 for name in names}), names)
+    assert box == {"speed": (1.0, 1.0), "upright": (0.2, 0.5)}
