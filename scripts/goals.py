@@ -1,4 +1,4 @@
-"""Teach a trained agent to pursue goals that are named later: `python scripts/goals.py --checkpoint DIR` (or --help)."""
+"""Teach a trained agent to pursue goals that are named later: `goals.py --checkpoint DIR`; see --help."""
 
 from __future__ import annotations
 
