@@ -30,53 +30,66 @@ SEEN_AT_ONCE = 1024
 
 
 class Boxes(NamedTuple):
-    """One box per row: ends of the intervals by quantity, (rows, quantity), infinite where open."""
+    """One box per row.
+
+    Attributes:
+        low: Lower ends of the intervals, (rows, quantity), -inf where open.
+        high: Upper ends, inf where open.
+        rows: Where the quantities were met that each box lies around, (rows,).
+    """
 
     low: Tensor
     high: Tensor
+    rows: Tensor
 
 
-def draw_boxes(met: Tensor, span: Tensor, scales: Tensor, num: int, generator: torch.Generator) -> Boxes:
-    """Boxes around what was met, with one quantity or all of them moved elsewhere in three quarters of them.
+class BoxSource:
+    """Draws boxes around what was met.
 
-    Each begins with the quantities of a random row. In half of the boxes one quantity, in another quarter all are drawn
-    anew, uniformly from their span: what a body does rarely has to be asked for often to be learned. Then each
-    interval becomes a point, open above, open below, one of up to a scale across, or, unless it was the one to be
-    drawn anew, open on both sides.
+    Three quarters lie around rows that are drawn so that every quantity takes all of its values equally often, in the
+    company that it was met in: what a body does rarely has to be asked for often to be learned. The others lie around
+    any row. In a quarter of all boxes one quantity is then moved to anywhere between the rarest values that were met.
+    Each interval becomes a point, open above, open below, one of up to a scale across, or, unless its quantity is the
+    one that counts most in its box, open on both sides.
 
     Args:
         met: Quantities that were met, (row, quantity).
-        span: Lowest and highest end drawn anew, (2, quantity).
         scales: Typical size of each quantity, (quantity,).
-        num: Boxes.
         generator: Random stream, where `met` lives.
     """
-    size, device = (num, met.shape[1]), met.device
 
-    def uniform(*shape: int) -> Tensor:
-        return torch.rand(shape, generator=generator, device=device)
+    def __init__(self, met: Tensor, scales: Tensor, generator: torch.Generator) -> None:
+        self.met, self.scales = met, scales
+        some = met[torch.randperm(len(met), generator=generator, device=met.device)[:RANGE_ROWS]]
+        self.span = torch.quantile(some, some.new_tensor(RANGE), dim=0)
+        self._sorted, self._order = met.t().contiguous().sort(dim=1)
 
-    rows = torch.randint(len(met), (num,), generator=generator, device=device)
-    anew = span[0] + (span[1] - span[0]) * uniform(*size)
-    chosen = torch.randint(size[1], (num, 1), generator=generator, device=device)
-    is_chosen = torch.arange(size[1], device=device) == chosen
-    how = uniform(num, 1)
-    centre = torch.where(((how < 0.5) & is_chosen) | (how > 0.75), anew, met[rows])
-    kind = uniform(*size)
-    kind = torch.where(is_chosen, 0.3 + 0.7 * kind, kind)  # open on both sides below 0.3
-    half = 0.5 * scales * torch.where(kind >= 0.9, uniform(*size), 0.0)
-    has_low = ((kind >= 0.3) & (kind < 0.7)) | (kind >= 0.9)
-    has_high = ((kind >= 0.3) & (kind < 0.5)) | (kind >= 0.7)
-    return Boxes(
-        torch.where(has_low, centre - half, -math.inf),
-        torch.where(has_high, centre + half, math.inf),
-    )
+    def draw(self, num: int, generator: torch.Generator) -> Boxes:
+        """So many boxes."""
+        size, device = (num, self.met.shape[1]), self.met.device
 
+        def uniform(*shape: int) -> Tensor:
+            return torch.rand(shape, generator=generator, device=device)
 
-def span_of(met: Tensor, generator: torch.Generator) -> Tensor:
-    """Between what values nearly all quantities (row, quantity) lie that were met: (2, quantity)."""
-    some = met[torch.randperm(len(met), generator=generator, device=met.device)[:RANGE_ROWS]]
-    return torch.quantile(some, some.new_tensor(RANGE), dim=0)
+        chosen = torch.randint(size[1], (num, 1), generator=generator, device=device)
+        is_chosen = torch.arange(size[1], device=device) == chosen
+        wanted = self.span[0] + (self.span[1] - self.span[0]) * uniform(*size)
+        rows = torch.randint(len(self.met), (num,), generator=generator, device=device)
+        rows = torch.where(uniform(num) < 0.75, self._nearest(chosen, wanted), rows)
+        centre = torch.where((uniform(num, 1) < 0.25) & is_chosen, wanted, self.met[rows])
+        kind = uniform(*size)
+        kind = torch.where(is_chosen, 0.3 + 0.7 * kind, kind)  # open on both sides below 0.3
+        half = 0.5 * self.scales * torch.where(kind >= 0.9, uniform(*size), 0.0)
+        has_low = ((kind >= 0.3) & (kind < 0.7)) | (kind >= 0.9)
+        has_high = ((kind >= 0.3) & (kind < 0.5)) | (kind >= 0.7)
+        low = torch.where(has_low, centre - half, -math.inf)
+        return Boxes(low, torch.where(has_high, centre + half, math.inf), rows)
+
+    def _nearest(self, chosen: Tensor, wanted: Tensor) -> Tensor:
+        """For each box a row where its chosen quantity (box, 1) has about the wanted value (box, quantity), (box,)."""
+        places = torch.searchsorted(self._sorted, wanted.t().contiguous()).clamp_max(len(self.met) - 1)
+        rows = self._order.gather(1, places).t()  # (box, quantity)
+        return rows.gather(1, chosen).squeeze(1)
 
 
 class GoalLearner:
@@ -102,8 +115,8 @@ class GoalLearner:
         self.optimizer = torch.optim.Adam(parameters, lr=settings.learning_rate, eps=1e-6, fused=True)
         rows = torch.from_numpy(replay.episode.reshape(-1) >= 0).nonzero().squeeze(1).to(replay.device)
         self.beliefs = _see_all(model, replay, rows)
-        self.met = replay.labels[rows][:, : len(model.goal_names)]
-        self.span = span_of(self.met, self._generator("span"))
+        met = replay.labels[rows][:, : len(model.goal_names)]
+        self.source = BoxSource(met, model.goal_scales, self._generator("span"))
 
     def update(self) -> dict[str, float]:
         """One step of actor and value; what it came to.
@@ -116,11 +129,11 @@ class GoalLearner:
         """
         settings, heads, scales = self.settings, self.model.goal_heads, self.model.goal_scales
         generator = self._generator("update", self.updates)
-        boxes = draw_boxes(self.met, self.span, scales, settings.starts, generator)
-        code = heads.encode(*boxes)
+        low, high, rows = self.source.draw(settings.starts, generator)
+        code = heads.encode(low, high)
         with self.model.trunk_precision():
-            features, entropies = self._imagine(self._starts(generator), code, generator)
-            worth = box_degree(*boxes, self.model.goal_quantities(features[1:]), scales)
+            features, entropies = self._imagine(self._starts(rows, generator), code, generator)
+            worth = box_degree(low, high, self.model.goal_quantities(features[1:]), scales)
             values = self.target.value(features[1:], code)
         discounts = torch.full_like(worth, self.discount)
         returns = lambda_return(self.frames_per_step * worth, discounts, values, settings.lambda_)
@@ -153,11 +166,16 @@ class GoalLearner:
     def _generator(self, name: str, counter: int = 0) -> torch.Generator:
         return torch.Generator(self.model.device).manual_seed(derive_seed(self.settings.seed, name, counter))
 
-    def _starts(self, generator: torch.Generator) -> State:
-        """Beliefs at random rows of the replay."""
-        size, device = (self.settings.starts,), self.model.device
-        rows = torch.randint(len(self.met), size, generator=generator, device=device)
-        return State(*(part[rows] for part in self.beliefs))
+    def _starts(self, rows: Tensor, generator: torch.Generator) -> State:
+        """Beliefs where imagination starts: half of them where what the box lies around was met, the others anywhere.
+
+        From the first it is learned to stay in a box, from the others to get there.
+        """
+        size, device = (len(rows),), self.model.device
+        anywhere = torch.randint(len(self.beliefs.deter), size, generator=generator, device=device)
+        is_there = torch.rand(size, generator=generator, device=device) < 0.5
+        chosen = torch.where(is_there, rows, anywhere)
+        return State(*(part[chosen] for part in self.beliefs))
 
     def _imagine(self, start: State, code: Tensor, generator: torch.Generator) -> tuple[Tensor, Tensor]:
         """Features (horizon + 1, rows, feature) along the actor's way, and entropies (horizon, rows) in nats."""

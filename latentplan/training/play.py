@@ -13,7 +13,7 @@ from latentplan.config import Config, derive_seed
 from latentplan.models import WorldModel
 from latentplan.replay import Replay
 from latentplan.training.collector import Collector
-from latentplan.training.goals import draw_boxes, span_of
+from latentplan.training.goals import BoxSource
 
 ROUND = 125  # decisions
 
@@ -65,6 +65,5 @@ def describe_box(names: Sequence[str], low: Sequence[float], high: Sequence[floa
 def _draw_goal(model: WorldModel, replay: Replay, generator: torch.Generator) -> str:
     rows = np.flatnonzero(replay.episode.reshape(-1) >= 0)
     met = replay.labels[torch.from_numpy(rows)][:, : len(model.goal_names)]
-    scales = model.goal_scales.cpu()
-    low, high = draw_boxes(met, span_of(met, generator), scales, 1, generator)
+    low, high, _ = BoxSource(met, model.goal_scales.cpu(), generator).draw(1, generator)
     return describe_box(model.goal_names, low[0].tolist(), high[0].tolist())
