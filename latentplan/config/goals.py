@@ -25,10 +25,10 @@ class GoalsConfig:
         seed: Seed of every random stream.
     """
 
-    updates: int = 30_000
+    updates: int = 50_000
     minutes: float | None = None
-    starts: int = 160
-    horizon: int = 15
+    starts: int = 320
+    horizon: int = 12
     hidden_dim: int = 48
     learning_rate: float = 1e-3
     entropy_scale: float = 1e-3

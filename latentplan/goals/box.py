@@ -130,7 +130,7 @@ class BoxModel:
     def policy(self, state: Any, generator: torch.Generator | None = None) -> Tensor:
         """The action for the box (rows, action): a sample when a generator is given, else the mode."""
         with self.model.trunk_precision():
-            mean, std = self.model.goal_heads.act(state.features, self._code)
+            mean, std = self.model.goal_action(state.features, self._code)
         if generator is None:
             return mean  # type: ignore[no-any-return]
         noise = torch.randn(mean.shape, generator=generator, device=mean.device)
@@ -144,7 +144,7 @@ class BoxModel:
         rows, chosen = type(state)(*(part.repeat_interleave(num, 0) for part in state)), []
         for draw in noise.flatten(0, 1).unbind(1):
             with self.model.trunk_precision():
-                mean, std = self.model.goal_heads.act(rows.features, self._code)
+                mean, std = self.model.goal_action(rows.features, self._code)
             chosen.append((mean + std * draw).clamp(-1.0, 1.0))
             rows, _ = self.model.fast_step(rows, chosen[-1])
         return torch.stack(chosen, 1)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
-from latentplan.models.heads import Actor, ScalarHead
+from latentplan.models.heads import Actor, ScalarHead, action_distribution
 
 ENDS = 2  # of an interval, each told by whether it is there, and where
 CODE_SIZE = 2 * ENDS  # numbers per quantity
@@ -37,10 +37,18 @@ class GoalHeads(nn.Module):
         where = [torch.where(torch.isfinite(end), end / self.scales, 0.0) for end in (low, high)]
         return torch.cat([there[0], where[0], there[1], where[1]], -1)
 
-    def act(self, features: Tensor, code: Tensor) -> tuple[Tensor, Tensor]:
-        """Mean in [-1, 1] and std of the action for features (..., feature) and codes that broadcast with them."""
-        mean, std = self.actor(self._beside(features, code))
-        return mean, std
+    def act(self, features: Tensor, code: Tensor, own: Tensor) -> tuple[Tensor, Tensor]:
+        """Mean in [-1, 1] and std of the action.
+
+        What is learned is what a goal changes in what the agent would do for its task (residual policy learning,
+        Silver et al. 2018): a body that can swing up its pole need not learn it again.
+
+        Args:
+            features: Of states, (..., feature).
+            code: Of goals, broadcasts with them.
+            own: What the task's actor puts out there, (..., 2 action).
+        """
+        return action_distribution(own + self.actor.mlp(self._beside(features, code)))
 
     def judge(self, features: Tensor, code: Tensor) -> Tensor:
         """Logits of the discounted worth from there on, (..., bin)."""

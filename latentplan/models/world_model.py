@@ -103,6 +103,11 @@ class WorldModel(nn.Module):
         heads = GoalHeads(features, goal_dim, self.action_dim, config.num_bins, self.goal_scales.clone())
         self.goal_dim, self.goal_heads = goal_dim, heads.to(self.device)
 
+    def goal_action(self, features: Tensor, code: Tensor) -> tuple[Tensor, Tensor]:
+        """Mean and std of the action, (..., action) each, for the goals of a code; see `GoalHeads.act`."""
+        mean, std = self.goal_heads.act(features, code, self.actor.mlp(features))
+        return mean, std
+
     def goal_quantities(self, features: Tensor) -> Tensor:
         """The quantities `goal_names` at states with features (..., feature), float32 (..., quantity)."""
         return self.probe(features)[..., : len(self.goal_names)].float()

@@ -184,7 +184,7 @@ class GoalLearner:
         shape = (self.settings.horizon, len(start.deter), sum(sizes))
         draws = torch.randn(shape, generator=generator, device=self.model.device)
         for action_noise, noise in zip(*(part.unbind(0) for part in draws.split(sizes, -1)), strict=True):
-            mean, std = self.model.goal_heads.act(features[-1].detach(), code)
+            mean, std = self.model.goal_action(features[-1].detach(), code)
             stds.append(std)
             deter = self.dream.dynamics.advance(state, sample_action(mean, std, action_noise))
             prior = self.dream.dynamics.prior(deter)

@@ -70,6 +70,15 @@ def test_the_view_of_a_box_is_a_model_that_can_be_planned_in(knowing, state, gen
         assert torch.allclose(proposals[8:12], alone, atol=1e-2)  # does not feel who shares the call
 
 
+def test_fresh_heads_do_what_the_task_does(model, state):
+    torch.manual_seed(2)
+    fresh = WorldModel(model.config, 3, LABELS, goal_dim=16)
+    fresh.load_state_dict(model.state_dict(), strict=False)
+    with torch.no_grad():
+        fresh.goal_heads.actor.mlp.output.weight.zero_()
+        assert torch.equal(BoxView(GOAL, 2)(fresh).policy(state), model.policy(state))
+
+
 def test_other_boxes_are_worth_and_done_otherwise(knowing, state):
     views = [BoxView(box, 2)(knowing) for box in ({}, GOAL, {"speed": (3.0, math.inf)})]
     with torch.no_grad():
