@@ -16,6 +16,7 @@ import torch
 from torch import Tensor
 
 from latentplan.goals.expression import Absolute, Both, Clause, Expression, Name, Node, Number
+from latentplan.planning.model import take_step
 
 Interval = tuple[float, float]
 
@@ -114,12 +115,20 @@ class BoxModel:
     def step(self, state: Any, action: Tensor) -> tuple[Any, Tensor]:
         """The next state, and what it is worth in the box, (rows,)."""
         following, _ = self.model.step(state, action)
-        return following, self._worth(following)
+        return following, self._worth(following.features)
 
     def fast_step(self, state: Any, action: Tensor) -> tuple[Any, Tensor]:
         """`step`, compiled where that can be, without gradients."""
         following, _ = self.model.fast_step(state, action)
-        return following, self._worth(following)
+        return following, self._worth(following.features)
+
+    def rollout(self, state: Any, actions: Tensor) -> tuple[Tensor, Any]:
+        """Worth (rows, time) along actions (rows, time, action), and the last state; quantities are read at once."""
+        features = []
+        for action in actions.unbind(1):
+            state, _ = take_step(self.model, state, action)
+            features.append(state.features)
+        return self._worth(torch.stack(features, 1)), state
 
     def value(self, state: Any) -> Tensor:
         """Expected discounted worth from a state on, under the actor for the box, (rows,)."""
@@ -143,8 +152,8 @@ class BoxModel:
         noise[:, 0] = 0.0
         rows, chosen = type(state)(*(part.repeat_interleave(num, 0) for part in state)), []
         for draw in noise.flatten(0, 1).unbind(1):
-            with self.model.trunk_precision():
-                mean, std = self.model.goal_action(rows.features, self._code)
+            with torch.autocast(draw.device.type, enabled=False):  # for few rows converting costs more than it saves
+                mean, std = self.model.goal_action(rows.features.float(), self._code)
             chosen.append((mean + std * draw).clamp(-1.0, 1.0))
             rows, _ = self.model.fast_step(rows, chosen[-1])
         return torch.stack(chosen, 1)
@@ -154,8 +163,8 @@ class BoxModel:
         going_on: Tensor = self.model.continues(state)
         return going_on
 
-    def _worth(self, state: Any) -> Tensor:
-        values = self.model.goal_quantities(state.features)
+    def _worth(self, features: Tensor) -> Tensor:
+        values = self.model.goal_quantities(features)
         return self._frames_per_step * box_degree(self._low, self._high, values, self.model.goal_scales)
 
 
