@@ -74,6 +74,17 @@ def test_the_policy_of_a_learned_goal_acts_where_it_fits(planner, model, state, 
     assert torch.equal(plan.actions, own.actions)
 
 
+def test_what_a_slower_model_takes_is_not_expected_of_this_one(planner, model, state, last):
+    class Slower(SlowModel):
+        def rollout(self, state, actions):
+            model.seconds += 0.09
+            return super().rollout(state, actions)
+
+    for _ in range(9):
+        planner.plan(model, state, objective=conditioned(lambda _: Slower()))
+    assert planner.plan(model, state, last, deadline_ms=25).info["iterations"].tolist() == [2, 2]
+
+
 def test_else_the_last_plan_goes_on(planner, model, state, last):
     shifted = planner.plan(model, state, last, deadline_ms=3)
     assert shifted.source == "tail"
