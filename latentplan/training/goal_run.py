@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
+import signal
 import time
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -136,22 +139,38 @@ def _learn(run: Path, folder: Path, settings: GoalsConfig, device: str, saved: d
         torch.save(about | state, folder / f"{GOALS_FILE}.part")
         (folder / f"{GOALS_FILE}.part").replace(folder / GOALS_FILE)
 
-    try:
-        with line:
-            while learner.updates < settings.updates and not minutes() >= (settings.minutes or math.inf):
-                parts = learner.update()
-                worth = parts["worth"] if math.isnan(worth) else 0.99 * worth + 0.01 * parts["worth"]
-                line.update(
-                    f"update {learner.updates:,} of {settings.updates:,} | imagined worth {worth:.3f} of 1 | "
-                    f"entropy {parts['entropy']:.2f} nats | {minutes():.1f} min"
-                )
-                if time.monotonic() - last_save > SAVE_SECONDS:
-                    save()
-                    last_save = time.monotonic()
-            save()
-            line.print(f"agent: {folder}")
-        return Result(folder, 0, {"worth": worth})
-    except KeyboardInterrupt:
+    with line, _asked_to_stop() as is_asked:
+        while learner.updates < settings.updates and not (is_asked() or minutes() >= (settings.minutes or math.inf)):
+            parts = learner.update()
+            worth = parts["worth"] if math.isnan(worth) else 0.99 * worth + 0.01 * parts["worth"]
+            line.update(
+                f"update {learner.updates:,} of {settings.updates:,} | imagined worth {worth:.3f} of 1 | "
+                f"entropy {parts['entropy']:.2f} nats | {minutes():.1f} min"
+            )
+            if time.monotonic() - last_save > SAVE_SECONDS:
+                save()
+                last_save = time.monotonic()
         save()
-        line.print(f"stopped; to go on: python scripts/goals.py --resume {folder}")
-        return Result(folder, INTERRUPTED, {})
+        if is_asked():
+            line.print(f"stopped; to go on: python scripts/goals.py --resume {folder}")
+            return Result(folder, INTERRUPTED, {})
+        line.print(f"agent: {folder}")
+    return Result(folder, 0, {"worth": worth})
+
+
+@contextlib.contextmanager
+def _asked_to_stop() -> Iterator[Callable[[], bool]]:
+    """Takes over Ctrl-C and requests to end: the update in work is finished first; asked again, it ends at once."""
+    asked: list[int] = []
+
+    def note(number: int, frame: Any) -> None:
+        if asked:
+            raise KeyboardInterrupt
+        asked.append(number)
+
+    previous = {number: signal.signal(number, note) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield lambda: bool(asked)
+    finally:
+        for number, handler in previous.items():
+            signal.signal(number, handler)

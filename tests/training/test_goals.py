@@ -1,6 +1,8 @@
 """Goals are learned in imagination, beside a model that stays as it is."""
 
 import math
+import os
+import signal
 
 import numpy as np
 import pytest
@@ -19,6 +21,7 @@ from latentplan.training import learn_goals, resume_goals
 from latentplan.training.goal_run import GOALS_FILE, load_replay
 from latentplan.training.goals import Boxes, BoxSource, GoalLearner
 from latentplan.training.play import describe_box
+from latentplan.training.state import INTERRUPTED
 
 LABELS = {"height": 0.5, "speed": 1.0, "task.walk": 0.5}
 INFO = {"domain": "walker", "task": "walk", "env_frames": 7, "discount": 0.9, "metrics": []}
@@ -102,6 +105,26 @@ def test_nothing_but_the_heads_changes(run, finished):
 def test_a_learning_that_was_cut_off_ends_with_the_same_agent(run, finished, tmp_path):
     learn_goals(run, tmp_path / "part", GoalsConfig(**vars(SETTINGS) | {"updates": 2}))
     resumed = resume_goals(tmp_path / "part", updates=6)
+    weights = [load_model(folder)[0].state_dict() for folder in (finished.run_dir, resumed.run_dir)]
+    assert all(torch.equal(value, weights[1][name]) for name, value in weights[0].items())
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_who_is_asked_to_stop_finishes_the_update_in_work(run, finished, tmp_path, monkeypatch, number):
+    descend = GoalLearner._descend
+
+    def interrupted(self, loss):
+        if self.updates == 2:
+            os.kill(os.getpid(), number)
+        descend(self, loss)
+
+    monkeypatch.setattr(GoalLearner, "_descend", interrupted)
+    before = signal.getsignal(number)
+    result = learn_goals(run, tmp_path / "part", SETTINGS)
+    assert result.exit_code == INTERRUPTED and read_info(tmp_path / "part")["goals"]["updates"] == 3
+    assert signal.getsignal(number) is before
+    monkeypatch.undo()
+    resumed = resume_goals(tmp_path / "part")
     weights = [load_model(folder)[0].state_dict() for folder in (finished.run_dir, resumed.run_dir)]
     assert all(torch.equal(value, weights[1][name]) for name, value in weights[0].items())
 
