@@ -82,8 +82,14 @@ def main(argv: Sequence[str] | None = None) -> int:
         print("  export   write the actor as a program that runs without this package")
         print("  doctor   report versions, device and renderer, and what to do about what is wrong")
         return 0
-    commands = {"train": _train, "eval": _evaluate, "distill": _distill, "goals": _goals, "export": _export}
-    commands["doctor"] = _doctor
+    commands = {
+        "train": _train,
+        "eval": _evaluate,
+        "distill": _distill,
+        "goals": _goals,
+        "export": _export,
+        "doctor": _doctor,
+    }
     return run_guarded(commands.get(command, lambda _: raise_unknown("command", command, COMMANDS)), arguments[1:])
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from statistics import NormalDist
 from typing import Any
 
@@ -12,8 +13,10 @@ from torch import Tensor
 
 from latentplan.agent import PlanningAgent
 from latentplan.config import Config, PlannerConfig
+from latentplan.goals.expression import Expression
 from latentplan.models import State, WorldModel, kl_divergence
 from latentplan.planning.conditioned import seen_for
+from latentplan.planning.objectives import Constraint, Term
 
 SIGNALS = ("mismatch", "value", "both", "random")
 GAP_STEPS = 2  # a step of imagination costs as much as seeing the frame
@@ -96,6 +99,13 @@ class GatedAgent(PlanningAgent):
         self._drift: Tensor | None = None
         self._is_first: Tensor | None = None
 
+    def set_objective(
+        self, objective: str | Expression | Term | None = None, constraints: str | Sequence[Constraint] = ()
+    ) -> None:
+        """See `PlanningAgent.set_objective`."""
+        super().set_objective(objective, constraints)
+        self._acting, _ = seen_for(self.model, self.controller.objective)
+
     @property
     def planned_fraction(self) -> float:
         """Share of planned decisions so far, 0 before the first."""
@@ -129,7 +139,6 @@ class GatedAgent(PlanningAgent):
 
     def _choose(self, state: State) -> Tensor:
         assert self._is_first is not None and self._drift is not None
-        self._acting, _ = seen_for(self.model, self.controller.objective)
         is_own = self._acting is self.model
         action = self.model.actor(state.features)[0] if is_own else self._acting.policy(state)
         is_due, is_tail = self._is_first, torch.zeros_like(self._is_first)
@@ -151,8 +160,8 @@ class GatedAgent(PlanningAgent):
     @property
     def _is_foreign(self) -> bool:
         """Whether something is pursued that no actor knows of."""
-        _, unknown = seen_for(self.model, self.controller.objective)
-        return unknown is not None or bool(self.controller.constraints)
+        is_unknown = self.controller.objective is not None and self._acting is self.model
+        return is_unknown or bool(self.controller.constraints)
 
     def _is_doubtful(self, state: State, action: Tensor, is_due: Tensor) -> Tensor:
         """Whether the signal exceeds the threshold and the budget allows for a plan, (batch,) bool on the CPU.

@@ -38,7 +38,7 @@ LAYERS = {
     "agent": (("config", "models", "planning", "goals"), {"torch", "numpy", "einops"}),
     "scoring": (("config", "envs", "goals"), {"numpy", "gymnasium"}),
     "background": (("config", "models", "planning", "goals", "agent"), {"torch", "numpy"}),
-    "gate": (("config", "models", "planning", "agent"), {"torch", "numpy"}),
+    "gate": (("config", "models", "planning", "goals", "agent"), {"torch", "numpy"}),
     "rollout": (("config", "envs", "replay", "agent"), {"numpy"}),
     "latency": (("config",), {"numpy"}),
     "virtual_clock": (("config", "planning", "latency", "rollout"), {"numpy", "torch"}),

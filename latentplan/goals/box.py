@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from latentplan.goals.expression import Absolute, Both, Clause, Expression, Name, Node, Number
-from latentplan.planning.model import take_step
+from latentplan.planning.model import repeat_rows, take_step
 
 Interval = tuple[float, float]
 
@@ -65,7 +65,8 @@ def box_of(expression: Expression, quantities: Sequence[str]) -> dict[str, Inter
         if found is None:
             return None
         name, (low, high) = found
-        low, high = max(low, box.get(name, found[1])[0]), min(high, box.get(name, found[1])[1])
+        least, most = box.get(name, (-math.inf, math.inf))
+        low, high = max(low, least), min(high, most)
         if low > high:
             return None  # no value of the quantity is in both
         box[name] = low, high
@@ -150,7 +151,7 @@ class BoxModel:
         size = (num, horizon, self.model.action_dim)
         noise = torch.stack([torch.randn(size, generator=each, device=self.model.device) for each in generators])
         noise[:, 0] = 0.0
-        rows, chosen = type(state)(*(part.repeat_interleave(num, 0) for part in state)), []
+        rows, chosen = repeat_rows(state, num), []
         for draw in noise.flatten(0, 1).unbind(1):
             with torch.autocast(draw.device.type, enabled=False):  # for few rows converting costs more than it saves
                 mean, std = self.model.goal_action(rows.features.float(), self._code)

@@ -26,7 +26,6 @@ class GoalHeads(nn.Module):
 
     def __init__(self, in_features: int, hidden_dim: int, action_dim: int, num_bins: int, scales: Tensor) -> None:
         super().__init__()
-        self.hidden_dim = hidden_dim
         self.register_buffer("scales", scales, persistent=False)
         self.actor = Actor(in_features + CODE_SIZE * len(scales), hidden_dim, action_dim)
         self.value_head = ScalarHead(in_features + CODE_SIZE * len(scales), hidden_dim, num_bins)

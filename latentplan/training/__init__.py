@@ -1,4 +1,4 @@
-"""Learning: losses, the Lightning module, collection, the run itself, distillation, and goals."""
+"""Learning: losses, the Lightning module, collection, the run itself, distillation and goals."""
 
 from latentplan.training.distill import distill, resume_distillation
 from latentplan.training.goal_run import learn_goals, resume_goals
