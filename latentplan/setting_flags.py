@@ -78,4 +78,4 @@ def describe_settings(settings: type) -> list[tuple[str, str]]:
 
 
 def _flag(name: str) -> str:
-    return f"--{name.rstrip('_').replace('_', '-')}"
+    return f"--{name.replace('_', '-')}"

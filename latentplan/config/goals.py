@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from latentplan.config.checks import above_zero, at_least, within
+from latentplan.config.checks import above_zero, at_least
 
 
 @dataclass(frozen=True)
@@ -19,8 +19,6 @@ class GoalsConfig:
         hidden_dim: Width of the hidden layers of the actor and the value.
         learning_rate: Adam step of both.
         entropy_scale: What a nat of the actor's entropy counts, of the spread of returns.
-        lambda_: Mixing of returns of different lengths, in [0, 1].
-        target_rate: Share of the value that the slow copy takes over with each update.
         play_decisions: Decisions that the agent plays to begin from, where it comes without the replay of its run.
         seed: Seed of every random stream.
     """
@@ -32,12 +30,9 @@ class GoalsConfig:
     hidden_dim: int = 48
     learning_rate: float = 1e-3
     entropy_scale: float = 1e-3
-    lambda_: float = 0.95
-    target_rate: float = 0.02
     play_decisions: int = 10_000
     seed: int = 0
 
     def __post_init__(self) -> None:
         at_least(self, updates=1, starts=1, horizon=1, hidden_dim=1, play_decisions=1, seed=0, entropy_scale=0.0)
         above_zero(self, "minutes", "learning_rate")
-        within(self, lambda_=(0.0, 1.0), target_rate=(0.0, 1.0))

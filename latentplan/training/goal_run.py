@@ -77,14 +77,14 @@ def resume_goals(
     return _learn(Path(saved["run"]), Path(folder), settings, device, saved)
 
 
-def load_replay(path: Path, model: WorldModel, device: str) -> Replay:
-    """The replay in a folder, whole.
+def load_replay(path: Path, model: WorldModel) -> Replay:
+    """The replay in a folder, whole, in main memory.
 
     Raises:
         UserError: It is damaged, or of another kind of agent.
     """
     num_lanes, lane_size = read_saved(path / "rows.pt")["episode"].shape
-    sizes = (model.action_dim, model.config.deter_dim, num_lanes, torch.device(device), len(model.labels))
+    sizes = (model.action_dim, model.config.deter_dim, num_lanes, torch.device("cpu"), len(model.labels))
     replay = Replay(num_lanes * lane_size, *sizes)
     replay.load(path)
     return replay
@@ -97,7 +97,7 @@ def _begin(
     played = folder / "replay"
     for path in (agent / "resume" / "replay", played):
         if (path / "rows.pt").exists():
-            return load_replay(path, model, str(model.device))
+            return load_replay(path, model)
     if config.env.domain == USER_DOMAIN:
         raise UserError(f"{agent} has no replay, and its environment is your own: give the folder of its run")
     line.print(f"no replay in {agent}: playing {settings.play_decisions:,} decisions to begin from")
@@ -105,8 +105,9 @@ def _begin(
     def report(done: int) -> None:
         line.update(f"played {done:,} of {settings.play_decisions:,} decisions")
 
-    play(config, model, settings.play_decisions, settings.seed, report).save(played)
-    return load_replay(played, model, str(model.device))
+    replay = play(config, model, settings.play_decisions, settings.seed, report)
+    replay.save(played)
+    return replay
 
 
 def _learn(run: Path, folder: Path, settings: GoalsConfig, device: str, saved: dict[str, Any] | None) -> Result:
@@ -120,7 +121,8 @@ def _learn(run: Path, folder: Path, settings: GoalsConfig, device: str, saved: d
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(derive_seed(settings.seed, "heads"))
         model.add_goal_heads(settings.hidden_dim)
-    learner = GoalLearner(model, settings, info["discount"], config.env.action_repeat, replay)
+    frames_per_step = config.env.action_repeat
+    learner = GoalLearner(model, settings, config.learning, info["discount"], frames_per_step, replay)
     earlier = 0.0
     if saved is not None:
         learner.load_state_dict(saved["learner"])

@@ -9,23 +9,22 @@ from __future__ import annotations
 
 import copy
 import math
+from functools import partial
 from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
-from latentplan.config import GoalsConfig, derive_seed
+from latentplan.config import GoalsConfig, LearningConfig, derive_seed
 from latentplan.goals.box import box_degree
 from latentplan.models import State, WorldModel
-from latentplan.models.heads import sample_action
 from latentplan.replay import Replay
-from latentplan.training.losses import HALF_LOG_2_PI_E, lambda_return
-from latentplan.training.module import RETURN_RANGE_RATE
+from latentplan.training.losses import lambda_return, roll_out
+from latentplan.training.optimization import descend, follow, return_scale
 from latentplan.training.snapshot import Snapshot
 
 RANGE = (0.005, 0.995)  # quantiles of what was met, between which ends of intervals are drawn
 RANGE_ROWS = 20_000
-MAX_GRAD_NORM = 100.0
 SEEN_AT_ONCE = 1024
 
 
@@ -97,25 +96,32 @@ class GoalLearner:
 
     Args:
         model: The world model, with heads for goals; nothing but these changes.
-        settings: Of the learning.
+        settings: Of the learning of goals.
+        learning: How the agent itself learned: the mixing of returns, the clipping and the slow copy are as there.
         discount: Per decision.
         frames_per_step: Env frames per decision.
         replay: Where beliefs to start from, and the quantities met, come from.
     """
 
     def __init__(
-        self, model: WorldModel, settings: GoalsConfig, discount: float, frames_per_step: int, replay: Replay
+        self,
+        model: WorldModel,
+        settings: GoalsConfig,
+        learning: LearningConfig,
+        discount: float,
+        frames_per_step: int,
+        replay: Replay,
     ) -> None:
-        self.model, self.settings = model, settings
+        self.model, self.settings, self.learning = model, settings, learning
         self.discount, self.frames_per_step = discount, frames_per_step
         self.updates, self.return_range = 0, torch.zeros((), device=model.device)
         self.dream = Snapshot(model).model
         self.target = copy.deepcopy(model.goal_heads).requires_grad_(False)
         parameters = [*model.goal_heads.requires_grad_(True).parameters()]
         self.optimizer = torch.optim.Adam(parameters, lr=settings.learning_rate, eps=1e-6, fused=True)
-        rows = torch.from_numpy(replay.episode.reshape(-1) >= 0).nonzero().squeeze(1).to(replay.device)
+        rows = torch.from_numpy(replay.episode.reshape(-1) >= 0).nonzero().squeeze(1)
         self.beliefs = _see_all(model, replay, rows)
-        met = replay.labels[rows][:, : len(model.goal_names)]
+        met = replay.labels[rows][:, : len(model.goal_names)].to(model.device)
         self.source = BoxSource(met, model.goal_scales, self._generator("span"))
 
     def update(self) -> dict[str, float]:
@@ -132,19 +138,26 @@ class GoalLearner:
         low, high, rows = self.source.draw(settings.starts, generator)
         code = heads.encode(low, high)
         with self.model.trunk_precision():
-            features, entropies = self._imagine(self._starts(rows, generator), code, generator)
+            start = self._starts(rows, generator)
+            features, entropies = self.imagine(start, code, generator)
             worth = box_degree(low, high, self.model.goal_quantities(features[1:]), scales)
             values = self.target.value(features[1:], code)
         discounts = torch.full_like(worth, self.discount)
-        returns = lambda_return(self.frames_per_step * worth, discounts, values, settings.lambda_)
+        returns = lambda_return(self.frames_per_step * worth, discounts, values, self.learning.lambda_)
         reach = torch.cat([torch.ones_like(discounts[:1]), discounts[:-1]]).cumprod(0)
-        gains = returns / self._return_scale(returns.detach()) + settings.entropy_scale * entropies
+        gains = returns / return_scale(self.return_range, returns.detach()) + settings.entropy_scale * entropies
         with self.model.trunk_precision():
             logits = heads.judge(features[:-1].detach(), code)
         loss = (reach * (heads.value_head.loss(logits, returns.detach()) - gains)).mean()
-        self._descend(loss)
+        descend(self.optimizer, loss, self.learning.max_grad_norm, self.updates)
+        follow(self.target, heads, self.learning.target_rate)
         self.updates += 1
         return {"worth": float(worth.detach().mean()), "entropy": float(entropies.detach().mean())}
+
+    def imagine(self, start: State, code: Tensor, generator: torch.Generator) -> tuple[Tensor, Tensor]:
+        """What the actor for the boxes of a code does from rows of states; see `roll_out`."""
+        act = partial(self.model.goal_action, code=code)
+        return roll_out(self.dream, act, start, self.settings.horizon, generator)
 
     def state_dict(self) -> dict[str, Any]:
         """Everything that changes."""
@@ -176,40 +189,6 @@ class GoalLearner:
         is_there = torch.rand(size, generator=generator, device=device) < 0.5
         chosen = torch.where(is_there, rows, anywhere)
         return State(*(part[chosen] for part in self.beliefs))
-
-    def _imagine(self, start: State, code: Tensor, generator: torch.Generator) -> tuple[Tensor, Tensor]:
-        """Features (horizon + 1, rows, feature) along the actor's way, and entropies (horizon, rows) in nats."""
-        state, features, stds = start, [start.features.float()], []
-        sizes = [self.model.action_dim, self.model.config.latent_dim]
-        shape = (self.settings.horizon, len(start.deter), sum(sizes))
-        draws = torch.randn(shape, generator=generator, device=self.model.device)
-        for action_noise, noise in zip(*(part.unbind(0) for part in draws.split(sizes, -1)), strict=True):
-            mean, std = self.model.goal_action(features[-1].detach(), code)
-            stds.append(std)
-            deter = self.dream.dynamics.advance(state, sample_action(mean, std, action_noise))
-            prior = self.dream.dynamics.prior(deter)
-            state = State(deter, torch.addcmul(prior.mean, prior.std, noise))
-            features.append(state.features)
-        return torch.stack(features), (torch.stack(stds).log() + HALF_LOG_2_PI_E).sum(-1)
-
-    def _return_scale(self, returns: Tensor) -> Tensor:
-        """See `Learner`."""
-        flat = returns.flatten()
-        spread = torch.quantile(flat, 0.95) - torch.quantile(flat, 0.05)
-        self.return_range = self.return_range.lerp(spread, RETURN_RANGE_RATE)
-        return self.return_range.clamp_min(1.0)
-
-    def _descend(self, loss: Tensor) -> None:
-        self.optimizer.zero_grad(set_to_none=True)
-        loss.backward()
-        norm = torch.nn.utils.clip_grad_norm_(self.model.goal_heads.parameters(), MAX_GRAD_NORM)
-        if not torch.isfinite(norm):
-            raise FloatingPointError(f"the gradient is not finite at update {self.updates} (loss {loss.item()})")
-        self.optimizer.step()
-        with torch.no_grad():
-            pairs = zip(self.target.parameters(), self.model.goal_heads.parameters(), strict=True)
-            for slow, fast in pairs:
-                slow.lerp_(fast, self.settings.target_rate)
 
 
 @torch.no_grad()

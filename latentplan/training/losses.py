@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import torch
@@ -103,28 +104,48 @@ def world_model_loss(model: WorldModel, batch: Batch, config: LearningConfig, ge
 
 
 def imagine(model: WorldModel, start: State, horizon: int, generator: torch.Generator) -> Imagination:
-    """Roll the actor out in the model for `horizon` steps from rows of states, with gradients through the dynamics.
+    """Roll the actor out in the model for `horizon` steps from rows of states, with gradients through the dynamics."""
+    stacked, entropies = roll_out(model, model.actor, start, horizon, generator)
+    rewards = model.reward_head.mean(model.reward_head(stacked[1:]))
+    continues = torch.sigmoid(model.continue_head(stacked[1:])).squeeze(-1)
+    return Imagination(stacked, rewards, continues, entropies)
 
-    The actor reads its state without a gradient, so that each action is credited along the dynamics alone
+
+def roll_out(
+    model: WorldModel,
+    policy: Callable[[Tensor], tuple[Tensor, Tensor]],
+    start: State,
+    horizon: int,
+    generator: torch.Generator,
+) -> tuple[Tensor, Tensor]:
+    """Follow samples of a policy and of the prior, with gradients through the dynamics.
+
+    The policy reads its state without a gradient, so that each action is credited along the dynamics alone
     (Hafner et al. 2020, section 3).
+
+    Args:
+        model: What imagines.
+        policy: Mean and std of the action, (rows, action) each, for features (rows, feature).
+        start: Rows of states.
+        horizon: Steps.
+        generator: Of the samples.
+
+    Returns:
+        Features, the start first, (horizon + 1, rows, feature); entropies of the actions, in nats, (horizon, rows).
     """
     state, features, stds = start, [start.features], []
     rows, device = len(start.deter), start.deter.device
     draws = torch.randn(horizon, rows, model.action_dim + model.config.latent_dim, generator=generator, device=device)
     action_noise, noise = draws.split([model.action_dim, model.config.latent_dim], -1)
     for step in range(horizon):
-        mean, std = model.actor(features[-1].detach())
+        mean, std = policy(features[-1].detach())
         action = sample_action(mean, std, action_noise[step])
         stds.append(std)
         deter = model.dynamics.advance(state, action)
         prior = model.dynamics.prior(deter)
         state = State(deter, torch.addcmul(prior.mean, prior.std, noise[step]))
         features.append(state.features)
-    stacked = torch.stack(features)
-    entropies = (torch.stack(stds).log() + HALF_LOG_2_PI_E).sum(-1)
-    rewards = model.reward_head.mean(model.reward_head(stacked[1:]))
-    continues = torch.sigmoid(model.continue_head(stacked[1:])).squeeze(-1)
-    return Imagination(stacked, rewards, continues, entropies)
+    return torch.stack(features), (torch.stack(stds).log() + HALF_LOG_2_PI_E).sum(-1)
 
 
 def lambda_return(rewards: Tensor, discounts: Tensor, values: Tensor, lambda_: float) -> Tensor:

@@ -16,9 +16,8 @@ from latentplan.models.heads import ScalarHead
 from latentplan.replay import Batch, Replay
 from latentplan.training.augmentation import quarter_turns
 from latentplan.training.losses import Learned, imagine, imitation_loss, lambda_return, value_loss, world_model_loss
+from latentplan.training.optimization import descend, follow, return_scale
 from latentplan.training.snapshot import Snapshot
-
-RETURN_RANGE_RATE = 0.01
 
 
 class Learner(lightning.LightningModule):
@@ -114,10 +113,7 @@ class Learner(lightning.LightningModule):
     def _learn_behaviour(self, learned: Learned, batch: Batch, generator: torch.Generator) -> dict[str, Tensor]:
         loss, parts = self._behaviour_loss(learned, batch, generator)
         parts["behaviour_grad_norm"] = self._descend(self._optimizers()[1], loss)
-        with torch.no_grad():
-            pairs = zip(self.target_value.parameters(), self.model.value_head.parameters(), strict=True)
-            for slow, fast in pairs:
-                slow.lerp_(fast, self.config.target_rate)
+        follow(self.target_value, self.model.value_head, self.config.target_rate)
         return parts
 
     def _optimizers(self) -> list[torch.optim.Optimizer]:
@@ -142,7 +138,7 @@ class Learner(lightning.LightningModule):
         discounts = self.discount * dream.continues
         returns = lambda_return(dream.rewards, discounts, values, config.lambda_)
         reach = torch.cat([torch.ones_like(discounts[:1]), discounts[:-1]]).cumprod(0).detach()
-        scale = self._return_scale(returns.detach())
+        scale = return_scale(self.return_range, returns.detach())
         actor = -(reach * (returns / scale + config.entropy_scale * dream.entropies)).mean()
         with self.model.trunk_precision(cache=False):
             imagined = value_loss(self.model.value_head, dream.features[:-1], returns, reach)
@@ -182,22 +178,5 @@ class Learner(lightning.LightningModule):
         targets = torch.cat([returns, torch.cat([returns, values[-1:]])[1 : len(predicted) + 1]])
         return value_loss(self.model.value_head, seen, targets, torch.ones_like(targets))
 
-    def _return_scale(self, returns: Tensor) -> Tensor:
-        """Spread of returns between their 5th and 95th percentile, smoothed from 0 on, at least 1.
-
-        Hafner et al. 2023, eq. 7.
-        """
-        flat = returns.flatten()
-        spread = torch.quantile(flat, 0.95) - torch.quantile(flat, 0.05)
-        self.return_range.lerp_(spread, RETURN_RANGE_RATE)
-        return self.return_range.clamp_min(1.0)
-
     def _descend(self, optimizer: torch.optim.Optimizer, loss: Tensor) -> Tensor:
-        optimizer.zero_grad(set_to_none=True)
-        loss.backward()
-        parameters = [parameter for group in optimizer.param_groups for parameter in group["params"]]
-        norm = torch.nn.utils.clip_grad_norm_(parameters, self.config.max_grad_norm)
-        if not torch.isfinite(norm):
-            raise FloatingPointError(f"the gradient is not finite at update {self.updates} (loss {loss.item()})")
-        optimizer.step()
-        return norm
+        return descend(optimizer, loss, self.config.max_grad_norm, self.updates)

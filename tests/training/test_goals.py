@@ -17,9 +17,10 @@ from latentplan.goals.box import box_degree, box_of
 from latentplan.goals.parser import parse_objective
 from latentplan.models import State, WorldModel
 from latentplan.replay import Replay, Rows
-from latentplan.training import learn_goals, resume_goals
+from latentplan.training import goals, learn_goals, resume_goals
 from latentplan.training.goal_run import GOALS_FILE, load_replay
 from latentplan.training.goals import Boxes, BoxSource, GoalLearner
+from latentplan.training.optimization import descend
 from latentplan.training.play import describe_box
 from latentplan.training.state import INTERRUPTED
 
@@ -111,14 +112,12 @@ def test_a_learning_that_was_cut_off_ends_with_the_same_agent(run, finished, tmp
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_who_is_asked_to_stop_finishes_the_update_in_work(run, finished, tmp_path, monkeypatch, number):
-    descend = GoalLearner._descend
-
-    def interrupted(self, loss):
-        if self.updates == 2:
+    def interrupted(optimizer, loss, max_norm, update):
+        if update == 2:
             os.kill(os.getpid(), number)
-        descend(self, loss)
+        return descend(optimizer, loss, max_norm, update)
 
-    monkeypatch.setattr(GoalLearner, "_descend", interrupted)
+    monkeypatch.setattr(goals, "descend", interrupted)
     before = signal.getsignal(number)
     result = learn_goals(run, tmp_path / "part", SETTINGS)
     assert result.exit_code == INTERRUPTED and read_info(tmp_path / "part")["goals"]["updates"] == 3
@@ -130,7 +129,7 @@ def test_who_is_asked_to_stop_finishes_the_update_in_work(run, finished, tmp_pat
 
 
 def test_the_imagined_worth_rises(run):
-    model, _, _ = load_model(run)
+    model, config, _ = load_model(run)
     model.requires_grad_(False)
     torch.manual_seed(0)
     model.add_goal_heads(16)
@@ -138,7 +137,7 @@ def test_the_imagined_worth_rises(run):
         model.probe_head.output.weight.normal_(std=2.0)
         model.dynamics.input.linear.weight[:, -1] *= 4.0
     settings = GoalsConfig(starts=64, horizon=4, learning_rate=1e-2, entropy_scale=0.0)
-    learner = GoalLearner(model, settings, 0.9, 2, load_replay(run / "resume" / "replay", model, "cpu"))
+    learner = GoalLearner(model, settings, config.learning, 0.9, 2, load_replay(run / "resume" / "replay", model))
     ends = torch.full((64, 2), -math.inf)
     low, high = torch.where(torch.tensor([False, True]), 2.0, ends), -ends  # to be fast, whatever the height
     learner.source.draw = lambda num, generator: Boxes(low, high, torch.arange(num) % ROWS)
@@ -146,7 +145,7 @@ def test_the_imagined_worth_rises(run):
     def judge():
         start, code = State(*(part.repeat(2, 1)[:64] for part in learner.beliefs)), model.goal_heads.encode(low, high)
         with torch.no_grad(), model.trunk_precision():
-            features, _ = learner._imagine(start, code, torch.Generator().manual_seed(7))
+            features, _ = learner.imagine(start, code, torch.Generator().manual_seed(7))
             return float(box_degree(low, high, model.goal_quantities(features[1:]), model.goal_scales).mean())
 
     before = judge()
@@ -156,12 +155,12 @@ def test_the_imagined_worth_rises(run):
 
 
 def test_what_is_broken_is_not_learned_from(run):
-    model, _, _ = load_model(run)
+    model, config, _ = load_model(run)
     model.requires_grad_(False)
     model.add_goal_heads(8)
     with torch.no_grad():
         model.goal_heads.actor.mlp.output.bias[0] = math.nan
-    learner = GoalLearner(model, SETTINGS, 0.9, 2, load_replay(run / "resume" / "replay", model, "cpu"))
+    learner = GoalLearner(model, SETTINGS, config.learning, 0.9, 2, load_replay(run / "resume" / "replay", model))
     with pytest.raises(FloatingPointError, match="not finite at update 0"):
         learner.update()
 
@@ -219,7 +218,7 @@ def test_an_agent_without_a_replay_plays_first(tiny, tmp_path):
     save_checkpoint(tmp_path / "agent", model, config, INFO | {"domain": "cartpole", "task": "swingup"})
     settings = GoalsConfig(**vars(SETTINGS) | {"updates": 1, "play_decisions": 500})
     learn_goals(tmp_path / "agent", tmp_path / "out", settings)
-    replay = load_replay(tmp_path / "out" / "replay", model, "cpu")
+    replay = load_replay(tmp_path / "out" / "replay", model)
     assert 500 <= len(replay) <= 550 and float(replay.labels.abs().sum()) > 0.0
     resumed = resume_goals(tmp_path / "out", updates=2)
     assert read_info(resumed.run_dir)["goals"]["updates"] == 2

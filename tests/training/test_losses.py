@@ -7,6 +7,7 @@ from latentplan.models import Gaussian, State, WorldModel, kl_divergence
 from latentplan.replay import Replay
 from latentplan.training.losses import imagine, imitation_loss, lambda_return, world_model_loss
 from latentplan.training.module import Learner
+from latentplan.training.optimization import return_scale
 
 
 @pytest.fixture
@@ -163,10 +164,10 @@ def test_the_entropy_is_that_of_a_gaussian(model):
 
 
 def test_the_scale_of_returns_is_at_least_one_and_follows_their_spread(learner):
-    assert learner._return_scale(torch.zeros(100)) == 1.0
+    assert return_scale(learner.return_range, torch.zeros(100)) == 1.0
     wide = torch.linspace(0.0, 1000.0, 101)  # a spread of 900
-    assert [learner._return_scale(wide).item() for _ in range(2)] == pytest.approx([9.0, 0.99 * 9.0 + 9.0])
-    assert [learner._return_scale(wide) for _ in range(1000)][-1].item() == pytest.approx(900.0, rel=1e-3)
+    assert [return_scale(learner.return_range, wide).item() for _ in range(2)] == pytest.approx([9.0, 0.99 * 9.0 + 9.0])
+    assert [return_scale(learner.return_range, wide) for _ in range(1000)][-1].item() == pytest.approx(900.0, rel=1e-3)
 
 
 def test_every_parameter_has_one_optimizer(learner):
