@@ -56,7 +56,7 @@ LAYERS = {
         {"lightning", "torch", "numpy", "einops", "rich", "tensorboard", "gymnasium", "yaml"},
     ),
     "compose": (("config",), {"jsonargparse", "yaml"}),
-    "setting_flags": (("config",), set()),
+    "setting_flags": (("config", "compose"), set()),
     "cli": None,
     "doctor": None,
     "evaluate": None,

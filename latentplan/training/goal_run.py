@@ -14,9 +14,10 @@ from typing import Any
 import torch
 
 from latentplan.checkpoint import INFO, load_model, read_info, resolve_checkpoint, save_checkpoint
-from latentplan.config import USER_DOMAIN, Config, GoalsConfig, UserError, derive_seed, make_folder, to_dict
+from latentplan.config import USER_DOMAIN, Config, GoalsConfig, UserError, derive_seed, to_dict
 from latentplan.models import WorldModel
 from latentplan.replay import Replay, read_saved
+from latentplan.training.claim import claim
 from latentplan.training.goals import GoalLearner
 from latentplan.training.play import play
 from latentplan.training.progress import StatusLine
@@ -48,8 +49,8 @@ def learn_goals(
     for name in (INFO, GOALS_FILE):
         if (folder / name).exists():
             raise UserError(f"{folder} already holds an agent: go on with --resume {folder}, or choose another --out")
-    make_folder(folder)
-    return _learn(Path(checkpoint), folder, settings or GoalsConfig(), device, None)
+    with claim(folder):
+        return _learn(Path(checkpoint), folder, settings or GoalsConfig(), device, None)
 
 
 def resume_goals(
@@ -74,7 +75,8 @@ def resume_goals(
         raise UserError(f"{saved['source']} is not the agent that {folder} began with")
     settings = GoalsConfig(**saved["settings"])
     settings = replace(settings, updates=updates or settings.updates, minutes=minutes or settings.minutes)
-    return _learn(Path(saved["run"]), Path(folder), settings, device, saved)
+    with claim(Path(folder)):
+        return _learn(Path(saved["run"]), Path(folder), settings, device, saved)
 
 
 def load_replay(path: Path, model: WorldModel) -> Replay:

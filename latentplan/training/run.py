@@ -22,6 +22,7 @@ from latentplan.envs import default_task
 from latentplan.models import WorldModel
 from latentplan.replay import Replay
 from latentplan.training.callbacks import Experience, Record, Save, Stop
+from latentplan.training.claim import claim
 from latentplan.training.collector import Description, EnvFactory
 from latentplan.training.curriculum import Curriculum
 from latentplan.training.data import ReplayBatches, ReplayData
@@ -79,9 +80,7 @@ def train(config: Config, make_env: EnvFactory | None = None) -> Result:
         config = replace(config, run=replace(config.run, run_dir=str(Path("runs") / name)))
     folder = Path(str(config.run.run_dir))
     if (folder / "config.yaml").exists():
-        raise UserError(
-            f"{folder} already holds a run: continue it with --resume {folder}, or choose another --run-dir"
-        )
+        raise UserError(f"{folder} already holds a run: continue with --resume {folder}, or choose another --run-dir")
     make_folder(folder)
     run = _Run(config, folder, make_env, resume=False)
     dump_config(config, folder / "config.yaml")
@@ -163,7 +162,8 @@ class _Run:
     def execute(self) -> Result:
         """Learn until the budget is spent, then evaluate."""
         try:
-            return self._execute()
+            with claim(self.folder):
+                return self._execute()
         finally:
             self.worker.close()
 

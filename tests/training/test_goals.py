@@ -18,6 +18,7 @@ from latentplan.goals.parser import parse_objective
 from latentplan.models import State, WorldModel
 from latentplan.replay import Replay, Rows
 from latentplan.training import goals, learn_goals, resume_goals
+from latentplan.training.claim import claim
 from latentplan.training.goal_run import GOALS_FILE, load_replay
 from latentplan.training.goals import Boxes, BoxSource, GoalLearner
 from latentplan.training.optimization import descend
@@ -199,6 +200,8 @@ def test_what_cannot_be_used_is_refused(run, finished, tiny, tmp_path):
     mine = tiny("", env={"domain": "user"})
     save_checkpoint(tmp_path / "mine", WorldModel(mine.model, 1, LABELS), mine, INFO)
     refused(lambda: learn_goals(tmp_path / "mine", tmp_path / "a"), "no replay", "the folder of its run")
+    with claim(finished.run_dir):
+        refused(lambda: resume_goals(finished.run_dir), "another process learns")
     refused(lambda: resume_goals(run), "nothing to resume", GOALS_FILE)
     unnamed = make_run(tmp_path / "unnamed", tiny(""), {})
     refused(lambda: learn_goals(unnamed, tmp_path / "b"), "without named quantities")

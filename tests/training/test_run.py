@@ -13,6 +13,7 @@ from latentplan.checkpoint import load_agent, read_info
 from latentplan.config import UserError
 from latentplan.training import resume, train
 from latentplan.training.callbacks import COLUMNS
+from latentplan.training.claim import claim
 from latentplan.training.run import INTERRUPTED
 
 
@@ -115,6 +116,8 @@ def test_another_seed_is_another_run(finished, tiny, dot, tmp_path):
 def test_a_folder_holds_one_run(finished, tiny, dot):
     with pytest.raises(UserError, match="already holds a run"):
         train(tiny(finished.run_dir), dot)
+    with claim(finished.run_dir), pytest.raises(UserError, match="another process learns"):
+        resume(finished.run_dir, make_env=dot)
 
 
 def test_a_run_needs_an_end(tiny, dot, tmp_path):

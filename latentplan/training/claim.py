@@ -1,0 +1,38 @@
+"""One learning in one folder at a time: two that save to the same files would ruin both."""
+
+from __future__ import annotations
+
+import contextlib
+import fcntl
+import os
+from collections.abc import Iterator
+from pathlib import Path
+
+from latentplan.config import UserError, make_folder
+
+LOCK = ".lock"
+
+
+@contextlib.contextmanager
+def claim(folder: Path) -> Iterator[None]:
+    """Make a folder where needed and hold it against every other claim; let go at the end, however the process ends.
+
+    A file system that knows no locks is trusted.
+
+    Raises:
+        UserError: Another process learns there, or the folder cannot be made.
+    """
+    make_folder(folder)
+    try:
+        lock = os.open(folder / LOCK, os.O_RDWR | os.O_CREAT, 0o666)
+    except OSError as error:
+        raise UserError(f"cannot write to {folder}: {error.strerror}; choose another") from None
+    try:
+        with contextlib.suppress(OSError):
+            try:
+                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:
+                raise UserError(f"another process learns in {folder}: end it first, or choose another folder") from None
+        yield
+    finally:
+        os.close(lock)
