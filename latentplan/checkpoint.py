@@ -10,7 +10,7 @@ from typing import Any
 
 import torch
 from safetensors import SafetensorError
-from safetensors.torch import load_file, save_file
+from safetensors.torch import load_file, save
 
 from latentplan.agent import ActorAgent, Agent, PlanningAgent, RandomAgent
 from latentplan.background import BackgroundAgent
@@ -51,12 +51,13 @@ def save_checkpoint(folder: Path, model: WorldModel, config: Config, info: dict[
     state = {name: value.detach().cpu().half().contiguous() for name, value in model.state_dict().items()}
     if broken := _not_finite(state):
         raise FloatingPointError(f"{broken} is not finite in float16: {folder} is left as it was")
-    save_file(state, part)
-    digest = hashlib.sha256(part.read_bytes()).hexdigest()
+    content = save(state)
+    part.write_bytes(content)
+    digest = hashlib.sha256(content).hexdigest()
     sizes = {"action_dim": model.action_dim, "labels": model.labels, "goal_dim": model.goal_dim}
     facts = info | sizes | {"config": to_dict(config), "sha256": digest}
     part.replace(folder / WEIGHTS)
-    (folder / f"{INFO}.part").write_text(json.dumps(facts, indent=1))
+    (folder / f"{INFO}.part").write_text(json.dumps(facts, indent=1) + "\n")
     (folder / f"{INFO}.part").replace(folder / INFO)
 
 

@@ -87,6 +87,11 @@ def test_saving_twice_replaces_the_first(model, folder):
     load_model(folder)
 
 
+def test_whoever_may_read_the_description_may_read_the_weights(folder):
+    assert len({oct(path.stat().st_mode) for path in folder.iterdir()}) == 1
+    assert (folder / "info.json").read_text().endswith("}\n")
+
+
 def test_a_run_folder_means_its_best_agent_or_else_its_last(model, tmp_path):
     save_checkpoint(tmp_path / "checkpoints" / "last", model, CONFIG, INFO | {"env_frames": 2})
     assert read_info(tmp_path)["env_frames"] == 2
