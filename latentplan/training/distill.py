@@ -23,8 +23,9 @@ from latentplan.config import DistillConfig, PlannerConfig, UserError, derive_se
 from latentplan.envs import make_env, make_from
 from latentplan.models import Gaussian, State
 from latentplan.rollout import OnStep, Step, episode_seed, iterate_episodes
+from latentplan.training.claim import claim
 from latentplan.training.collector import EnvFactory
-from latentplan.training.comparison import describe_distillation, describe_mean
+from latentplan.training.comparison import Comparison, describe_mean
 from latentplan.training.demonstrations import Demonstrations, first_actions, plan_actions
 from latentplan.training.progress import StatusLine
 from latentplan.training.run import Result
@@ -55,7 +56,7 @@ def distill(
         make_env: The user's environment, as given to `train`; None takes the suite's task it was trained on.
 
     Returns:
-        Where the agent lies, and mean returns on the same starts: `before`, `after`, `planner`.
+        Where the agent lies, and mean returns on the same starts: `before`, `after`, `planner`, `planner_after`.
 
     Raises:
         UserError: The checkpoint, the folder or a setting cannot be used.
@@ -130,7 +131,7 @@ class _Distillation:
         """Go through what is left of the rounds, then compare; an interrupted run says how to go on."""
         standing = self.standing
         try:
-            with self.line:
+            with claim(self.folder), self.line:
                 if not standing.planner:
                     self._begin()
                 while not self._is_spent():
@@ -216,29 +217,28 @@ class _Distillation:
         )
 
     def _finish(self) -> dict[str, float]:
-        """Judge the best actor on starts that chose nothing, and keep it only if it earns more there too."""
+        """Judge the best actor on starts that chose nothing, and keep it only if it is better there too."""
         standing = self.standing
-        after: list[float] | None = None
+        found = Comparison(standing.before, standing.planner)
         if standing.best_round != START:
             self.model.actor.load_state_dict(self.best)
             after = self._play(self.acting, "judge", "judging the best actor")
-        kept = standing.before if after is None or np.mean(after) <= np.mean(standing.before) else after
-        is_better = kept is after
-        self.model.actor.load_state_dict(self.best if is_better else self.start)
-        returns = {"before": standing.before, "after": kept, "planner": standing.planner}
+            found = replace(found, after=after, planner_after=self._play(self.planning, "judge", "the planner with it"))
+        self.model.actor.load_state_dict(self.best if found.is_better else self.start)
+        kept = found if found.is_better else Comparison(found.before, found.planner, found.before, found.planner)
+        returns = asdict(kept)
         facts = {
             "rounds": standing.stage // len(STAGES),
             "decisions": standing.decisions,
-            "kept_round": standing.best_round + 1 if is_better else None,
+            "kept_round": standing.best_round + 1 if found.is_better else None,
             **{f"returns_{name}": values for name, values in returns.items()},
             "settings": to_dict(self.settings),
             "planner": to_dict(self.planner_config),
             "from_sha256": self.info["sha256"],
         }
         save_checkpoint(self.folder, self.model, self.config, self.info | {"distilled": facts})
-        for line in describe_distillation(standing.before, after, standing.planner, standing.best_round + 1):
+        for line in [*found.describe(standing.best_round + 1), f"agent: {self.folder}"]:
             self.line.print(line)
-        self.line.print(f"agent: {self.folder}")
         return {name: float(np.mean(values)) for name, values in returns.items()}
 
     def _play(

@@ -12,7 +12,8 @@ from latentplan.checkpoint import load_agent, load_model, read_info, save_checkp
 from latentplan.config import DistillConfig, PlannerConfig, UserError
 from latentplan.models import Gaussian, State, WorldModel
 from latentplan.training import distill, resume_distillation
-from latentplan.training.comparison import describe_distillation
+from latentplan.training.claim import claim
+from latentplan.training.comparison import Comparison
 from latentplan.training.demonstrations import Demonstrations, plan_actions
 from latentplan.training.standing import STATE_FILE
 from latentplan.training.state import INTERRUPTED
@@ -94,6 +95,7 @@ def test_the_result_is_a_checkpoint_that_keeps_what_was_known(finished, checkpoi
     assert distilled["kept_round"] in (1, 2, 3) and distilled["from_sha256"] == start["sha256"]
     assert np.mean(distilled["returns_after"]) == finished.summary["after"]
     assert np.mean(distilled["returns_before"]) == finished.summary["before"]
+    assert np.mean(distilled["returns_planner_after"]) == finished.summary["planner_after"]
     assert load_agent(finished.run_dir, mode="actor").act(np.zeros((64, 64, 3), np.uint8)).shape == (1,)
 
 
@@ -177,6 +179,8 @@ def test_folders_that_do_not_fit_are_refused(finished, checkpoint, push, tmp_pat
         distill(checkpoint, finished.run_dir, SETTINGS, make_env=push)
     with pytest.raises(UserError, match="nothing to resume"):
         resume_distillation(tmp_path)
+    with claim(tmp_path / "held"), pytest.raises(UserError, match="another process learns"):
+        distill(checkpoint, tmp_path / "held", SETTINGS, make_env=push)
     (tmp_path / "resume").mkdir()
     (tmp_path / "resume" / "distill.pt").write_bytes((finished.run_dir / "resume" / "distill.pt").read_bytes()[:-100])
     with pytest.raises(UserError, match=r"distill\.pt is damaged"):
@@ -237,15 +241,18 @@ def test_labels_that_are_not_finite_stop_learning(model):
 
 
 @pytest.mark.parametrize(
-    ("after", "words"),
+    ("after", "planner_after", "words"),
     [
-        (None, ["no round improved", "unchanged"]),
-        ([5.0, 6.0, 7.0], ["but not here", "unchanged", "-5.0"]),
-        ([15.0, 16.0, 18.0], ["kept: the actor of round 4"]),
-        ([9.0, 12.0, 16.0], ["kept: the actor of round 4", "holds 0"]),
+        (None, None, ["no round improved", "unchanged"]),
+        ([5.0, 6.0, 7.0], [25.0, 20.0, 21.0], ["but not here", "unchanged", "-5.0"]),
+        ([15.0, 16.0, 18.0], [20.0, 19.0, 21.0], ["kept: the actor of round 4"]),
+        ([9.0, 12.0, 16.0], [20.0, 20.0, 21.0], ["kept: the actor of round 4", "holds 0"]),
+        ([15.0, 16.0, 18.0], [10.0, 10.0, 21.0], ["loses more", "unchanged", "+5.3", "-6.7"]),
     ],
 )
-def test_the_verdict_follows_from_paired_returns(after, words):
-    text = "\n".join(describe_distillation([10.0, 11.0, 12.0], after, [20.0, 20.0, 21.0], 4))
+def test_the_verdict_follows_from_paired_returns(after, planner_after, words):
+    found = Comparison([10.0, 11.0, 12.0], [20.0, 20.0, 21.0], after, planner_after)
+    text = "\n".join(found.describe(4))
     assert all(word in text for word in words), text
     assert ("holds 0" in text) == ("holds 0" in words)
+    assert found.is_better == ("kept: the actor of round 4" in words)
