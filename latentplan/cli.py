@@ -25,7 +25,7 @@ from latentplan.compose import (
     read_layer,
     settings_parser,
 )
-from latentplan.config import Config, UserError
+from latentplan.config import MAX_THREADS, Config, UserError
 
 COMMANDS = ("train", "eval", "distill", "goals", "export", "doctor")
 RESUMABLE = ("--frames", "--minutes", "--device")
@@ -48,7 +48,6 @@ EXPORT_FLAGS = {
     "--out": ("FILE", "the file to write"),
     "--format": ("pt2|onnx", "program of torch.export, or ONNX where onnx and onnxscript are installed (pt2)"),
 }
-MAX_THREADS = 1024
 METAVARS = {"--frames": "N", "--minutes": "M", "--run-dir": "DIR", "--resume": "DIR", "--config": "FILE"}
 
 

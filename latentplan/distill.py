@@ -8,47 +8,38 @@ from __future__ import annotations
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
-from datetime import datetime
-from pathlib import Path
 from typing import Any
 
 from latentplan.cli import read_flags, run_guarded, use_device
-from latentplan.compose import build_config, field_names, raise_unknown
-from latentplan.config import DEVICES, DistillConfig, PlannerConfig, UserError, from_dict, to_dict
+from latentplan.compose import build_config, field_names
+from latentplan.config import DistillConfig, PlannerConfig, UserError, from_dict, to_dict
 from latentplan.config.planner import override_planner
-from latentplan.setting_flags import describe_settings, read_settings, read_threads, setting_kinds
+from latentplan.setting_flags import (
+    COMMON_FLAGS,
+    LearningRequest,
+    describe_settings,
+    name_folder,
+    read_request,
+    setting_kinds,
+)
 
 FLAGS = {
     "--checkpoint": ("DIR", "folder of a trained agent, or of a run (its best checkpoint)"),
     "--out": ("DIR", "folder of the distilled agent (runs/distilled-<domain>-<task>-<date>)"),
-    "--resume": ("DIR", "continue the distillation in this folder"),
-    "--device": ("|".join(DEVICES), "where the agent computes (auto: cuda where usable)"),
-    "--threads": ("N", "CPU threads (torch's own choice)"),
+    **COMMON_FLAGS,
 }
 RESUMABLE = ("--rounds", "--minutes", "--device", "--threads")
 
 
 @dataclass(frozen=True)
-class DistillRequest:
+class DistillRequest(LearningRequest):
     """What the command line asks for.
 
     Attributes:
-        checkpoint: Folder of the agent to begin with; None when a distillation resumes.
-        out: Where the distilled agent goes, or None for a folder of its own under `runs`.
-        resume: Folder of the distillation to continue, or None.
-        settings: Fields of `DistillConfig` that were given.
         planner: Planner settings that replace the agent's, as they were typed.
-        device: `auto`, `cpu` or `cuda`.
-        threads: CPU threads, or None to leave it to torch.
     """
 
-    checkpoint: Path | None
-    out: Path | None
-    resume: Path | None
-    settings: dict[str, Any]
     planner: dict[str, str]
-    device: str
-    threads: int | None
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -65,26 +56,9 @@ def parse_arguments(argv: Sequence[str]) -> DistillRequest:
     kinds = setting_kinds(DistillConfig)
     searches = [f"--planner.{name}" for name in field_names("planner")]
     flags = read_flags(argv, [*FLAGS, *kinds, *searches])
-    if "--resume" in flags:
-        for flag in flags:
-            if flag not in ("--resume", *RESUMABLE):
-                raise UserError(f"{flag} cannot be given with --resume; only {', '.join(RESUMABLE)} can")
-    elif "--checkpoint" not in flags:
-        raise UserError("flag --checkpoint is missing; give the folder of a trained agent or of a run")
-    device = flags.get("--device", "auto")
-    if device not in DEVICES:
-        raise_unknown("device", device, DEVICES)
-    settings = read_settings(DistillConfig, flags)
-    paths = {
-        name: Path(flags[f"--{name}"]) if f"--{name}" in flags else None for name in ("checkpoint", "out", "resume")
-    }
-    return DistillRequest(
-        **paths,
-        settings=settings,
-        planner={flag.removeprefix("--planner."): flags[flag] for flag in searches if flag in flags},
-        device=device,
-        threads=read_threads(flags),
-    )
+    request = read_request(DistillConfig, flags, RESUMABLE)
+    planner = {flag.removeprefix("--planner."): flags[flag] for flag in searches if flag in flags}
+    return DistillRequest(**vars(request), planner=planner)
 
 
 def _distill(argv: Sequence[str]) -> int:
@@ -102,8 +76,7 @@ def _distill(argv: Sequence[str]) -> int:
     if request.resume is not None:
         return resume_distillation(request.resume, device=device, **request.settings).exit_code
     assert request.checkpoint is not None
-    stamp = datetime.now().strftime("%Y%m%d-%H%M%S")
-    out = request.out or Path("runs") / f"distilled-{info['domain']}-{info['task']}-{stamp}"
+    out = request.out or name_folder("distilled", info)
     settings = DistillConfig(**request.settings)
     return distill(request.checkpoint, out, settings, planner=planner, device=device).exit_code
 

@@ -237,7 +237,8 @@ class Replay:
         held = np.minimum(self.written, self.lane_size)
         oldest = self.written - held
         lanes, starts = np.empty(0, np.int64), np.empty(0, np.int64)
-        too_short = f"no episode in replay has sequence_length ({length}) decisions: lower --learning.sequence_length"
+        advice = "raise --replay.capacity" if self.lane_size <= length else "lower --learning.sequence_length"
+        too_short = f"no episode in replay has sequence_length ({length}) decisions: {advice}"
         if held.max() <= length:
             raise UserError(too_short)
         for _ in range(SAMPLING_ROUNDS):

@@ -1,14 +1,76 @@
-"""Flags made of the fields of a dataclass of settings, whose docstring tells what they mean."""
+"""Flags made of a dataclass of settings, and what commands that teach a trained agent ask with them."""
 
 from __future__ import annotations
 
 import dataclasses
 import math
 import typing
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from datetime import datetime
+from pathlib import Path
 from typing import Any
 
-from latentplan.config import UserError
+from latentplan.compose import raise_unknown
+from latentplan.config import DEVICES, UserError
+
+COMMON_FLAGS = {
+    "--resume": ("DIR", "go on with the learning in this folder"),
+    "--device": ("|".join(DEVICES), "where the agent computes (auto: cuda where usable)"),
+    "--threads": ("N", "CPU threads (torch's own choice)"),
+}
+
+
+@dataclass(frozen=True)
+class LearningRequest:
+    """What the command line of teaching a trained agent asks for.
+
+    Attributes:
+        checkpoint: Folder of the agent to begin with; None when a learning resumes.
+        out: Where the agent that has learned goes, or None for a folder of its own under `runs`.
+        resume: Folder of the learning to go on with, or None.
+        settings: Fields of the dataclass of settings that were given.
+        device: `auto`, `cpu` or `cuda`.
+        threads: CPU threads, or None to leave it to torch.
+    """
+
+    checkpoint: Path | None
+    out: Path | None
+    resume: Path | None
+    settings: dict[str, Any]
+    device: str
+    threads: int | None
+
+
+def read_request(settings: type, flags: Mapping[str, str], resumable: Sequence[str]) -> LearningRequest:
+    """The request that flags make.
+
+    Args:
+        settings: The dataclass of settings.
+        flags: By name, as they were typed.
+        resumable: Those that may be given with `--resume`.
+
+    Raises:
+        UserError: A flag or value is wrong; the message says what to give.
+    """
+    if "--resume" in flags:
+        for flag in flags:
+            if flag not in ("--resume", *resumable):
+                raise UserError(f"{flag} cannot be given with --resume; only {', '.join(resumable)} can")
+    elif "--checkpoint" not in flags:
+        raise UserError("flag --checkpoint is missing; give the folder of a trained agent or of a run")
+    device = flags.get("--device", "auto")
+    if device not in DEVICES:
+        raise_unknown("device", device, DEVICES)
+    checkpoint, out, resume = (
+        Path(flags[flag]) if flag in flags else None for flag in ("--checkpoint", "--out", "--resume")
+    )
+    return LearningRequest(checkpoint, out, resume, read_settings(settings, flags), device, read_threads(flags))
+
+
+def name_folder(kind: str, info: Mapping[str, Any]) -> Path:
+    """A folder under `runs` for what an agent becomes: `runs/<kind>-<domain>-<task>-<date>`."""
+    return Path("runs") / f"{kind}-{info['domain']}-{info['task']}-{datetime.now():%Y%m%d-%H%M%S}"
 
 
 def setting_kinds(settings: type) -> dict[str, type]:

@@ -60,6 +60,7 @@ def test_unknown_settings_are_named():
         (LearningConfig, "discount", 1.5),
         (LearningConfig, "model_learning_rate", float("nan")),
         (RunConfig, "frames", -1),
+        (RunConfig, "threads", 999_999),
         (ModelConfig, "encoder_channels", ()),
     ],
 )

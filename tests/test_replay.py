@@ -251,6 +251,11 @@ def test_too_short_episodes_are_named(lengths):
         sample(replay, length=5)
 
 
+def test_a_replay_too_small_for_a_sequence_says_so():
+    with pytest.raises(UserError, match="raise --replay.capacity"):
+        sample(filled(lengths=(9,), capacity=4), length=5)
+
+
 def test_an_episode_of_the_sequence_length_is_long_enough():
     assert_aligned(sample(filled(lengths=(2, 5, 3)), length=5))
 

@@ -10,7 +10,16 @@ import dataclasses
 from dataclasses import dataclass, field
 from typing import Any
 
-from latentplan.config.checks import UserError, above_zero, at_least, derive_seed, make_folder, one_of
+from latentplan.config.checks import (
+    MAX_THREADS,
+    UserError,
+    above_zero,
+    at_least,
+    derive_seed,
+    make_folder,
+    one_of,
+    within,
+)
 from latentplan.config.distill import DistillConfig
 from latentplan.config.goals import GoalsConfig
 from latentplan.config.learning import CollectionConfig, LearningConfig
@@ -24,6 +33,7 @@ __all__ = [
     "EvaluationConfig",
     "GoalsConfig",
     "LearningConfig",
+    "MAX_THREADS",
     "ModelConfig",
     "PlannerConfig",
     "ReplayConfig",
@@ -145,7 +155,7 @@ class RunConfig:
         minutes: Minutes of wall clock to train for; None leaves it to `frames`.
         seed: Seed of every random stream of the run.
         device: `auto`, `cpu` or `cuda`.
-        threads: CPU threads for learning; None takes every core but the one that collects.
+        threads: CPU threads for learning, in [1, 1024]; None takes every core but the one that collects.
         run_dir: Folder of the run; None makes `runs/<domain>-<task>-<date>`.
     """
 
@@ -159,7 +169,9 @@ class RunConfig:
     def __post_init__(self) -> None:
         one_of(self, device=DEVICES)
         at_least(self, seed=0)
-        above_zero(self, "frames", "minutes", "threads")
+        above_zero(self, "frames", "minutes")
+        if self.threads is not None:
+            within(self, threads=(1, MAX_THREADS))
 
 
 @dataclass(frozen=True)

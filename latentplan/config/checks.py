@@ -6,6 +6,8 @@ import hashlib
 from pathlib import Path
 from typing import Any
 
+MAX_THREADS = 1024  # more are refused before they exhaust the machine
+
 
 class UserError(ValueError):
     """Something the user gave cannot work; the message is one line that says what to give instead."""
