@@ -7,6 +7,7 @@ import pytest
 
 from latentplan.compose import compose
 from latentplan.config import (
+    CollectionConfig,
     Config,
     EnvConfig,
     LearningConfig,
@@ -67,6 +68,12 @@ def test_unknown_settings_are_named():
 def test_a_bad_value_names_its_field(kind, name, value):
     with pytest.raises(ValueError, match=name):
         kind(**{name: value})
+
+
+def test_episodes_too_short_to_learn_from_are_refused():
+    Config(collection=CollectionConfig(episode_decisions=16))
+    with pytest.raises(ValueError, match=r"episode_decisions \(15\) must be at least 16, learning.sequence_length"):
+        Config(collection=CollectionConfig(episode_decisions=15))
 
 
 def test_settings_cannot_be_written_to():

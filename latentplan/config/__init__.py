@@ -176,7 +176,11 @@ class RunConfig:
 
 @dataclass(frozen=True)
 class Config:
-    """Everything that defines a run."""
+    """Everything that defines a run.
+
+    Raises:
+        UserError: Episodes cut while collecting would be too short to learn from.
+    """
 
     env: EnvConfig = field(default_factory=EnvConfig)
     model: ModelConfig = field(default_factory=ModelConfig)
@@ -186,6 +190,11 @@ class Config:
     replay: ReplayConfig = field(default_factory=ReplayConfig)
     evaluation: EvaluationConfig = field(default_factory=EvaluationConfig)
     run: RunConfig = field(default_factory=RunConfig)
+
+    def __post_init__(self) -> None:
+        cut, length = self.collection.episode_decisions, self.learning.sequence_length
+        if cut is not None and cut < length:
+            raise UserError(f"collection.episode_decisions ({cut}) must be at least {length}, learning.sequence_length")
 
 
 def to_dict(config: Any) -> dict[str, Any]:

@@ -38,7 +38,7 @@ class Comparison:
 
     @property
     def is_better(self) -> bool:
-        """Whether the chosen actor earns more, and no less than what the planner loses by it."""
+        """Whether the chosen actor earns more, and more than what the planner loses by it."""
         if self.after is None or self.planner_after is None:
             return False
         gain = np.mean(self.after) - np.mean(self.before)

@@ -70,12 +70,12 @@ def resume_goals(
     path = Path(folder) / GOALS_FILE
     if not path.exists():
         raise UserError(f"nothing to resume in {folder}: {path} is missing")
-    saved = read_saved(path)
-    if read_info(saved["source"])["sha256"] != saved["sha256"]:
-        raise UserError(f"{saved['source']} is not the agent that {folder} began with")
-    settings = GoalsConfig(**saved["settings"])
-    settings = replace(settings, updates=updates or settings.updates, minutes=minutes or settings.minutes)
     with claim(Path(folder)):
+        saved = read_saved(path)
+        if read_info(saved["source"])["sha256"] != saved["sha256"]:
+            raise UserError(f"{saved['source']} is not the agent that {folder} began with")
+        settings = GoalsConfig(**saved["settings"])
+        settings = replace(settings, updates=updates or settings.updates, minutes=minutes or settings.minutes)
         return _learn(Path(saved["run"]), Path(folder), settings, device, saved)
 
 

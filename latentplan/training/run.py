@@ -17,7 +17,7 @@ import torch
 from lightning.pytorch.loggers import TensorBoardLogger
 
 from latentplan.compose import dump_config, read_config
-from latentplan.config import USER_DOMAIN, Config, RunConfig, UserError, derive_seed, make_folder
+from latentplan.config import USER_DOMAIN, Config, RunConfig, UserError, derive_seed
 from latentplan.envs import default_task
 from latentplan.models import WorldModel
 from latentplan.replay import Replay
@@ -81,10 +81,10 @@ def train(config: Config, make_env: EnvFactory | None = None) -> Result:
     folder = Path(str(config.run.run_dir))
     if (folder / "config.yaml").exists():
         raise UserError(f"{folder} already holds a run: continue with --resume {folder}, or choose another --run-dir")
-    make_folder(folder)
-    run = _Run(config, folder, make_env, resume=False)
-    dump_config(config, folder / "config.yaml")
-    return run.execute()
+    with claim(folder):
+        run = _Run(config, folder, make_env, resume=False)
+        dump_config(config, folder / "config.yaml")
+        return run.execute()
 
 
 def resume(
@@ -118,7 +118,8 @@ def resume(
         run = replace(run, frames=frames, minutes=minutes)
     if device is not None:
         run = replace(run, device=device)
-    return _Run(replace(config, run=run), folder, make_env, resume=True).execute()
+    with claim(folder):
+        return _Run(replace(config, run=run), folder, make_env, resume=True).execute()
 
 
 class _Run:
@@ -162,8 +163,7 @@ class _Run:
     def execute(self) -> Result:
         """Learn until the budget is spent, then evaluate."""
         try:
-            with claim(self.folder):
-                return self._execute()
+            return self._execute()
         finally:
             self.worker.close()
 

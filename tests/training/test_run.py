@@ -113,11 +113,14 @@ def test_another_seed_is_another_run(finished, tiny, dot, tmp_path):
     assert without_minutes(other.run_dir)[0] != without_minutes(finished.run_dir)[0]
 
 
-def test_a_folder_holds_one_run(finished, tiny, dot):
+def test_a_folder_holds_one_run(finished, tiny, dot, tmp_path):
     with pytest.raises(UserError, match="already holds a run"):
         train(tiny(finished.run_dir), dot)
     with claim(finished.run_dir), pytest.raises(UserError, match="another process learns"):
         resume(finished.run_dir, make_env=dot)
+    with claim(tmp_path), pytest.raises(UserError, match="another process learns"):
+        train(tiny(tmp_path), dot)
+    assert not (tmp_path / "config.yaml").exists()
 
 
 def test_a_run_needs_an_end(tiny, dot, tmp_path):
