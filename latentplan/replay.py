@@ -141,7 +141,11 @@ class Replay:
         self.written[lane] += count
 
     def sample(self, batch_size: int, sequence_length: int, rng: np.random.Generator) -> Batch:
-        """Uniformly drawn sequences, each within one episode.
+        """Uniformly drawn sequences, each within one episode; `draw` and `gather` in one."""
+        return self.gather(self.draw(batch_size, sequence_length, rng))
+
+    def draw(self, batch_size: int, sequence_length: int, rng: np.random.Generator) -> Tensor:
+        """Where uniformly drawn sequences live, each within one episode: rows (batch, time + 1).
 
         Raises:
             UserError: No episode is long enough.
@@ -149,7 +153,10 @@ class Replay:
         lanes, starts = self._draw_starts(batch_size, sequence_length, rng)
         steps = np.arange(sequence_length + 1)
         positions = (starts[:, None] + steps) % self.lane_size + (lanes * self.lane_size)[:, None]
-        rows = torch.as_tensor(positions, device=self.device)
+        return torch.as_tensor(positions, device=self.device)
+
+    def gather(self, rows: Tensor) -> Batch:
+        """The sequences that live at rows (batch, time + 1); reads nothing back from the device."""
         acted = rows[:, :-1]
         return Batch(
             frames=self.frames[rows],
@@ -162,16 +169,18 @@ class Replay:
             plan=self.plan[acted],
         )
 
-    def refresh(self, rows: Tensor, deter: Tensor) -> None:
+    def refresh(self, rows: Tensor, deter: Tensor, chosen: Tensor) -> None:
         """Replace the stored beliefs at rows (batch, time) with newer ones (batch, time, deter).
 
-        Where a row occurs more than once, its last occurrence counts.
+        Only the sequences `chosen`, bool (batch,), are read. Where a row occurs in several, the last one counts.
         """
         index = rows.flatten().to(self.device)
-        # Every occurrence writes the value of the last one: parallel writes to one place have no order.
-        in_order, order = index.sort(stable=True)
-        last = order[torch.searchsorted(in_order, index, right=True) - 1]
-        self.deter[index] = deter.flatten(0, 1).to(self.deter)[last]
+        is_chosen = chosen.to(self.device).repeat_interleave(rows.shape[1])
+        # Every occurrence writes the value of the last one chosen: parallel writes to one place have no order.
+        in_order, order = (2 * index + is_chosen).sort(stable=True)
+        last = order[torch.searchsorted(in_order, 2 * index + 1, right=True) - 1]
+        newer = deter.flatten(0, 1).to(self.deter)[last]
+        self.deter[index] = torch.where(is_chosen[last, None], newer, self.deter[index])
 
     def save(self, folder: Path) -> None:
         """Write what is new since the last save; `load` restores exactly what the last whole save held.

@@ -77,6 +77,7 @@ def assert_aligned(batch):
     assert torch.equal(batch.deter[:, 0], time[:, 0])
 
 
+EVERY = torch.ones(64, dtype=torch.bool)
 RINGS = [
     pytest.param({}, id="one lane"),
     pytest.param({"capacity": 120, "lanes": 3}, id="three lanes"),
@@ -144,7 +145,7 @@ def test_refreshed_beliefs_go_back_to_where_the_batch_came_from():
     replay = filled(capacity=40, lanes=2, lengths=(7, 4, 9, 6))
     batch = sample(replay)
     time, episode, lane = told(batch)
-    replay.refresh(batch.rows, torch.stack([time * 2.0, episode + 100.0 * lane], -1))
+    replay.refresh(batch.rows, torch.stack([time * 2.0, episode + 100.0 * lane], -1), EVERY[: len(batch.rows)])
     again = sample(replay, seed=1)
     time, episode, lane = (part[:, 0] for part in told(again))
     refreshed = torch.isin(again.rows[:, 0], batch.rows)
@@ -157,8 +158,19 @@ def test_refreshed_beliefs_go_back_to_where_the_batch_came_from():
 def test_where_a_row_is_refreshed_twice_the_last_counts():
     replay = filled()
     deter = torch.arange(12.0).reshape(2, 3, 2)
-    replay.refresh(torch.tensor([[4, 5, 4], [6, 4, 5]]), deter)
+    replay.refresh(torch.tensor([[4, 5, 4], [6, 4, 5]]), deter, EVERY[:2])
     assert replay.deter[4:7].tolist() == [[8.0, 9.0], [10.0, 11.0], [6.0, 7.0]]
+
+
+@pytest.mark.parametrize("chosen", [(True, False), (False, True), (False, False)])
+def test_what_is_not_chosen_is_not_refreshed_even_where_it_comes_last(chosen):
+    replay = filled()
+    before = replay.deter.clone()
+    rows, deter = torch.tensor([[4, 5, 6], [5, 6, 7]]), torch.arange(12.0).reshape(2, 3, 2)
+    replay.refresh(rows, deter, torch.tensor(chosen))
+    for row in range(len(before)):
+        written = [deter[s, t] for s in range(2) for t in range(3) if chosen[s] and rows[s, t] == row]
+        assert torch.equal(replay.deter[row].float(), written[-1] if written else before[row].float())
 
 
 def assert_same(left, right):

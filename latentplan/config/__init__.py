@@ -179,7 +179,7 @@ class Config:
     """Everything that defines a run.
 
     Raises:
-        UserError: Episodes cut while collecting would be too short to learn from.
+        UserError: Episodes cut while collecting would be too short, or a CUDA graph could not reach the replay.
     """
 
     env: EnvConfig = field(default_factory=EnvConfig)
@@ -195,6 +195,8 @@ class Config:
         cut, length = self.collection.episode_decisions, self.learning.sequence_length
         if cut is not None and cut < length:
             raise UserError(f"collection.episode_decisions ({cut}) must be at least {length}, learning.sequence_length")
+        if self.learning.cuda_graph and not self.replay.on_device:
+            raise UserError("learning.cuda_graph needs replay.on_device: a graph gathers its sequences itself")
 
 
 def to_dict(config: Any) -> dict[str, Any]:

@@ -27,7 +27,7 @@ class Curriculum(lightning.Callback):
 
     Args:
         config: Settings of the run: which task comes first, and for how many simulator frames. Nothing is replaced when
-            that is the run's own task, or when the run has an objective in a task's place.
+            that is the run's own task; a run with an objective has none.
         labels: Names of the quantities that come with each frame, in their order.
         state: Clocks of the run.
 
@@ -43,7 +43,8 @@ class Curriculum(lightning.Callback):
         self._frames, self._repeat = config.learning.curriculum_frames, config.env.action_repeat
         self._column, self.note = None, ""
         first = config.learning.curriculum_task
-        if self._frames > 0 and first not in (None, config.env.task) and config.env.objective is None:
+        own = config.env.task if config.env.objective is None else None
+        if self._frames > 0 and first not in (None, own):
             tasks = [name.removeprefix(TASK_PREFIX) for name in labels if name.startswith(TASK_PREFIX)]
             if first not in tasks:
                 raise UserError(

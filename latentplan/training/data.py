@@ -6,16 +6,20 @@ from collections.abc import Iterator
 
 import lightning
 import numpy as np
+from torch import Tensor
 from torch.utils.data import DataLoader, IterableDataset
 
 from latentplan.config import Config, derive_seed
 from latentplan.replay import Batch, Replay
 from latentplan.training.curriculum import Curriculum
+from latentplan.training.graphed import GraphedLearner
 from latentplan.training.module import Learner
 
 
-class ReplayBatches(IterableDataset[Batch]):
+class ReplayBatches(IterableDataset[Batch | Tensor]):
     """The updates of one epoch: reads replay, so that nothing is fetched past a collection.
+
+    Sequences, or no more than the rows where they live, for a learner that gathers them itself.
 
     Args:
         replay: Where sequences are drawn from.
@@ -32,13 +36,14 @@ class ReplayBatches(IterableDataset[Batch]):
         """Updates per epoch."""
         return self.length
 
-    def __iter__(self) -> Iterator[Batch]:
+    def __iter__(self) -> Iterator[Batch | Tensor]:
         """Draw the batches of this epoch, each when it is asked for."""
         learning = self.config.learning
         rng = np.random.default_rng(derive_seed(self.config.run.seed, "batches", self.learner.updates))
         for _ in range(self.length):
-            batch = self.replay.sample(learning.batch_size, learning.sequence_length, rng)
-            yield self.curriculum(batch)
+            rows = self.replay.draw(learning.batch_size, learning.sequence_length, rng)
+            gathers = isinstance(self.learner, GraphedLearner)
+            yield rows if gathers else self.curriculum(self.replay.gather(rows))
 
 
 class ReplayData(lightning.LightningDataModule):
@@ -48,6 +53,6 @@ class ReplayData(lightning.LightningDataModule):
         super().__init__()
         self.batches = batches
 
-    def train_dataloader(self) -> DataLoader[Batch]:
+    def train_dataloader(self) -> DataLoader[Batch | Tensor]:
         """A loader that neither collates nor prefetches."""
         return DataLoader(self.batches, batch_size=None, num_workers=0)

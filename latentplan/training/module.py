@@ -53,25 +53,24 @@ class Learner(lightning.LightningModule):
         behaviour = [*self.model.actor.parameters(), *self.model.value_head.parameters()]
         chosen = {id(parameter) for parameter in behaviour}
         world = [parameter for parameter in self.model.parameters() if id(parameter) not in chosen]
+        rates = (self.config.model_learning_rate, self.config.behaviour_learning_rate)
+        capturable = self.device.type == "cuda"
         return [
-            torch.optim.Adam(world, lr=self.config.model_learning_rate, eps=1e-6, fused=True),
-            torch.optim.Adam(behaviour, lr=self.config.behaviour_learning_rate, eps=1e-6, fused=True),
+            torch.optim.Adam(parameters, lr=rate, eps=1e-6, fused=True, capturable=capturable)
+            for parameters, rate in zip((world, behaviour), rates, strict=True)
         ]
 
     def training_step(self, batch: Batch, batch_index: int) -> None:
         """One update of the world model from a batch of sequences, and of behaviour from the batch before."""
-        world_optimizer, _ = self._optimizers()
         behaviour = self._start_behaviour()
         generator = torch.Generator(self.device).manual_seed(derive_seed(self.seed, "update", self.updates))
         try:
-            batch, unturned = quarter_turns(batch, self.config.turned_share, generator)
-            learned = world_model_loss(self.model, batch, self.config, generator)
-            learned.parts["model_grad_norm"] = self._descend(world_optimizer, learned.loss)
+            learned, batch, unturned = self._learn_model(batch, generator)
         finally:
             self._finish_behaviour(behaviour)
-        self.replay.refresh(batch.rows[unturned], learned.states.deter[unturned])
+        self.replay.refresh(batch.rows, learned.states.deter, unturned)
         self.snapshot.refresh()
-        self._waiting = (learned._replace(loss=learned.loss.detach()), batch, generator)
+        self._waiting = (learned, batch, generator)
         self.updates += 1
         self.metrics |= learned.parts
 
@@ -110,6 +109,13 @@ class Learner(lightning.LightningModule):
         if behaviour is not None:
             self.metrics |= behaviour.result()
 
+    def _learn_model(self, batch: Batch, generator: torch.Generator) -> tuple[Learned, Batch, Tensor]:
+        """What was learned, the batch as it was seen, and which of its sequences were seen as they are, (batch,)."""
+        batch, unturned = quarter_turns(batch, self.config.turned_share, generator)
+        learned = world_model_loss(self.model, batch, self.config, generator)
+        learned.parts["model_grad_norm"] = self._descend(self._optimizers()[0], learned.loss)
+        return learned._replace(loss=learned.loss.detach()), batch, unturned
+
     def _learn_behaviour(self, learned: Learned, batch: Batch, generator: torch.Generator) -> dict[str, Tensor]:
         loss, parts = self._behaviour_loss(learned, batch, generator)
         parts["behaviour_grad_norm"] = self._descend(self._optimizers()[1], loss)
@@ -126,7 +132,8 @@ class Learner(lightning.LightningModule):
     ) -> tuple[Tensor, dict[str, Tensor]]:
         config, states = self.config, learned.states
         flat = State(states.deter.flatten(0, 1), states.stoch.flatten(0, 1))
-        chosen = torch.randperm(len(flat.deter), generator=generator, device=self.device)[: config.imagination_starts]
+        order = torch.rand(len(flat.deter), generator=generator, device=self.device).argsort()
+        chosen = order[: config.imagination_starts]
         with self.model.trunk_precision(cache=False):
             dream = imagine(
                 self.snapshot.model,

@@ -14,14 +14,30 @@ def descend(optimizer: torch.optim.Optimizer, loss: Tensor, max_norm: float, upd
     Raises:
         FloatingPointError: The gradient is not finite, at this update.
     """
-    optimizer.zero_grad(set_to_none=True)
-    loss.backward()
-    parameters = [parameter for group in optimizer.param_groups for parameter in group["params"]]
-    norm = torch.nn.utils.clip_grad_norm_(parameters, max_norm)
+    norm = _clipped_gradient(optimizer, loss, max_norm)
     if not torch.isfinite(norm):
         raise FloatingPointError(f"the gradient is not finite at update {update} (loss {loss.item()})")
     optimizer.step()
     return norm
+
+
+def descend_if_finite(optimizer: torch.optim.Optimizer, loss: Tensor, max_norm: float) -> Tensor:
+    """`descend` of a fused optimizer that reads nothing back: a gradient that is not finite changes nothing.
+
+    Returns:
+        The norm that the gradient had before it was clipped; whether it is finite tells whether the step was taken.
+    """
+    norm = _clipped_gradient(optimizer, loss, max_norm)
+    optimizer.found_inf = (~torch.isfinite(norm)).float()  # type: ignore[attr-defined]  # asks it to leave this step out
+    optimizer.step()
+    return norm
+
+
+def _clipped_gradient(optimizer: torch.optim.Optimizer, loss: Tensor, max_norm: float) -> Tensor:
+    optimizer.zero_grad(set_to_none=True)
+    loss.backward()
+    parameters = [parameter for group in optimizer.param_groups for parameter in group["params"]]
+    return torch.nn.utils.clip_grad_norm_(parameters, max_norm)
 
 
 @torch.no_grad()
@@ -34,9 +50,11 @@ def follow(slow: nn.Module, fast: nn.Module, rate: float) -> None:
 def return_scale(range_so_far: Tensor, returns: Tensor) -> Tensor:
     """Spread of returns between their 5th and 95th percentile, at least 1; `range_so_far` follows it, smoothed from 0.
 
+    It stays where it is when the spread is not finite; the loss of such returns is not finite either.
+
     Hafner et al. 2023, eq. 7.
     """
     flat = returns.flatten()
     spread = torch.quantile(flat, 0.95) - torch.quantile(flat, 0.05)
-    range_so_far.lerp_(spread, RETURN_RANGE_RATE)
+    range_so_far.lerp_(torch.where(torch.isfinite(spread), spread, range_so_far), RETURN_RANGE_RATE)
     return range_so_far.clamp_min(1.0)

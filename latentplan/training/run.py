@@ -26,7 +26,7 @@ from latentplan.training.claim import claim
 from latentplan.training.collector import Description, EnvFactory
 from latentplan.training.curriculum import Curriculum
 from latentplan.training.data import ReplayBatches, ReplayData
-from latentplan.training.module import Learner
+from latentplan.training.graphed import make_learner
 from latentplan.training.progress import Progress
 from latentplan.training.state import INTERRUPTED, RunState, load_state, restore
 from latentplan.training.worker import LocalWorker, RemoteWorker, Worker
@@ -150,15 +150,15 @@ class _Run:
         on = self.device if config.replay.on_device else torch.device("cpu")
         capacity, num_labels = _capacity(config), len(model.labels)
         self.replay = Replay(capacity, model.action_dim, config.model.deter_dim, config.env.num_envs, on, num_labels)
-        own_seed = derive_seed(seed, "learner")
-        self.learner = Learner(model, config.learning, self.description.discount, self.replay, own_seed)
-        self.state = RunState()
+        self.state, saved = RunState(), None
         self._saved_optimizers: list[Any] = []
         if resume:
             self.state, saved, self._saved_optimizers = load_state(self.folder / "resume", self.device)
             self.replay.load(self.folder / "resume" / "replay")
-            restore(self.learner, saved, self.folder)
         self.curriculum = Curriculum(config, model.labels, self.state)
+        self.learner = make_learner(model, config, self.description.discount, self.replay, self.curriculum)
+        if saved is not None:
+            restore(self.learner, saved, self.folder)
 
     def execute(self) -> Result:
         """Learn until the budget is spent, then evaluate."""

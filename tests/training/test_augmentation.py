@@ -4,7 +4,14 @@ import pytest
 import torch
 
 from latentplan.models import WorldModel
-from latentplan.training.augmentation import quarter_turns, random_shift
+from latentplan.training.augmentation import (
+    quarter_turns,
+    random_shift,
+    shift_by_index,
+    shift_by_slices,
+    turn_by_index,
+    turn_by_slices,
+)
 from latentplan.training.losses import world_model_loss
 
 
@@ -85,6 +92,14 @@ def test_sequences_turn_as_a_whole_and_forget_their_belief(batch):
 def test_a_share_of_nothing_turns_nothing_and_draws_nothing(batch):
     generator = torch.Generator().manual_seed(1)
     turned, unturned = quarter_turns(batch, 0.0, generator)
-    assert turned is batch and unturned == slice(None)
+    assert turned is batch and unturned.all()
     assert generator.get_state().equal(torch.Generator().manual_seed(1).get_state())
     assert not _turned(batch, 1.0)[1].any()
+
+
+def test_what_a_gpu_does_and_what_a_cpu_does_are_the_same(batch):
+    frames, generator = batch.frames, torch.Generator().manual_seed(2)
+    offsets = torch.randint(9, (len(frames), 2), generator=generator)
+    assert torch.equal(shift_by_index(frames, offsets, 4), shift_by_slices(frames, offsets, 4))
+    amounts = torch.arange(len(frames)) % 4
+    assert torch.equal(turn_by_index(frames, amounts), turn_by_slices(frames, amounts))

@@ -47,7 +47,15 @@ def test_without_another_task_the_batch_is_what_it_was(labelled):
     assert Curriculum(first(None), LABELS, at(0))(labelled) is labelled
     assert Curriculum(first("walk", task="walk"), LABELS, at(0))(labelled) is labelled
     assert Curriculum(first("walk", task="walk"), (), at(0))(labelled) is labelled
-    assert Curriculum(first("walk", task="stand", objective="speed -> 2.0"), LABELS, at(0))(labelled) is labelled
+
+
+@pytest.mark.parametrize("task", ["walk", "stand"])
+def test_an_objective_can_follow_any_task(labelled, task):
+    state = at(99)
+    curriculum = Curriculum(first("walk", task=task, objective="speed -> 2.0"), LABELS, state)
+    assert torch.equal(curriculum(labelled).rewards, labelled.labels[:, 1:, 2])
+    state.env_frames = 100
+    assert curriculum(labelled) is labelled
 
 
 @pytest.mark.parametrize(("labels", "told"), [(LABELS, "stand, walk"), ((), "none")])
