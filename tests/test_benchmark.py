@@ -24,7 +24,7 @@ from bench.machine import product_limits  # noqa: E402
 from bench.render import measure_qualities  # noqa: E402
 from bench.report import format_table, interval, number  # noqa: E402
 from bench.statistics import interquartile_estimate, interquartile_mean, paired_difference  # noqa: E402
-from bench.update import PARTS, measure_update  # noqa: E402
+from bench.update import PARTS, measure_graph, measure_update  # noqa: E402
 
 ENV = EnvConfig(domain="cartpole", task="swingup", action_repeat=100, render_quality="fastest")
 MODEL = ModelConfig(deter_dim=8, hidden_dim=8, encoder_channels=(4, 4), decoder_channels=2, num_bins=5)
@@ -175,6 +175,7 @@ def test_an_update_is_measured_in_parts_whose_operations_add_up():
     assert sum(part["flop"] for part in measured["parts"].values()) == measured["flop"]
     assert all(measured["parts"][name]["flop"] > 0 for name in ("encode", "recurrence", "decode", "behaviour"))
     assert measured["frames_per_s"] == pytest.approx(8 * measured["updates_per_s"])
+    assert measured["graph_ms"] is None and measure_graph(CONFIG, action_dim=2, device=CPU, updates=2) > 0.0
     assert measured["flop_per_s"] / product_limits(CPU, size=64)["float32"] > 0.0
 
 

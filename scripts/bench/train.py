@@ -74,6 +74,7 @@ def _summary(result: dict[str, Any]) -> str:
             f"{result['update_ms']:.1f} ms with model and behaviour side by side: "
             f"{result['updates_per_s']:.2f} updates/s, {result['frames_per_s']:,.0f} frames replayed/s "
             f"(medians of {result['updates']} updates)",
+            *([] if result["graph_ms"] is None else [f"{result['graph_ms']:.2f} ms as one CUDA graph"]),
             f"a big product: {limits}",
         ]
     )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from statistics import median
 from typing import Any
 
@@ -16,10 +17,10 @@ from bench.machine import now
 from latentplan.config import Config
 from latentplan.models import WorldModel
 from latentplan.replay import Batch, Replay, Rows
+from latentplan.training.graphed import WARM_UP_UPDATES, GraphedLearner
 from latentplan.training.module import Learner
 
 NUM_ROWS = 4096
-WARM_UP_UPDATES = 2
 DISCOUNT = 0.99  # any value costs the same
 PARTS = ("sample", "encode", "recurrence", "decode", "heads", "behaviour", "optimizer", "other")
 Lap = dict[str, float]
@@ -41,6 +42,16 @@ class StandaloneLearner(Learner):
         assert self._waiting is not None
         waiting, self._waiting = self._waiting, None
         self._learn_behaviour(*waiting)
+
+
+class StandaloneGraph(GraphedLearner):
+    """The same for a whole update in one CUDA graph."""
+
+    own_optimizers: list[torch.optim.Optimizer]
+
+    def optimizers(self, use_pl_optimizer: bool = True) -> Any:
+        """The optimizers, as they are."""
+        return self.own_optimizers
 
 
 class PhaseMeter:
@@ -88,8 +99,9 @@ def measure_update(config: Config, action_dim: int, device: torch.device, update
     world model's loss, its gradient clipping included.
 
     Returns:
-        Plain values: `parts` (ms and counted operations of each), `update_ms`, `flop`, `flop_per_s`,
-        `updates_per_s`, `frames_per_s`, `parameters` and the sizes. Times are medians.
+        Plain values: `parts` (ms and counted operations of each), `update_ms`, `graph_ms` (the same update as one CUDA
+        graph; None on a CPU), `flop`, `flop_per_s`, `updates_per_s`, `frames_per_s`, `parameters` and the sizes. Times
+        are medians.
     """
     torch.manual_seed(0)
     replay = synthetic_replay(config, action_dim, device)
@@ -108,12 +120,28 @@ def measure_update(config: Config, action_dim: int, device: torch.device, update
         "updates": updates,
         "update_ms": 1000.0 * seconds,
         "in_turn_ms": 1000.0 * in_turn,
+        "graph_ms": measure_graph(config, action_dim, device, updates) if device.type == "cuda" else None,
         "updates_per_s": 1.0 / seconds,
         "frames_per_s": sizes.batch_size * (sizes.sequence_length + 1) / seconds,
         "flop": int(flop["in_turn"]),
         "flop_per_s": flop["in_turn"] / seconds,
         "parts": parts,
     }
+
+
+def measure_graph(config: Config, action_dim: int, device: torch.device, updates: int) -> float:
+    """Milliseconds of an update as `learning.cuda_graph` takes it, the median; on a CPU of what would be recorded."""
+    replay = synthetic_replay(replace(config, replay=replace(config.replay, on_device=True)), action_dim, device)
+    model = WorldModel(config.model, action_dim).to(device)
+    learner = StandaloneGraph(model, config.learning, DISCOUNT, replay, 0, lambda batch: batch).to(device)
+    learner.own_optimizers = learner.configure_optimizers()
+    rng, seconds = np.random.default_rng(1), []
+    for _ in range(WARM_UP_UPDATES + 1 + updates):  # the first of them is recorded when those before it are done
+        rows, started = replay.draw(config.learning.batch_size, config.learning.sequence_length, rng), now(device)
+        learner.training_step(rows, 0)
+        seconds.append(now(device) - started)
+    learner.catch_up()
+    return 1000.0 * median(seconds[-updates:])
 
 
 def synthetic_replay(config: Config, action_dim: int, device: torch.device) -> Replay:
