@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import torch
 from torch import Tensor, nn
 
@@ -38,6 +40,17 @@ def _clipped_gradient(optimizer: torch.optim.Optimizer, loss: Tensor, max_norm: 
     loss.backward()
     parameters = [parameter for group in optimizer.param_groups for parameter in group["params"]]
     return torch.nn.utils.clip_grad_norm_(parameters, max_norm)
+
+
+def take_up(optimizer: torch.optim.Optimizer, saved: dict[str, Any]) -> None:
+    """Give an optimizer the state that was saved of another one; whether a graph may record it stays its own matter.
+
+    That depends on the device, and a run may go on on another.
+    """
+    capturable = [group["capturable"] for group in optimizer.param_groups]
+    optimizer.load_state_dict(saved)
+    for group, own in zip(optimizer.param_groups, capturable, strict=True):
+        group["capturable"] = own
 
 
 @torch.no_grad()

@@ -27,6 +27,7 @@ from latentplan.training.collector import Description, EnvFactory
 from latentplan.training.curriculum import Curriculum
 from latentplan.training.data import ReplayBatches, ReplayData
 from latentplan.training.graphed import make_learner
+from latentplan.training.optimization import take_up
 from latentplan.training.progress import Progress
 from latentplan.training.state import INTERRUPTED, RunState, load_state, restore
 from latentplan.training.worker import LocalWorker, RemoteWorker, Worker
@@ -143,9 +144,9 @@ class _Run:
             raise
 
     def _build(self, *, resume: bool) -> None:
-        config, seed = self.config, self.config.run.seed
+        config = self.config
         with torch.random.fork_rng(devices=[]):
-            torch.manual_seed(derive_seed(seed, "weights"))
+            torch.manual_seed(derive_seed(config.run.seed, "weights"))
             model = WorldModel(config.model, self.description.action_dim, self.description.labels).to(self.device)
         on = self.device if config.replay.on_device else torch.device("cpu")
         capacity, num_labels = _capacity(config), len(model.labels)
@@ -202,7 +203,7 @@ class _Run:
             def on_fit_start(self, trainer: lightning.Trainer, learner: lightning.LightningModule) -> None:
                 if optimizers:
                     for optimizer, saved in zip(trainer.optimizers, optimizers, strict=True):
-                        optimizer.load_state_dict(saved)
+                        take_up(optimizer, saved)
 
         return lightning.Trainer(
             accelerator="gpu" if self.device.type == "cuda" else "cpu",
@@ -238,11 +239,10 @@ class _Run:
         return summary
 
     def _announce(self) -> None:
-        config, description = self.config, self.description
+        config, description, run = self.config, self.description, self.config.run
         parameters = sum(parameter.numel() for parameter in self.learner.model.parameters())
-        frames, minutes = config.run.frames, config.run.minutes
-        budget = [f"{frames:,} frames"] if frames else []
-        budget += [f"{minutes:g} minutes"] if minutes else []
+        budget = [f"{run.frames:,} frames"] if run.frames else []
+        budget += [f"{run.minutes:g} minutes"] if run.minutes else []
         renderer = ", ".join(f"{name} {value}" for name, value in description.renderer.items())
         rows = self.replay.lane_size * self.replay.num_lanes
         lines = {

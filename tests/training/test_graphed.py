@@ -13,6 +13,7 @@ from latentplan.replay import Replay, Rows
 from latentplan.training import augmentation
 from latentplan.training.graphed import WARM_UP_UPDATES, GraphedLearner
 from latentplan.training.module import Learner
+from latentplan.training.optimization import take_up
 
 SETTINGS = {"turned_share": 0.5, "random_shift": 2, "imitation_scale": 0.1}
 LABELS = {"height": 0.5, "task.stand": 0.5}
@@ -179,3 +180,15 @@ def test_what_is_replayed_is_what_is_run(tiny):
     whole.catch_up()
     for (name, one), (_, two) in zip(plain.state_dict().items(), whole.state_dict().items(), strict=True):
         torch.testing.assert_close(one, two, rtol=1e-3, atol=1e-4, msg=name)
+
+
+def test_an_optimizer_goes_on_on_another_device_as_that_device_wants_it():
+    weight = torch.nn.Parameter(torch.ones(2))
+    saved, goes_on = (torch.optim.Adam([weight], lr=1e-3, fused=True) for _ in range(2))
+    weight.grad = torch.ones(2)
+    saved.step()
+    state = saved.state_dict()
+    state["param_groups"][0]["capturable"] = True
+    take_up(goes_on, state)
+    assert goes_on.param_groups[0]["capturable"] is False
+    assert torch.equal(goes_on.state[weight]["exp_avg"], saved.state[weight]["exp_avg"])
