@@ -2,6 +2,7 @@
 
 import json
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -25,11 +26,14 @@ PLANNER = PlannerConfig(horizon=3, num_samples=8, num_elites=2, num_policy_sampl
 @pytest.fixture(scope="module")
 def checkpoint(tmp_path_factory):
     """An untrained agent for five-decision episodes of cartpole."""
-    folder = tmp_path_factory.mktemp("agent")
+    return saved(tmp_path_factory.mktemp("agent"), ENV)
+
+
+def saved(folder, env):
     info = {"domain": "cartpole", "task": "swingup", "env_frames": 1234, "discount": 0.9, "metrics": {}}
     torch.manual_seed(0)
     model = WorldModel(MODEL, 1, scales("cartpole"))
-    save_checkpoint(folder, model, Config(env=ENV, model=MODEL, planner=PLANNER), info)
+    save_checkpoint(folder, model, Config(env=env, model=MODEL, planner=PLANNER), info)
     return folder
 
 
@@ -64,6 +68,21 @@ def test_some_players_are_compared_with_an_agent_trained_for_the_goal(tmp_path, 
     by_player = {row["player"]: row for row in rows}
     assert by_player["trained actor"]["scores"] == by_player["actor"]["scores"]  # the same agent here
     assert 1000.0 * by_player["actor"]["quantities"]["task.swingup"] == pytest.approx(by_player["actor"]["mean_return"])
+
+
+def test_what_is_trained_for_a_constraint_is_paid_by_the_task_too(tmp_path, checkpoint):
+    trained = saved(tmp_path / "trained", replace(ENV, task="balance", objective="cart > 100"))  # which pays nothing
+    path = tmp_path / "result.json"
+    flags = ["--constraints", "cart < 0.01", "--players", "actor", "--trained", str(trained), "--json", str(path)]
+    assert (
+        benchmark.main(["zero-shot", "--checkpoint", str(checkpoint), "--episodes", "2", "--device", "cpu", *flags])
+        == 0
+    )
+    result = json.loads(path.read_text())
+    actor, _, same = result["rows"]
+    assert [row["player"] for row in result["rows"]] == ["actor", "trained planner", "trained actor"]
+    assert same["returns"] == actor["returns"] != [0.0, 0.0] and same["scores"] == actor["scores"]
+    assert result["floor"] == "endless"
 
 
 def test_kicks_are_the_same_for_every_player_and_change_what_they_earn(checkpoint):

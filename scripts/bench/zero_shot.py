@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -18,7 +19,7 @@ from bench.options import (
 )
 from bench.report import format_table, interval, number, write_json
 from latentplan.compose import build_config, raise_unknown
-from latentplan.config import UserError, to_dict
+from latentplan.config import EnvConfig, UserError, to_dict
 
 if TYPE_CHECKING:
     from latentplan.envs import SuiteEnv
@@ -32,7 +33,7 @@ FLAGS = {
         "A, B",
         "rows of each goal: some of planner, gated, random moments, random gate, unconstrained, actor, random (all)",
     ),
-    "--trained": ("DIR", "agent trained for the objectives, to compare with: two rows more, its planner and its actor"),
+    "--trained": ("DIR", "agent trained for the goals, to compare with: two rows more, its planner and its actor"),
     "--episodes": ("N", "episodes of each row, on the same starts (10)"),
     "--seed": ("S", "episode i starts from a state that depends only on S and i (0)"),
     "--push": ("STD", "of kicks to all joint velocities, one decision in 25, the same for every player (none)"),
@@ -105,6 +106,7 @@ def run(flags: Flags) -> int:
     overrides = {name: getattr(planner, name) for name in typed}
     device = str(choose_device(flags))
     from latentplan.rollout import episode_seed
+    from latentplan.scoring import goal_env
 
     seeds = [episode_seed(seed, index) for index in range(episodes)]
     about = {
@@ -117,6 +119,7 @@ def run(flags: Flags) -> int:
         "seed": seed,
         "episodes": episodes,
         "push": push,
+        "floor": goal_env(EnvConfig()).floor,
         "trained": trained_for,
     }
     print(f"{about['domain']}-{about['task']}, {episodes} episodes per row, {workers} at once", flush=True)
@@ -147,7 +150,12 @@ def list_jobs(flags: Flags) -> list[Job]:
     asked = [name for name in (*OBJECTIVE_PLAYERS, *trained) if name in (*wanted, *trained)]
     jobs = [
         *(Job(text, None, name) for text in objectives for name in asked),
-        *(Job(None, text, name) for text in constraints for name in CONSTRAINT_PLAYERS if name in wanted),
+        *(
+            Job(None, text, name)
+            for text in constraints
+            for name in (*CONSTRAINT_PLAYERS, *trained)
+            if name in (*wanted, *trained)
+        ),
     ]
     if not jobs:
         raise UserError("--players names nobody who plays for an objective; unconstrained is for constraints")
@@ -177,10 +185,12 @@ def play_job(conditions: Conditions, job: Job) -> dict[str, Any]:
         assert conditions.trained is not None, "asked for by --trained"
         checkpoint, player, search = conditions.trained, job.player.removeprefix("trained "), {}
     _, config, _ = load_model(checkpoint)
+    _, own, _ = load_model(conditions.checkpoint)
     agent = make_player(player, checkpoint, conditions.device, search)
     goals = read_goals(job.objective, job.constraint, config.env.domain)
     assert goals is not None, "a job names an objective or a constraint"
-    env = make_env(goal_env(config.env))
+    # Each in the world that it knows, and all paid by the same task.
+    env = make_env(replace(goal_env(config.env), task=own.env.task, objective=own.env.objective))
     try:
         scored = score_env(env, goals, agent if job.player in PURSUERS else None)
         result = summarize(run_episodes(scored, agent, conditions.seeds, on_step=_pusher(env, conditions)))
