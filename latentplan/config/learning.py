@@ -18,8 +18,6 @@ class LearningConfig:
         sequence_length: Decisions per sequence.
         random_shift: Pixels by which each replayed sequence of frames is moved at most, in either direction.
         turned_share: Of the replayed sequences, turned by quarter turns; for a body to which every side is the same.
-        turned_mirrors: Whether those may be mirrored as well, their actions negated; for a body whose mirror image
-            moves by the negative of every action, and whose quantities are the same there.
         model_learning_rate: Adam step of encoder, dynamics, decoder, reward and continue heads.
         behaviour_learning_rate: Adam step of actor and value.
         max_grad_norm: Gradient norm at which each optimizer clips.
@@ -49,7 +47,6 @@ class LearningConfig:
     sequence_length: int = 16
     random_shift: int = 0
     turned_share: float = 0.0
-    turned_mirrors: bool = False
     model_learning_rate: float = 1e-3
     behaviour_learning_rate: float = 3e-4
     max_grad_norm: float = 100.0

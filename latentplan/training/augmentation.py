@@ -50,16 +50,14 @@ def shift_by_index(frames: Tensor, offsets: Tensor, pixels: int) -> Tensor:
     return frames
 
 
-def quarter_turns(batch: Batch, share: float, mirrors: bool, generator: torch.Generator) -> tuple[Batch, Tensor]:
+def quarter_turns(batch: Batch, share: float, generator: torch.Generator) -> tuple[Batch, Tensor]:
     """Turn the pictures of some sequences by a quarter, a half or three quarters, and forget what came before them.
 
-    For bodies seen from above, to which every side is the same: what is learned of one place holds for four. For bodies
-    whose mirror image moves by the negative of every action it holds for eight.
+    For bodies seen from above, to which every side is the same: what is learned of one place holds for four.
 
     Args:
         batch: Sequences; their pictures are square.
         share: Of the sequences that are turned, each as a whole, in [0, 1].
-        mirrors: Whether they may be mirrored as well, their actions negated.
         generator: Where they are drawn from.
 
     Returns:
@@ -68,33 +66,19 @@ def quarter_turns(batch: Batch, share: float, mirrors: bool, generator: torch.Ge
     size, device = len(batch.frames), batch.frames.device
     if share == 0.0:
         return batch, torch.ones(size, dtype=torch.bool, device=device)
-    kinds = torch.randint(1, 8 if mirrors else 4, (size,), generator=generator, device=device)
+    turns = torch.randint(1, 4, (size,), generator=generator, device=device)
     is_turned = torch.rand(size, generator=generator, device=device) < share
-    kinds = kinds * is_turned
-    turned = batch._replace(
-        frames=(turn_by_slices if device.type == "cpu" else turn_by_index)(batch.frames, kinds),
-        deter=batch.deter * ~is_turned[:, None],
-    )
-    return _with_negated_actions(turned, kinds >= 4) if mirrors else turned, ~is_turned
+    frames = (turn_by_slices if device.type == "cpu" else turn_by_index)(batch.frames, turns * is_turned)
+    return batch._replace(frames=frames, deter=batch.deter * ~is_turned[:, None]), ~is_turned
 
 
-def turn_by_slices(frames: Tensor, kinds: Tensor) -> Tensor:
-    """Frames turned by kinds (batch,), in [0, 7]: so many quarters, from 4 on after a mirroring; quickest on a CPU."""
-    turned = []
-    for sequence, kind in zip(frames, kinds.tolist(), strict=True):
-        mirrored = sequence.flip(1) if kind >= 4 else sequence
-        turned.append(torch.rot90(mirrored, kind % 4, (1, 2)))
+def turn_by_slices(frames: Tensor, amounts: Tensor) -> Tensor:
+    """Frames turned by quarters (batch,), in [0, 3]: the quickest on a CPU."""
+    turned = [torch.rot90(each, amount, (1, 2)) for each, amount in zip(frames, amounts.tolist(), strict=True)]
     return torch.stack(turned)
 
 
-def turn_by_index(frames: Tensor, kinds: Tensor) -> Tensor:
+def turn_by_index(frames: Tensor, amounts: Tensor) -> Tensor:
     """The same, reading nothing back from the device."""
-    mirrored = torch.where((kinds >= 4).view(-1, 1, 1, 1, 1), frames.flip(2), frames)
-    turned = torch.stack([torch.rot90(mirrored, amount, (2, 3)) for amount in range(4)])
-    return turned[kinds % 4, torch.arange(len(frames), device=frames.device)]
-
-
-def _with_negated_actions(batch: Batch, chosen: Tensor) -> Batch:
-    sign = torch.where(chosen, -1.0, 1.0)[:, None, None]
-    mean, std = batch.plan.chunk(2, -1)
-    return batch._replace(actions=sign * batch.actions, plan=torch.cat([sign * mean, std], -1))
+    turned = torch.stack([torch.rot90(frames, amount, (2, 3)) for amount in range(4)])
+    return turned[amounts, torch.arange(len(frames), device=frames.device)]

@@ -111,9 +111,8 @@ class Learner(lightning.LightningModule):
 
     def _learn_model(self, batch: Batch, generator: torch.Generator) -> tuple[Learned, Batch, Tensor]:
         """What was learned, the batch as it was seen, and which of its sequences were seen as they are, (batch,)."""
-        config = self.config
-        batch, unturned = quarter_turns(batch, config.turned_share, config.turned_mirrors, generator)
-        learned = world_model_loss(self.model, batch, config, generator)
+        batch, unturned = quarter_turns(batch, self.config.turned_share, generator)
+        learned = world_model_loss(self.model, batch, self.config, generator)
         learned.parts["model_grad_norm"] = self._descend(self._optimizers()[0], learned.loss)
         return learned._replace(loss=learned.loss.detach()), batch, unturned
 

@@ -15,7 +15,7 @@ from latentplan.training.graphed import WARM_UP_UPDATES, GraphedLearner
 from latentplan.training.module import Learner
 from latentplan.training.optimization import take_up
 
-SETTINGS = {"turned_share": 0.5, "turned_mirrors": True, "random_shift": 2, "imitation_scale": 0.1}
+SETTINGS = {"turned_share": 0.5, "random_shift": 2, "imitation_scale": 0.1}
 LABELS = {"height": 0.5, "task.stand": 0.5}
 
 
