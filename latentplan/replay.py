@@ -175,7 +175,7 @@ class Replay:
         Only the sequences `chosen`, bool (batch,), are read. Where a row occurs in several, the last one counts.
         """
         index = rows.flatten().to(self.device)
-        is_chosen = chosen.to(self.device).repeat_interleave(rows.shape[1])
+        is_chosen = chosen.to(self.device)[:, None].expand(rows.shape).flatten()
         # Every occurrence writes the value of the last one chosen: parallel writes to one place have no order.
         in_order, order = (2 * index + is_chosen).sort(stable=True)
         last = order[torch.searchsorted(in_order, 2 * index + 1, right=True) - 1]

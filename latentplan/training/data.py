@@ -40,9 +40,9 @@ class ReplayBatches(IterableDataset[Batch | Tensor]):
         """Draw the batches of this epoch, each when it is asked for."""
         learning = self.config.learning
         rng = np.random.default_rng(derive_seed(self.config.run.seed, "batches", self.learner.updates))
+        gathers = isinstance(self.learner, GraphedLearner)
         for _ in range(self.length):
             rows = self.replay.draw(learning.batch_size, learning.sequence_length, rng)
-            gathers = isinstance(self.learner, GraphedLearner)
             yield rows if gathers else self.curriculum(self.replay.gather(rows))
 
 
