@@ -140,10 +140,6 @@ class Replay:
             store[index] = torch.as_tensor(getattr(rows, name)[newest], device=self.device).to(store.dtype)
         self.written[lane] += count
 
-    def sample(self, batch_size: int, sequence_length: int, rng: np.random.Generator) -> Batch:
-        """Uniformly drawn sequences, each within one episode; `draw` and `gather` in one."""
-        return self.gather(self.draw(batch_size, sequence_length, rng))
-
     def draw(self, batch_size: int, sequence_length: int, rng: np.random.Generator) -> Tensor:
         """Where uniformly drawn sequences live, each within one episode: rows (batch, time + 1).
 

@@ -59,7 +59,7 @@ def filled(capacity=60, lanes=1, lengths=(7, 4, 9), chunk=5):
 
 
 def sample(replay, batch_size=64, length=3, seed=0):
-    return replay.sample(batch_size, length, np.random.default_rng(seed))
+    return replay.gather(replay.draw(batch_size, length, np.random.default_rng(seed)))
 
 
 def told(batch):

@@ -36,7 +36,8 @@ class GraphedLearner(Learner):
         discount: Per decision.
         replay: On the model's device.
         seed: Of the noise of posterior, prior and actor samples.
-        prepare: What becomes of gathered sequences before they are learned from.
+        prepare: What becomes of gathered sequences before they are learned from; recorded as it is then, so that it may
+            change where values are forgotten and nowhere else.
     """
 
     skipped: Tensor

@@ -17,24 +17,30 @@ from bench.machine import now
 from latentplan.config import Config
 from latentplan.models import WorldModel
 from latentplan.replay import Batch, Replay, Rows
-from latentplan.training.graphed import WARM_UP_UPDATES, GraphedLearner
+from latentplan.training.graphed import WARM_UP_UPDATES as GRAPH_WARM_UP_UPDATES
+from latentplan.training.graphed import GraphedLearner
 from latentplan.training.module import Learner
 
 NUM_ROWS = 4096
+WARM_UP_UPDATES = 2
 DISCOUNT = 0.99  # any value costs the same
 PARTS = ("sample", "encode", "recurrence", "decode", "heads", "behaviour", "optimizer", "other")
 Lap = dict[str, float]
 Parts = dict[str, Callable[[], Any]]
 
 
-class StandaloneLearner(Learner):
-    """A learner that holds its own optimizers, so that it updates without a Trainer."""
+class OwnOptimizers:
+    """What makes a learner hold its own optimizers, so that it updates without a Trainer."""
 
     own_optimizers: list[torch.optim.Optimizer]
 
     def optimizers(self, use_pl_optimizer: bool = True) -> Any:
         """The optimizers, as they are."""
         return self.own_optimizers
+
+
+class StandaloneLearner(OwnOptimizers, Learner):
+    """A learner that updates without a Trainer."""
 
     def step_in_turn(self, batch: Batch) -> None:
         """An update whose two halves follow each other in one thread, so that each can be timed and counted."""
@@ -44,14 +50,8 @@ class StandaloneLearner(Learner):
         self._learn_behaviour(*waiting)
 
 
-class StandaloneGraph(GraphedLearner):
+class StandaloneGraph(OwnOptimizers, GraphedLearner):
     """The same for a whole update in one CUDA graph."""
-
-    own_optimizers: list[torch.optim.Optimizer]
-
-    def optimizers(self, use_pl_optimizer: bool = True) -> Any:
-        """The optimizers, as they are."""
-        return self.own_optimizers
 
 
 class PhaseMeter:
@@ -136,7 +136,7 @@ def measure_graph(config: Config, action_dim: int, device: torch.device, updates
     learner = StandaloneGraph(model, config.learning, DISCOUNT, replay, 0, lambda batch: batch).to(device)
     learner.own_optimizers = learner.configure_optimizers()
     rng, seconds = np.random.default_rng(1), []
-    for _ in range(WARM_UP_UPDATES + 1 + updates):  # the first of them is recorded when those before it are done
+    for _ in range(GRAPH_WARM_UP_UPDATES + 1 + updates):  # the first of them is recorded when those before it are done
         rows, started = replay.draw(config.learning.batch_size, config.learning.sequence_length, rng), now(device)
         learner.training_step(rows, 0)
         seconds.append(now(device) - started)
@@ -212,7 +212,7 @@ def _overlapped_seconds(learner: StandaloneLearner, device: torch.device, rng: n
 
 def _sample(learner: StandaloneLearner, rng: np.random.Generator) -> Batch:
     config = learner.config
-    batch = learner.replay.sample(config.batch_size, config.sequence_length, rng)
+    batch = learner.replay.gather(learner.replay.draw(config.batch_size, config.sequence_length, rng))
     return Batch(*(part.to(learner.device) for part in batch))
 
 

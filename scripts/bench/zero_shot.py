@@ -185,7 +185,7 @@ def play_job(conditions: Conditions, job: Job) -> dict[str, Any]:
         assert conditions.trained is not None, "asked for by --trained"
         checkpoint, player, search = conditions.trained, job.player.removeprefix("trained "), {}
     _, config, _ = load_model(checkpoint)
-    _, own, _ = load_model(conditions.checkpoint)
+    own = config if checkpoint == conditions.checkpoint else load_model(conditions.checkpoint)[1]
     agent = make_player(player, checkpoint, conditions.device, search)
     goals = read_goals(job.objective, job.constraint, config.env.domain)
     assert goals is not None, "a job names an objective or a constraint"

@@ -60,7 +60,7 @@ def test_plans_come_back_beside_the_actions_they_led_to(tmp_path):
     replay.save(tmp_path)
     again = Replay(40, action_dim=1, deter_dim=16, num_lanes=1, device=CPU)
     again.load(tmp_path)
-    batch = again.sample(64, 5, np.random.default_rng(0))
+    batch = again.gather(again.draw(64, 5, np.random.default_rng(0)))
     known = (batch.plan[..., 1:] > 0.0).expand_as(batch.plan)
     assert batch.plan.shape == (64, 5, 2) and 0 < int(known[:, 0, 0].sum()) < 64
     assert torch.equal(known, known[:, :1, :1].expand_as(known))
@@ -73,7 +73,7 @@ def batch():
     replay = Replay(80, action_dim=1, deter_dim=16, num_lanes=2, device=CPU)
     replay.add(0, rows_of(40, np.tile(np.float32([0.8, 0.2]), (40, 1))))
     replay.add(1, rows_of(40))
-    return replay.sample(8, 5, np.random.default_rng(0))
+    return replay.gather(replay.draw(8, 5, np.random.default_rng(0)))
 
 
 def learned(tiny, batch, updates=1, **learning):
