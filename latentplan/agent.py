@@ -14,6 +14,8 @@ from latentplan.goals.image import read_goal
 from latentplan.goals.objective import plan_goals
 from latentplan.models import State, WorldModel, reflex
 from latentplan.models.heads import sample_action
+from latentplan.models.noise import CorrelatedNoise
+from latentplan.models.symmetry import TurnedModel, flat, folded, mean_over_turns, turned, unturned
 from latentplan.planning import CEMPlanner, ModelPredictiveController
 from latentplan.planning.objectives import Constraint, Term
 
@@ -22,9 +24,10 @@ class ModelAgent:
     """What planning and acting agents share: a belief that follows the frames.
 
     One frame (64, 64, 3) in gives one action (action,) out; several, (batch, 64, 64, 3), give (batch, action).
-    The belief is the posterior's mean.
+    The belief is the posterior's mean, of the frame alone or (`model.turns`) of its four quarter turns.
 
     Attributes:
+        state: The belief, `deter` (batch, deter) and `stoch` (batch, latent); (batch, 4, ...) where it is of all turns.
         last_source: What the most recent action came from, "plan", "tail" (of an older plan) or "actor"; a list of
             these where environments of a batch can differ.
 
@@ -48,14 +51,15 @@ class ModelAgent:
         seed: int = 0,
     ) -> None:
         self.model, self.config = model.eval(), config
-        self.noise_std, self.noise_correlation = noise_std, noise_correlation
+        self.noise_std, self.noise = noise_std, CorrelatedNoise(noise_correlation)
         self.num_actions = model.action_dim
         self.generator = torch.Generator(model.device)
         self.state: State | None = None
         self._action: Tensor | None = None
         self._forget: Tensor | None = None
-        self._noise: Tensor | None = None
         self._weights = reflex.lay_out(model)
+        self._turns = model.config.turns
+        self.imagined: WorldModel | TurnedModel = model if self._turns == 1 else TurnedModel(model)
         self.seed(seed)
 
     def seed(self, seed: int) -> None:
@@ -65,7 +69,8 @@ class ModelAgent:
     def reset(self, mask: np.ndarray | None = None) -> None:
         """Forget the past, everywhere or in the environments where mask (batch,) is true."""
         if mask is None or self.state is None:
-            self.state = self._action = self._forget = self._noise = None
+            self.state = self._action = self._forget = None
+            self.noise.reset()
         else:
             forget = torch.tensor(mask, dtype=torch.bool, device=self.model.device)
             self._forget = forget if self._forget is None else self._forget | forget
@@ -82,7 +87,8 @@ class ModelAgent:
         state = self._believe(frames)
         action = self._choose(state)
         if self.noise_std > 0.0:
-            action = (action + self.noise_std * self._explore(action)).clamp(-1.0, 1.0)
+            noise = self.noise.draw(action, self.generator, self._forget)
+            action = (action + self.noise_std * noise).clamp(-1.0, 1.0)
         self.state, self._action, self._forget = state, action, None
         result = action.float().cpu().numpy()
         return result[0] if single else result
@@ -92,33 +98,19 @@ class ModelAgent:
         """The latent of one frame seen without a past, float32 (32,), or (batch, 32) for several."""
         single = frame.ndim == 3
         frames = self._check(frame[None] if single else frame)
-        latent = self.model.see(self.model.dynamics.initial(len(frames)).deter, frames).stoch.cpu().numpy()
+        latent = self._glance(frames).cpu().numpy()
         return latent[0] if single else latent
 
     def imagine(self) -> np.ndarray | None:
         """The picture an agent looks forward to, uint8 (32, 32, 3); None without a plan."""
         return None
 
-    def _explore(self, action: Tensor) -> Tensor:
-        """Standard normal noise of the action's shape, correlated with that of the decision before (an AR(1) process).
-
-        White noise hardly moves a heavy body: what it pushes now it takes back at the next decision.
-        """
-        fresh = torch.randn(action.shape, generator=self.generator, device=action.device)
-        if self._noise is None or self.noise_correlation == 0.0:
-            self._noise = fresh
-            return fresh
-        kept = self.noise_correlation
-        noise = kept * self._noise + (1.0 - kept**2) ** 0.5 * fresh
-        self._noise = noise if self._forget is None else torch.where(self._forget[:, None], fresh, noise)
-        return self._noise
-
     def _choose(self, state: State) -> Tensor:
         raise AssertionError("an agent defines how it chooses")
 
     def _picture(self, state: State, actions: Tensor) -> np.ndarray:
         """The decoded end of a plan (batch, horizon, action), uint8 (32, 32, 3), of the first environment."""
-        first = State(*(part[:1] for part in state))
+        first = State(*(part[:1] for part in unturned(state)))
         _, last = self.model.rollout(first, actions[:1].to(first.deter.dtype))
         return self.model.decoder.picture(last.features.float())[0].cpu().numpy()
 
@@ -131,20 +123,29 @@ class ModelAgent:
             model=self.model,
             env=self.config.env,
             planner=planner,
-            encode_goal=lambda path: torch.as_tensor(self.encode(read_goal(path)), device=self.model.device),
+            encode_goal=self._encode_goal,
         )
+
+    def _encode_goal(self, path: str) -> Tensor:
+        """The latents of a picture's turns, (turn, latent)."""
+        return self._glance(turned(self._check(read_goal(path)[None]), self._turns))
+
+    def _glance(self, frames: Tensor) -> Tensor:
+        """Latents (batch, latent) of frames seen without a past."""
+        return self.model.see(self.model.dynamics.initial(len(frames)).deter, frames).stoch
 
     def _believe(self, frames: Tensor) -> State:
         if self.state is None or self.model.device.type != "cpu":  # elsewhere the weights do not follow the model's
             self._weights = reflex.lay_out(self.model)
-        if self.state is None or self._action is None:
-            return self._see(self.model.dynamics.initial(len(frames)).deter, frames)
-        if len(self.state.deter) != len(frames):
+        if self.state is not None and len(self.state.deter) != len(frames):
             raise ValueError(f"got {len(frames)} frames after {len(self.state.deter)}: call reset() between batches")
-        deter = reflex.advance(self._weights, self.state, self._action)
+        frames, turns = turned(frames, self._turns), self._turns
+        deter = self.model.dynamics.initial(len(frames)).deter
+        if self.state is not None and self._action is not None:
+            deter = reflex.advance(self._weights, flat(self.state), self._action.repeat_interleave(turns, 0))
         if self._forget is not None:
-            deter = torch.where(self._forget[:, None], 0.0, deter)
-        return self._see(deter, frames)
+            deter = torch.where(self._forget.repeat_interleave(turns)[:, None], 0.0, deter)
+        return folded(self._see(deter, frames), turns)
 
     def _see(self, deter: Tensor, frames: Tensor) -> State:
         return reflex.see(self._weights, deter, frames)
@@ -181,7 +182,7 @@ class PlanningAgent(ModelAgent):
     ) -> None:
         super().__init__(model, config, noise_std=noise_std, noise_correlation=noise_correlation, seed=seed)
         search = CEMPlanner.from_config(planner or config.planner, action_dim=model.action_dim, discount=discount)
-        self.controller = ModelPredictiveController(search, model, generator=self.generator)
+        self.controller = ModelPredictiveController(search, self.imagined, generator=self.generator)
 
     def reset(self, mask: np.ndarray | None = None) -> None:
         """Forget the past and the last plan, everywhere or where mask (batch,) is true."""
@@ -261,10 +262,10 @@ class ActorAgent(ModelAgent):
         return super().act(frame)
 
     def _choose(self, state: State) -> Tensor:
-        mean, std = reflex.act(self._weights, state)
+        mean, std = (mean_over_turns(part, state) for part in reflex.act(self._weights, flat(state)))
         if not self.explore:
             return mean
-        return sample_action(mean, std, self._explore(mean))
+        return sample_action(mean, std, self.noise.draw(mean, self.generator, self._forget))
 
 
 class RandomAgent:

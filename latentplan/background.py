@@ -15,6 +15,7 @@ from latentplan.agent import ModelAgent
 from latentplan.config import Config, PlannerConfig
 from latentplan.goals.expression import Expression
 from latentplan.models import State, WorldModel
+from latentplan.models.symmetry import TurnedModel
 from latentplan.planning import BackgroundPlanner, CEMPlanner, Plan, PlanExecutor, PlanScheduler
 from latentplan.planning.objectives import Constraint, Term
 
@@ -25,7 +26,7 @@ class LatentPlanner:
 
     search: CEMPlanner
 
-    def plan(self, model: WorldModel, state: State, previous: Plan | None = None, **options: Any) -> Plan:
+    def plan(self, model: WorldModel | TurnedModel, state: State, previous: Plan | None = None, **options: Any) -> Plan:
         """See `CEMPlanner.plan`."""
         with model.trunk_precision():
             return self.search.plan(model, state, previous, **options)
@@ -66,16 +67,16 @@ class BackgroundAgent(ModelAgent):
         worker: str = "process",
         max_age: int | None = None,
         fresh_ticks: int | None = None,
-        make_executor: Callable[[LatentPlanner, WorldModel], PlanExecutor] | None = None,
+        make_executor: Callable[[LatentPlanner, Any], PlanExecutor] | None = None,
     ) -> None:
         super().__init__(model, config, seed=seed)
         search = CEMPlanner.from_config(planner or config.planner, action_dim=model.action_dim, discount=discount)
         if make_executor is None:
-            executor: PlanExecutor = BackgroundPlanner(LatentPlanner(search), self.model, worker=worker)
+            executor: PlanExecutor = BackgroundPlanner(LatentPlanner(search), self.imagined, worker=worker)
         else:
-            executor = make_executor(LatentPlanner(search), self.model)
+            executor = make_executor(LatentPlanner(search), self.imagined)
         self.scheduler = PlanScheduler(
-            search, self.model, executor, max_age=max_age, fresh_ticks=fresh_ticks, generator=self.generator
+            search, self.imagined, executor, max_age=max_age, fresh_ticks=fresh_ticks, generator=self.generator
         )
         self.plan_age: int | None = None
 

@@ -5,9 +5,10 @@ One call is one decision. Inputs and outputs are plain tensors, and everything t
     action, deter, stoch = program(frame, deter, stoch, action, is_first)
 
 `frame` uint8 (batch, 64, 64, 3); `deter` float32 (batch, deter) and `stoch` float32 (batch, latent), the belief that
-the last call returned; `action` float32 (batch, action) in [-1, 1], what was executed since; `is_first` bool (batch,),
-true at the first frame of an episode, where the three before it are not read (zeros will do). The batch may have any
-size, and changes nothing about each row's result.
+the last call returned (that of all four quarter turns side by side, where the agent sees these); `action` float32
+(batch, action) in [-1, 1], what was executed since; `is_first` bool (batch,), true at the first frame of an episode,
+where the three before it are not read (zeros will do). The batch may have any size, and changes nothing about each
+row's result.
 """
 
 from __future__ import annotations
@@ -26,6 +27,7 @@ from latentplan.agent import ModelAgent
 from latentplan.checkpoint import load_model
 from latentplan.config import UserError
 from latentplan.models import State, WorldModel, reflex
+from latentplan.models.symmetry import turned
 
 FORMATS = ("pt2", "onnx")
 SIZES = "actor.json"  # the part of a .pt2 file that names the sizes of its inputs
@@ -37,8 +39,9 @@ EXAMPLE_ROWS = 2  # a batch of one would be built into the program
 class _Decision(nn.Module):
     """Belief update and actor with weights of their own."""
 
-    def __init__(self, weights: reflex.Reflex) -> None:
+    def __init__(self, weights: reflex.Reflex, turns: int) -> None:
         super().__init__()
+        self._turns = turns
         tensors, self._layout = tree_flatten(weights)
         self._names = [f"weight_{index}" for index in range(len(tensors))]
         for name, tensor in zip(self._names, tensors, strict=True):
@@ -48,10 +51,16 @@ class _Decision(nn.Module):
         self, frame: Tensor, deter: Tensor, stoch: Tensor, action: Tensor, is_first: Tensor
     ) -> tuple[Tensor, Tensor, Tensor]:
         weights = tree_unflatten([getattr(self, name) for name in self._names], self._layout)
-        advanced = reflex.advance(weights, State(deter, stoch), action)
-        state = reflex.see(weights, torch.where(is_first[:, None], 0.0, advanced), frame)
-        mean, _ = reflex.act(weights, state)
-        return mean, state.deter, state.stoch
+        turns, (rows, size) = self._turns, action.shape
+        taken = action[:, None].expand(-1, turns, -1).reshape(rows * turns, size)
+        last = State(*(part.reshape(rows * turns, part.shape[1] // turns) for part in (deter, stoch)))
+        advanced = reflex.advance(weights, last, taken).reshape(rows, deter.shape[1])
+        begun = torch.where(is_first[:, None], 0.0, advanced).reshape(last.deter.shape)
+        state = reflex.see(weights, begun, turned(frame, turns))
+        modes, _ = reflex.act(weights, state)
+        mean = modes.reshape(rows, turns, size).mean(1)
+        deters, stochs = (part.reshape(rows, part.shape[1] * turns) for part in state)
+        return mean, deters, stochs
 
 
 def export_actor(agent_or_checkpoint: ModelAgent | str | Path, path: str | Path, format: str = "pt2") -> Path:
@@ -96,11 +105,16 @@ def export_actor(agent_or_checkpoint: ModelAgent | str | Path, path: str | Path,
 
 def sizes(model: WorldModel) -> dict[str, int]:
     """Sizes of a program's vectors: `deter`, `stoch` and `action`."""
-    return {"deter": model.config.deter_dim, "stoch": model.config.latent_dim, "action": model.action_dim}
+    turns = model.config.turns
+    return {
+        "deter": turns * model.config.deter_dim,
+        "stoch": turns * model.config.latent_dim,
+        "action": model.action_dim,
+    }
 
 
 def _trace(model: WorldModel) -> ExportedProgram:
-    decision = _Decision(reflex.lay_out(model)).eval()
+    decision = _Decision(reflex.lay_out(model), model.config.turns).eval()
     batch = Dim("batch", min=1)
     dynamic = {name: {0: batch} for name in INPUTS}
     with torch.no_grad():

@@ -15,6 +15,7 @@ from latentplan.agent import PlanningAgent
 from latentplan.config import Config, PlannerConfig
 from latentplan.goals.expression import Expression
 from latentplan.models import State, WorldModel, kl_divergence
+from latentplan.models.symmetry import flat, mean_over_turns
 from latentplan.planning.conditioned import seen_for
 from latentplan.planning.objectives import Constraint, Term
 
@@ -94,7 +95,9 @@ class GatedAgent(PlanningAgent):
         self.threshold = HEAD_START + _normal_threshold(planning_budget, len(self._names))
         self._scales = {name: RunningScale() for name in (*self._names, "drift")}
         self._num_planned = self._num_decisions = 0
-        self._acting: Any = self.model  # whose actor and value these are: the model's own, or those of a learned goal
+        self._acting: Any = (
+            self.imagined
+        )  # whose actor and value these are: the model's own, or those of a learned goal
         self._mismatch: Tensor | None = None
         self._drift: Tensor | None = None
         self._is_first: Tensor | None = None
@@ -104,7 +107,7 @@ class GatedAgent(PlanningAgent):
     ) -> None:
         """See `PlanningAgent.set_objective`."""
         super().set_objective(objective, constraints)
-        self._acting, _ = seen_for(self.model, self.controller.objective)
+        self._acting, _ = seen_for(self.imagined, self.controller.objective)
 
     @property
     def planned_fraction(self) -> float:
@@ -133,14 +136,16 @@ class GatedAgent(PlanningAgent):
 
     def _see(self, deter: Tensor, frames: Tensor) -> State:
         posterior = self.model.dynamics.posterior(deter, self.model.encoder(frames))
-        self._mismatch = kl_divergence(posterior, self.model.dynamics.prior(deter))
+        mismatch = kl_divergence(posterior, self.model.dynamics.prior(deter))
+        self._mismatch = mismatch.unflatten(0, (-1, self._turns)).mean(1)
         self._drift = self._mismatch if self._drift is None else self._drift + self._mismatch
         return State(deter, posterior.mean)
 
     def _choose(self, state: State) -> Tensor:
         assert self._is_first is not None and self._drift is not None
-        is_own = self._acting is self.model
-        action = self.model.actor(state.features)[0] if is_own else self._acting.policy(state)
+        is_own = self._acting is self.imagined
+        mode = self.model.actor(flat(state).features)[0] if is_own else self._acting.policy(state)
+        action = mean_over_turns(mode, state) if is_own else mode
         is_due, is_tail = self._is_first, torch.zeros_like(self._is_first)
         if self._is_foreign:
             planned, is_tail = self.controller.follow() or (action, is_tail)
@@ -160,7 +165,7 @@ class GatedAgent(PlanningAgent):
     @property
     def _is_foreign(self) -> bool:
         """Whether something is pursued that no actor knows of."""
-        is_unknown = self.controller.objective is not None and self._acting is self.model
+        is_unknown = self.controller.objective is not None and self._acting is self.imagined
         return is_unknown or bool(self.controller.constraints)
 
     def _is_doubtful(self, state: State, action: Tensor, is_due: Tensor) -> Tensor:

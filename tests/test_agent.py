@@ -221,7 +221,7 @@ def test_random_actions_fill_the_bounds_and_repeat_with_their_seed(film):
 
 def _noises(agent, frames, decisions):
     """The noise of each decision, (decision, batch, action), where the agent's own choice is known."""
-    return torch.stack([agent._explore(torch.zeros(frames, 2)) for _ in range(decisions)])
+    return torch.stack([agent.noise.draw(torch.zeros(frames, 2), agent.generator) for _ in range(decisions)])
 
 
 @pytest.mark.parametrize("correlation", [0.0, 0.8])
@@ -236,12 +236,12 @@ def test_a_new_episode_forgets_the_noise_of_the_last(model, film):
     kept, reset = (make_actor(model, explore=True, noise_correlation=0.99, seed=3) for _ in range(2))
     for agent in (kept, reset):
         agent.act(film[0])
-    first = reset._noise
+    first = reset.noise.last
     reset.reset(np.array([True] + [False] * (len(film[0]) - 1)))
     for agent in (kept, reset):
         agent.act(film[1])
-    assert torch.equal(kept._noise[1:], reset._noise[1:])
-    assert not torch.allclose(first[0], reset._noise[0], atol=0.3)
+    assert torch.equal(kept.noise.last[1:], reset.noise.last[1:])
+    assert not torch.allclose(first[0], reset.noise.last[0], atol=0.3)
 
 
 def test_a_planner_without_time_acts_by_its_actor_and_says_so(model, film):

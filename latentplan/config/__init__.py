@@ -95,6 +95,8 @@ class ModelConfig:
         encoder_channels: Channels of the encoder's layers: the first reads 4 x 4 patches, each other halves the grid.
         decoder_channels: Channels of the decoder's 8 x 8 grid of tokens.
         num_bins: Bins of the distributional reward and value heads.
+        turns: Turns of each frame by a quarter that agents keep a belief of, and act by the mean of: 1, or 4 for a body
+            to which every side is the same.
     """
 
     latent_dim: int = LATENT_DIM
@@ -103,8 +105,11 @@ class ModelConfig:
     encoder_channels: tuple[int, ...] = (32, 48, 64)
     decoder_channels: int = 16
     num_bins: int = 63
+    turns: int = 1
 
     def __post_init__(self) -> None:
+        if self.turns not in (1, 4):
+            raise ValueError(f"turns must be 1 or 4, got {self.turns}")
         at_least(self, latent_dim=1, deter_dim=1, hidden_dim=1, decoder_channels=1, num_bins=3)
         if not 1 <= len(self.encoder_channels) <= 5 or min(self.encoder_channels) < 1:
             raise ValueError(f"encoder_channels must hold 1 to 5 positive sizes, got {self.encoder_channels}")
@@ -179,7 +184,8 @@ class Config:
     """Everything that defines a run.
 
     Raises:
-        UserError: Episodes cut while collecting would be too short, or a CUDA graph could not reach the replay.
+        UserError: Episodes cut while collecting would be too short, a CUDA graph could not reach the replay, or agents
+            would see turned frames that nothing has learned from.
     """
 
     env: EnvConfig = field(default_factory=EnvConfig)
@@ -195,6 +201,8 @@ class Config:
         cut, length = self.collection.episode_decisions, self.learning.sequence_length
         if cut is not None and cut < length:
             raise UserError(f"collection.episode_decisions ({cut}) must be at least {length}, learning.sequence_length")
+        if self.model.turns > 1 and self.learning.turned_share == 0.0:
+            raise UserError("model.turns 4 needs learning.turned_share above 0: turned frames have to be learned from")
         if self.learning.cuda_graph and not self.replay.on_device:
             raise UserError("learning.cuda_graph needs replay.on_device: a graph gathers its sequences itself")
 

@@ -13,7 +13,7 @@ from functools import partial
 from typing import Any
 
 import torch
-from einops import rearrange, reduce
+from einops import rearrange, reduce, repeat
 from torch import Tensor
 
 from latentplan.config import EnvConfig, UserError
@@ -114,7 +114,8 @@ def plan_objective(
         frames_per_step: Env frames that one imagined step stands for.
         learned: What `return` stands for.
         guide: Added once where the expression holds no `return`.
-        encode_goal: Gives the latent (latent,) of a picture's path; called once per goal.
+        encode_goal: Gives the latent (latent,) of a picture's path, or one for each turn that beliefs have (turn,
+            latent); called once per goal.
     """
     objectives: list[Objective] = []
     quantities: list[tuple[float, Node]] = []
@@ -176,8 +177,11 @@ def _worth(terms: Sequence[tuple[float, Node]], rollout: Rollout) -> Tensor:
 
 
 def _closeness(goal: Tensor, rollout: Rollout) -> Tensor:
-    latents = torch.stack([state.stoch for state in rollout.states])
-    distances = (latents.float() - goal.float()).square().mean(dim=-1).sqrt()
+    latents, particles = torch.stack([state.stoch for state in rollout.states]).float(), rollout.num_particles
+    turns = torch.atleast_2d(goal.float())
+    order = torch.arange(particles, device=goal.device) % len(turns)
+    targets = repeat(turns[order], "particle latent -> (row particle) latent", row=len(rollout.actions) // particles)
+    distances = (latents - targets).square().mean(dim=-1).sqrt()
     return _discounted(plan_degree(distances / GOAL_DISTANCE), rollout)
 
 

@@ -12,7 +12,7 @@ from functools import partial
 import torch
 from torch import Tensor
 
-from latentplan.planning.model import Model, require
+from latentplan.planning.model import Model, require, supports
 from latentplan.planning.objectives import Objective, Rollout, Term
 
 View = Callable[[Model], Model]
@@ -35,7 +35,9 @@ def conditioned(view: View) -> Objective:
 def seen_for(model: Model, objective: Term | None) -> tuple[Model, Term | None]:
     """What is searched in, and what for: a goal that was learned is the own return (None) of a view of the model."""
     view = objective.view if isinstance(objective, Objective) else None
-    return (model, objective) if view is None else (view(model), None)
+    if view is None:
+        return model, objective
+    return (model.shown_as(view) if supports(model, "shown_as") else view(model)), None  # type: ignore[attr-defined]
 
 
 def _return(view: View, rollout: Rollout) -> Tensor:

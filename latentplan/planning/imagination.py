@@ -60,9 +60,15 @@ class Scorer:
             term.check(model)
         return cls(model, chosen, kept, discounts, use_continues, penalty)
 
+    @property
+    def num_particles(self) -> int:
+        """Rollouts of each candidate: as many as the objective asks for, else as many as the model."""
+        asked = self.objective.num_particles
+        return asked if asked > 1 else getattr(self.model, "num_particles", 1)
+
     def start_rows(self, state: State, num: int) -> State:
         """Where `num` candidates per environment start: rows (batch sample particle) for a state of rows (batch,)."""
-        particles = self.objective.num_particles
+        particles = self.num_particles
         if particles == 1:
             return repeat_rows(state, num)
         several = (
@@ -80,7 +86,7 @@ class Scorer:
             start: What `start_rows` gave.
             actions: Candidates, (batch, sample, horizon, action).
         """
-        batch, particles = actions.shape[0], self.objective.num_particles
+        batch, particles = actions.shape[0], self.num_particles
         rows = rearrange(actions, "batch sample horizon action -> (batch sample) horizon action")
         if particles > 1:
             rows = repeat_rows(rows, particles)

@@ -12,6 +12,9 @@ A model needs one method, `step`. What else it has is detected by name:
     propose(state, num, horizon, generators) -> actions (batch num, horizon, action)    fused: what the policy would do,
                                                      its mode first, then samples, one generator per row of state
     particles(state, num) -> state                   several versions of each row, batch-major: (batch num) rows
+    num_particles                                    in how many of these every candidate is judged; 1 without it
+
+    shown_as(view) -> model                          itself in front of a view of what it wraps, see `conditioned`
 
 Every output must depend on its own row only.
 """

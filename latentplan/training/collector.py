@@ -17,6 +17,7 @@ from latentplan.agent import ActorAgent, ModelAgent, PlanningAgent, RandomAgent
 from latentplan.config import Config, UserError, derive_seed
 from latentplan.envs import make_env, make_from, make_vector_env, render_info
 from latentplan.models import WorldModel
+from latentplan.models.symmetry import unturned
 from latentplan.replay import Rows
 from latentplan.reporting.film import filming
 from latentplan.rollout import episode_seed, run_episodes
@@ -210,7 +211,7 @@ class Collector:
         frames, labels, first = self._frames.copy(), self._labels.copy(), self._ended.copy()
         actions = agent.act(frames)
         state = agent.state if isinstance(agent, ModelAgent) else None
-        deter = None if state is None else state.deter.float().cpu().numpy()
+        deter = None if state is None else unturned(state).deter.float().cpu().numpy()
         plan = None
         if isinstance(agent, PlanningAgent) and agent.controller.objective is None:
             plan = agent.planned_action()

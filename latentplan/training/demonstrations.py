@@ -9,12 +9,13 @@ import torch
 from torch import Tensor
 
 from latentplan.models import Gaussian, State, WorldModel
+from latentplan.models.symmetry import TurnedModel
 from latentplan.planning import CEMPlanner, Plan
 
 
 def plan_actions(
     planner: CEMPlanner,
-    model: WorldModel,
+    model: WorldModel | TurnedModel,
     states: State,
     generator: torch.Generator,
     rows_per_call: int,

@@ -269,7 +269,7 @@ class _Distillation:
         def show(done: int) -> None:
             self._show(f"planning at {done:,} of {total:,} beliefs")
 
-        return plan_actions(self.planning.controller.planner, self.model, here, generator, rows, show)
+        return plan_actions(self.planning.controller.planner, self.planning.imagined, here, generator, rows, show)
 
     def _save(self) -> None:
         self.standing.minutes = self._minutes()

@@ -48,6 +48,8 @@ class Student:
             rows = torch.randint(len(demonstrations), (settings.batch_size,), generator=generator)
             features = demonstrations.states(rows).features.to(device)
             mean, std = (part.to(device) for part in demonstrations.actions(rows))
+            if features.ndim == 3:  # every turn of a belief learns what was planned for all
+                mean, std = (part[:, None].expand(-1, features.shape[1], -1) for part in (mean, std))
             loss = imitation_loss(self.actor, features, mean, std).mean()
             if not torch.isfinite(loss):
                 raise FloatingPointError(f"the imitation loss is not finite at update {update} of round {round_index}")

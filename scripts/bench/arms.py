@@ -102,7 +102,7 @@ def play_arm(checkpoint: str, arm: Arm, seeds: Sequence[int], device: str, threa
     @torch.no_grad()
     def compare(step: Step) -> None:
         if step.action is not None:
-            mode = agent.model.actor(agent.state.features)[0][0].float().cpu().numpy()
+            mode = agent.imagined.policy(agent.state)[0].float().cpu().numpy()
             differs.append(bool((np.abs(mode - step.action) > DIFFERENT_ACTION).any()))
 
     env = make_env(config.env)

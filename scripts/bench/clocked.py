@@ -114,13 +114,15 @@ def measure_error(trial: Trial) -> Iterator[Row]:
 
 def _record(agent: Any, env: SuiteEnv, seed: int) -> tuple[list[Any], list[np.ndarray], list[float]]:
     """Beliefs, the actions taken at them, and the rewards that arrived with the next."""
+    from latentplan.models.symmetry import unturned
+
     beliefs, actions, rewards = [], [], []
     agent.reset()
     frame, _ = env.reset(seed=seed)
     over = False
     while not over:
         action = agent.act(frame)
-        beliefs.append(agent.state)
+        beliefs.append(unturned(agent.state))
         actions.append(action)
         frame, reward, terminated, truncated, _ = env.step(action)
         rewards.append(reward)

@@ -98,6 +98,20 @@ def test_beliefs_are_stored_beside_their_frames(make_collector, tiny):
 
 
 @pytest.mark.parametrize("behaviour", ["planner", "actor"])
+def test_what_is_stored_of_an_agent_that_turns_its_frames_is_the_belief_of_those_stored(
+    make_collector, tiny, behaviour
+):
+    turns = {"model": {"turns": 4}, "learning": {"turned_share": 0.5}}
+    config, collector = tiny("", **turns), make_collector(**turns)
+    (rows,) = collector.collect(weights_of(config), behaviour, 10, 0).rows
+    frames, actions = torch.from_numpy(rows.frames), torch.from_numpy(rows.actions)
+    state = collector.model.see(torch.zeros(1, 16), frames[:1])
+    for time in range(1, 10):
+        state = collector.model.infer(state, actions[time - 1 : time], frames[time : time + 1])
+        assert np.allclose(rows.deter[time], state.deter.detach().numpy(), atol=1e-4)
+
+
+@pytest.mark.parametrize("behaviour", ["planner", "actor"])
 def test_collection_follows_from_seed_round_and_weights(make_collector, tiny, behaviour):
     weights = weights_of(tiny(""))
     one, same, other = (make_collector().collect(weights, behaviour, 12, counter).rows[0] for counter in (3, 3, 4))

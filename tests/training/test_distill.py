@@ -233,6 +233,18 @@ def test_a_student_learns_what_is_demonstrated(model):
     assert (mean - wanted.mean).abs().mean() < 0.15 and float(std.mean()) == pytest.approx(0.3, abs=0.1)
 
 
+def test_a_student_of_turned_beliefs_learns_the_same_from_every_side(model):
+    demonstrations, rows = Demonstrations(), states_of(model, 160)
+    sides = State(*(part.unflatten(0, (40, 4)) for part in rows))
+    planned = Gaussian(torch.linspace(-0.8, 0.8, 40)[:, None], torch.full((40, 1), 0.1))
+    demonstrations.add(sides, planned, 0)
+    student = Student(model.actor, DistillConfig(updates=400, learning_rate=3e-3, batch_size=40))
+    student.learn(demonstrations, 0, lambda done, loss: None)
+    with torch.no_grad():
+        mean = student.actor(sides.features)[0]
+    assert (mean - planned.mean[:, None]).abs().mean() < 0.1
+
+
 def test_labels_that_are_not_finite_stop_learning(model):
     demonstrations = Demonstrations()
     demonstrations.add(states_of(model), Gaussian(torch.full((40, 1), float("nan")), torch.ones(40, 1)), 0)

@@ -1,0 +1,132 @@
+"""Beliefs of four turns: the same world, told four times."""
+
+import pickle
+
+import pytest
+import torch
+
+from latentplan.config import ModelConfig
+from latentplan.models import State, WorldModel
+from latentplan.models.symmetry import QUARTERS, TurnedModel, flat, folded, mean_over_turns, turned, unturned
+from latentplan.planning import CEMPlanner
+from latentplan.planning.check import check_model
+from latentplan.planning.objectives import learned_return, risk, terminal_value
+
+SIZES = ModelConfig(deter_dim=16, hidden_dim=16, encoder_channels=(8, 8), decoder_channels=2, num_bins=15)
+
+
+@pytest.fixture(scope="module")
+def model():
+    torch.manual_seed(0)
+    model = WorldModel(SIZES, action_dim=2, labels={"height": 1.0}).requires_grad_(False)
+    for head in (model.reward_head, model.value_head, model.actor):
+        head.mlp.output.weight.normal_(std=0.5)
+    return model
+
+
+@pytest.fixture
+def beliefs():
+    """Beliefs of three environments, four turns each."""
+    generator = torch.Generator().manual_seed(1)
+    return State(*(torch.randn(3, QUARTERS, size, generator=generator) for size in (16, 32)))
+
+
+def plan_for(model, state, **options):
+    planner = CEMPlanner(action_dim=2, horizon=3, num_samples=24, num_elites=6, num_policy_samples=6, discount=0.9)
+    return planner.plan(model, state, generator=torch.Generator().manual_seed(2), **options)
+
+
+def test_a_frame_comes_first_and_four_turns_lead_back_to_it():
+    frames = torch.randint(0, 256, (2, 64, 64, 3), dtype=torch.uint8)
+    turns = turned(frames).unflatten(0, (2, QUARTERS))
+    assert torch.equal(turns[:, 0], frames)
+    again = turned(turns[:, 3]).unflatten(0, (2, QUARTERS))
+    assert torch.equal(again[:, 1], frames) and not torch.equal(turns[:, 1], frames)
+    assert turned(frames, 1) is frames
+
+
+def test_rows_and_beliefs_are_the_same_numbers(beliefs):
+    rows = flat(beliefs)
+    assert rows.deter.shape == (12, 16)
+    assert all(torch.equal(one, other) for one, other in zip(folded(rows, QUARTERS), beliefs, strict=True))
+    assert torch.equal(unturned(beliefs).stoch, beliefs.stoch[:, 0])
+    assert all(torch.equal(one, other) for one, other in zip(flat(rows), rows, strict=True))
+    assert torch.equal(mean_over_turns(rows.deter, beliefs), beliefs.deter.mean(1))
+
+
+@pytest.mark.parametrize("method", ["value", "continues", "policy"])
+def test_what_is_told_of_a_belief_is_the_mean_of_its_turns(method, model, beliefs):
+    seen = TurnedModel(model)
+    each = torch.stack([getattr(model, method)(State(*(part[:, turn] for part in beliefs))) for turn in range(4)])
+    assert torch.allclose(getattr(seen, method)(beliefs), each.mean(0), atol=1e-2)  # a trunk in bfloat16
+    assert torch.allclose(getattr(seen, method)(flat(beliefs)), getattr(model, method)(flat(beliefs)), atol=1e-2)
+
+
+@pytest.mark.parametrize("method", ["step", "fast_step"])
+def test_a_step_takes_every_turn_along(method, model, beliefs):
+    action = torch.rand(3, 2) * 2 - 1
+    following, reward = getattr(TurnedModel(model), method)(beliefs, action)
+    for turn in range(QUARTERS):
+        alone, _ = getattr(model, method)(State(*(part[:, turn] for part in beliefs)), action)
+        assert torch.allclose(following.stoch[:, turn], alone.stoch, atol=2e-2)
+    rewards = [getattr(model, method)(State(*(part[:, turn] for part in beliefs)), action)[1] for turn in range(4)]
+    assert torch.allclose(reward, torch.stack(rewards).mean(0), atol=2e-2)
+
+
+def test_proposals_begin_with_the_mode_of_every_turn(model, beliefs):
+    streams = [torch.Generator().manual_seed(seed) for seed in range(3)]
+    proposals = TurnedModel(model).propose(beliefs, 6, 5, streams)
+    assert proposals.shape == (18, 5, 2)
+    modes = model.policy(flat(beliefs)).unflatten(0, (3, QUARTERS))
+    assert torch.allclose(
+        proposals.unflatten(0, (3, 6))[:, :4, 0].float(), modes.float(), atol=0.05
+    )  # a trunk in bfloat16
+
+
+def test_a_belief_that_is_the_same_from_every_side_is_planned_for_as_one(model, beliefs):
+    alike = State(*(part[:, :1].expand(-1, QUARTERS, -1).contiguous() for part in beliefs))
+    actions = torch.rand(3, 24, 3, 2) * 2 - 1
+    one, all_turns = (
+        judged(seen, state, actions) for seen, state in ((model, unturned(alike)), (TurnedModel(model), alike))
+    )
+    assert torch.allclose(one, all_turns, atol=2e-2) and one.std() > 0.1
+
+
+def test_a_candidate_is_worth_the_mean_of_what_the_turns_promise(model, beliefs):
+    actions = torch.rand(3, 24, 3, 2) * 2 - 1
+    each = [judged(model, State(*(part[:, turn] for part in beliefs)), actions) for turn in range(QUARTERS)]
+    together = judged(TurnedModel(model), beliefs, actions)
+    assert torch.allclose(together, torch.stack(each).mean(0), atol=2e-2)
+    assert not torch.allclose(together, each[0], atol=0.1)
+
+
+def judged(model, state, actions):
+    """What candidates are worth, (batch, sample)."""
+    from latentplan.planning.imagination import Scorer
+
+    discounts = 0.9 ** torch.arange(actions.shape[2] + 1)
+    scorer = Scorer.build(model, None, (), discounts, terminal_value=None, use_continues=False, penalty=None)
+    return scorer.score(scorer.start_rows(state, actions.shape[1]), actions).returns
+
+
+def test_plans_are_of_environments_and_do_not_depend_on_who_shares_the_call(model, beliefs):
+    seen = TurnedModel(model)
+    plan = plan_for(seen, beliefs)
+    alone = plan_for(seen, State(*(part[1:2] for part in beliefs)))
+    assert plan.actions.shape == (3, 3, 2)
+    assert torch.allclose(plan.actions[1], alone.actions[0], atol=0.1)
+    assert plan_for(seen, beliefs, previous=plan).actions.shape == (3, 3, 2)
+
+
+def test_an_objective_of_so_many_particles_gets_so_many(model, beliefs):
+    seen = TurnedModel(model)
+    assert torch.equal(seen.particles(beliefs, 6).stoch[4:6], beliefs.stoch[0, :2])
+    worst = risk(learned_return() + terminal_value(), measure="worst", num_particles=QUARTERS)
+    assert torch.isfinite(plan_for(seen, beliefs, objective=worst).actions).all()
+
+
+def test_a_planner_accepts_it_in_another_process_too(model, beliefs):
+    seen = pickle.loads(pickle.dumps(TurnedModel(model)))
+    assert torch.allclose(seen.value(beliefs), TurnedModel(model).value(beliefs))
+    assert seen.label_names == ("height",)
+    check_model(seen, beliefs, 2)
