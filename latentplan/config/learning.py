@@ -36,8 +36,8 @@ class LearningConfig:
         entropy_scale: Weight of the actor's entropy, in units of the normalised return.
         imitation_scale: Weight of the actor's KL to the plans it was collected with; 0 leaves it out.
         target_rate: Share of the value network that its slow target takes over at each update.
-        curriculum_task: Task of the same domain whose reward is learned first, on the way to the run's own task or
-            `env.objective`; None starts with that.
+        curriculum_task: Task of the same domain, or expression over its quantities such as `upright`, whose reward is
+            learned first, on the way to the run's own task or `env.objective`; None starts with that.
         curriculum_frames: Simulator frames of the run for which it is, counted before action repeat.
         cuda_graph: Whether an update on a GPU is recorded once, as a CUDA graph, and replayed; needs
             `replay.on_device`. On a CPU it changes nothing.

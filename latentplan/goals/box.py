@@ -21,6 +21,15 @@ from latentplan.planning.model import repeat_rows, take_step
 Interval = tuple[float, float]
 
 
+def paid_degree(shortfalls: Tensor) -> Tensor:
+    """How far a clause is met, in [0, 1], as the simulator scores it: 1 where it is, 0.1 where one margin is missing.
+
+    Args:
+        shortfalls: In margins, any shape; 0 and below is met.
+    """
+    return torch.exp(math.log(0.1) * shortfalls.clamp_min(0.0).square())
+
+
 def plan_degree(shortfalls: Tensor) -> Tensor:
     """How far a clause is met, in (0, 1], with a slope wherever it is not.
 
@@ -29,9 +38,7 @@ def plan_degree(shortfalls: Tensor) -> Tensor:
     Args:
         shortfalls: In margins, any shape; 0 and below is met.
     """
-    missing = shortfalls.clamp_min(0.0)
-    gaussian = torch.exp(math.log(0.1) * missing.square())
-    return 0.5 * (gaussian + 1.0 / (1.0 + missing))
+    return 0.5 * (paid_degree(shortfalls) + 1.0 / (1.0 + shortfalls.clamp_min(0.0)))
 
 
 def box_degree(low: Tensor, high: Tensor, values: Tensor, scales: Tensor) -> Tensor:

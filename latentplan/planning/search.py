@@ -75,7 +75,8 @@ class Search:
             use_continues=options.use_continues,
             penalty=options.constraint_penalty,
         )
-        size = (type(model), self.batch, self.horizon, self.scorer.num_particles, self.dtype, self.device)
+        kind = type(model), type(getattr(model, "model", None))  # what it wraps may be slower than what another does
+        size = (kind, self.batch, self.horizon, self.scorer.num_particles, self.dtype, self.device)
         seconds = None if deadline_ms is None else deadline_ms / 1000
         self.budget = Budget(options.pace, size, options.clock or time.perf_counter, started, seconds, self.device)
 

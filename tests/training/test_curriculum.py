@@ -5,11 +5,13 @@ import pytest
 import torch
 
 from latentplan.config import Config, EnvConfig, LearningConfig, UserError
+from latentplan.config.quantities import scales as quantity_scales
 from latentplan.envs import make_env
+from latentplan.envs.reward import ObjectiveReward
 from latentplan.training.curriculum import Curriculum, summed_reward
 from latentplan.training.state import RunState
 
-LABELS = ("height", "task.stand", "task.walk")
+LABELS = {"height": 0.2, "task.stand": 1.0, "task.walk": 1.0}
 
 
 def first(name, action_repeat=1, frames=100, **env):
@@ -46,7 +48,7 @@ def test_nothing_but_the_rewards_changes(labelled):
 def test_without_another_task_the_batch_is_what_it_was(labelled):
     assert Curriculum(first(None), LABELS, at(0))(labelled) is labelled
     assert Curriculum(first("walk", task="walk"), LABELS, at(0))(labelled) is labelled
-    assert Curriculum(first("walk", task="walk"), (), at(0))(labelled) is labelled
+    assert Curriculum(first("walk", task="walk"), {}, at(0))(labelled) is labelled
 
 
 @pytest.mark.parametrize("task", ["walk", "stand"])
@@ -58,10 +60,35 @@ def test_an_objective_can_follow_any_task(labelled, task):
     assert curriculum(labelled) is labelled
 
 
-@pytest.mark.parametrize(("labels", "told"), [(LABELS, "stand, walk"), ((), "none")])
+@pytest.mark.parametrize(("labels", "told"), [(LABELS, "stand, walk"), ({}, "none")])
 def test_a_task_that_the_simulator_does_not_tell_of_is_refused(labels, told):
-    with pytest.raises(UserError, match=f"curriculum_task 'fly' is unknown; .*: {told}$"):
+    with pytest.raises(UserError, match=f"curriculum_task 'fly' is unknown; .*: {told}; as an expression: .*fly"):
         Curriculum(first("fly"), labels, at(0))
+
+
+@pytest.mark.parametrize("text", ["return", "height + goal:nowhere.png"])
+def test_a_reward_that_no_quantity_tells_is_refused(text):
+    with pytest.raises(UserError, match="curriculum_task"):
+        Curriculum(first(text), LABELS, at(0))
+
+
+def test_an_expression_can_come_first(labelled):
+    height, stand, _ = labelled.labels[:, 1:].unbind(-1)
+    changed = Curriculum(first("2 * height - task(stand)"), LABELS, at(0))(labelled)
+    assert torch.allclose(changed.rewards, 2 * height - stand)
+    clause = Curriculum(first("height > 0.6"), LABELS, at(0))(labelled)
+    missing = (0.6 - height).clamp_min(0.0) / 0.2
+    assert torch.allclose(clause.rewards, 0.1 ** missing.square())
+
+
+def test_an_expression_pays_what_it_pays_as_the_objective_of_a_run(labelled):
+    text, scales = "upright - 0.2 * abs(pole_speed) + (upright > 0.5 and pole_speed < 1.0)", quantity_scales("pendulum")
+    labels = torch.randn(4, 6, len(scales), generator=torch.Generator().manual_seed(0))
+    paid = ObjectiveReward(text, "pendulum")
+    expected = [[paid(row) for row in rows[1:].double().numpy()] for rows in labels]
+    config = first(text, domain="pendulum", task="swingup")
+    changed = Curriculum(config, scales, at(0))(labelled._replace(labels=labels))
+    assert torch.allclose(changed.rewards.double(), torch.tensor(expected, dtype=torch.float64), atol=1e-5)
 
 
 @pytest.mark.parametrize("action_repeat", [1, 2, 4, 8])
