@@ -19,7 +19,7 @@ TASKS = {
     "cheetah": ("run", 4),
     "finger": ("spin", 2),
     "ball_in_cup": ("catch", 4),
-    "pendulum": ("swingup", 2),
+    "pendulum": ("swingup", 4),
 }
 
 
