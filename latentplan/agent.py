@@ -28,6 +28,7 @@ class ModelAgent:
 
     Attributes:
         state: The belief, `deter` (batch, deter) and `stoch` (batch, latent); (batch, 4, ...) where it is of all turns.
+        imagined: The world model as planners see it, whose states are these beliefs.
         last_source: What the most recent action came from, "plan", "tail" (of an older plan) or "actor"; a list of
             these where environments of a batch can differ.
 

@@ -107,14 +107,34 @@ class TurnedModel:
         return mean_over_turns(self.model.policy(flat(state), generator), state)
 
     def propose(self, state: State, num: int, horizon: int, generators: Sequence[torch.Generator]) -> Tensor:
-        """What the actor does from each turn in turn, (batch num, horizon, action): its modes first, then samples."""
-        each = -(-num // QUARTERS)
-        streams = [generator for generator in generators for _ in range(QUARTERS)]
-        rows = self.model.propose(flat(state), each, horizon, streams)
-        by_turn = rearrange(
-            rows, "(batch turn each) time action -> batch (each turn) time action", turn=QUARTERS, each=each
-        )
-        return by_turn[:, :num].flatten(0, 1)
+        """The mode of `policy`, then what the actor does from single turns, each in turn: its modes, then samples.
+
+        Args:
+            state: Beliefs (batch, turn, size).
+            num: Sequences from each.
+            horizon: Model steps.
+            generators: One stream per belief.
+
+        Returns:
+            Sequences (batch num, horizon, action).
+        """
+        each = -(-(num - 1) // QUARTERS)
+        proposals = self._follow(state, horizon).unsqueeze(1)
+        if each:
+            streams = [generator for generator in generators for _ in range(QUARTERS)]
+            rows = self.model.propose(flat(state), each, horizon, streams)
+            pattern = "(batch turn each) time action -> batch (each turn) time action"
+            by_turn = rearrange(rows, pattern, turn=QUARTERS, each=each)
+            proposals = torch.cat([proposals.to(rows.dtype), by_turn], 1)
+        return proposals[:, :num].flatten(0, 1)
+
+    def _follow(self, state: State, horizon: int) -> Tensor:
+        """The mode of `policy` and of what follows from it, (batch, horizon, action)."""
+        actions: list[Tensor] = []
+        for _ in range(horizon):
+            actions.append(self.policy(state))
+            state, _ = self.fast_step(state, actions[-1])
+        return torch.stack(actions, 1)
 
     @staticmethod
     def _imagine(

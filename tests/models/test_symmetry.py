@@ -73,14 +73,16 @@ def test_a_step_takes_every_turn_along(method, model, beliefs):
     assert torch.allclose(reward, torch.stack(rewards).mean(0), atol=2e-2)
 
 
-def test_proposals_begin_with_the_mode_of_every_turn(model, beliefs):
-    streams = [torch.Generator().manual_seed(seed) for seed in range(3)]
-    proposals = TurnedModel(model).propose(beliefs, 6, 5, streams)
-    assert proposals.shape == (18, 5, 2)
-    modes = model.policy(flat(beliefs)).unflatten(0, (3, QUARTERS))
-    assert torch.allclose(
-        proposals.unflatten(0, (3, 6))[:, :4, 0].float(), modes.float(), atol=0.05
-    )  # a trunk in bfloat16
+@pytest.mark.parametrize("num", [1, 3, 6])
+def test_proposals_begin_with_the_mode_of_all_turns_then_those_of_each(num, model, beliefs):
+    seen, streams = TurnedModel(model), [torch.Generator().manual_seed(seed) for seed in range(3)]
+    proposals = seen.propose(beliefs, num, 5, streams)
+    assert proposals.shape == (3 * num, 5, 2)
+    modes = torch.cat([seen.policy(beliefs)[:, None], model.policy(flat(beliefs)).unflatten(0, (3, QUARTERS))], 1)
+    first = proposals.unflatten(0, (3, num))[:, :, 0]
+    assert torch.allclose(first[:, :5].float(), modes[:, :num].float(), atol=0.05)  # a trunk in bfloat16
+    state, _ = seen.step(beliefs, proposals[::num, 0])
+    assert torch.allclose(proposals[::num, 1].float(), seen.policy(state).float(), atol=0.05)
 
 
 def test_a_belief_that_is_the_same_from_every_side_is_planned_for_as_one(model, beliefs):
