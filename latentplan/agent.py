@@ -15,7 +15,7 @@ from latentplan.goals.objective import plan_goals
 from latentplan.models import State, WorldModel, reflex
 from latentplan.models.heads import sample_action
 from latentplan.models.noise import CorrelatedNoise
-from latentplan.models.symmetry import TurnedModel, flat, folded, mean_over_turns, turned, unturned
+from latentplan.models.symmetry import TurnedModel, flat, folded, mean_over_turns, per_turn, turned, unturned
 from latentplan.planning import CEMPlanner, ModelPredictiveController
 from latentplan.planning.objectives import Constraint, Term
 
@@ -141,11 +141,11 @@ class ModelAgent:
         if self.state is not None and len(self.state.deter) != len(frames):
             raise ValueError(f"got {len(frames)} frames after {len(self.state.deter)}: call reset() between batches")
         frames, turns = turned(frames, self._turns), self._turns
-        deter = self.model.dynamics.initial(len(frames)).deter
-        if self.state is not None and self._action is not None:
-            deter = reflex.advance(self._weights, flat(self.state), self._action.repeat_interleave(turns, 0))
+        if self.state is None or self._action is None:
+            return folded(self._see(self.model.dynamics.initial(len(frames)).deter, frames), turns)
+        deter = reflex.advance(self._weights, flat(self.state), per_turn(self._action, turns))
         if self._forget is not None:
-            deter = torch.where(self._forget.repeat_interleave(turns)[:, None], 0.0, deter)
+            deter = torch.where(per_turn(self._forget, turns)[:, None], 0.0, deter)
         return folded(self._see(deter, frames), turns)
 
     def _see(self, deter: Tensor, frames: Tensor) -> State:

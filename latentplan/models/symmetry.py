@@ -36,7 +36,12 @@ def folded(state: State, turns: int) -> State:
 
 def flat(state: State) -> State:
     """The rows (batch turn, size) of a belief."""
-    return State(*(part.flatten(0, -2) for part in state))
+    return state if state.deter.ndim == 2 else State(*(part.flatten(0, 1) for part in state))
+
+
+def per_turn(values: Tensor, turns: int) -> Tensor:
+    """What holds for each environment, (batch, ...), for the rows of its belief, (batch turn, ...)."""
+    return values if turns == 1 else values.repeat_interleave(turns, 0)
 
 
 def unturned(state: State) -> State:
@@ -142,5 +147,5 @@ class TurnedModel:
     ) -> tuple[State, Tensor]:
         if state.deter.ndim == 2:
             return function(state, actions)
-        following, rewards = function(flat(state), actions.repeat_interleave(QUARTERS, 0))
+        following, rewards = function(flat(state), per_turn(actions, QUARTERS))
         return folded(following, QUARTERS), mean_over_turns(rewards, state)
