@@ -112,6 +112,14 @@ def test_a_goal_is_planned_for_from_every_side(model, film):
     assert agent.act(film[0]).shape == (3, 2)
 
 
+def test_a_goal_that_was_learned_is_pursued_from_every_side(model, film):
+    learned = copy.deepcopy(model)
+    learned.add_goal_heads(16)
+    for agent in (PlanningAgent(learned, CONFIG, 0.9), GatedAgent(learned, CONFIG, 0.9, planning_budget=0.5)):
+        agent.set_objective("distance < 0.05")
+        assert all(agent.act(frames).shape == (3, 2) for frames in film)
+
+
 def test_a_picture_is_reached_for_from_every_side(model, film, tmp_path):
     import cv2
 
