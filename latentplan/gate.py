@@ -95,9 +95,7 @@ class GatedAgent(PlanningAgent):
         self.threshold = HEAD_START + _normal_threshold(planning_budget, len(self._names))
         self._scales = {name: RunningScale() for name in (*self._names, "drift")}
         self._num_planned = self._num_decisions = 0
-        self._acting: Any = (
-            self.imagined
-        )  # whose actor and value these are: the model's own, or those of a learned goal
+        self._acting: Any = self.imagined  # or, of a learned goal, what shows its actor and value
         self._mismatch: Tensor | None = None
         self._drift: Tensor | None = None
         self._is_first: Tensor | None = None
