@@ -91,11 +91,11 @@ def test_an_action_is_the_mean_of_what_one_would_do_from_each_side(model, film):
     assert np.allclose(ActorAgent(model, CONFIG).act(film[0]), np.mean(sides, axis=0), atol=1e-5)
 
 
+@pytest.mark.parametrize("make", ["planner", "actor"], indirect=True)  # the others share searches or a threshold
 def test_environments_of_a_batch_do_not_feel_each_other(make, model, film):
     together, alone = make(model), make(model)
     for frames in film:
-        if not isinstance(together, BackgroundAgent):  # which share their plans' searches
-            assert np.allclose(together.act(frames)[1], alone.act(frames[1]), atol=0.1)
+        assert np.allclose(together.act(frames)[1], alone.act(frames[1]), atol=0.1)
 
 
 def test_an_episode_that_ends_is_forgotten_from_every_side(model, film):

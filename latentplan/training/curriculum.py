@@ -32,7 +32,7 @@ class Curriculum(lightning.Callback):
 
     Args:
         config: Settings of the run: what comes first, and for how many simulator frames. Nothing is replaced when that
-            is the run's own task; a run with an objective has none.
+            is the run's own task, or its own objective where it has one.
         labels: The quantities that come with each frame, in their order, and their scales.
         state: Clocks of the run.
 
@@ -49,7 +49,7 @@ class Curriculum(lightning.Callback):
         self._terms: tuple[tuple[float, Node], ...] = ()
         self._columns, self.note = {name: column for column, name in enumerate(labels)}, ""
         first = config.learning.curriculum_task
-        own = config.env.task if config.env.objective is None else None
+        own = config.env.task if config.env.objective is None else config.env.objective
         if self._frames > 0 and first not in (None, own):
             self._terms = _read(first, labels)
             self.note = f"; first {first}, for {self._frames:,} frames"

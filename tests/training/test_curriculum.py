@@ -140,6 +140,15 @@ def test_values_of_another_reward_are_forgotten_once_also_by_a_run_that_is_resum
     assert learner.forgotten == times
 
 
+def test_an_objective_that_is_what_would_come_first_is_learned_from_the_start(labelled):
+    learner, state = Learner(), at(0)
+    curriculum = Curriculum(first("height", objective="height"), LABELS, state)
+    assert curriculum(labelled) is labelled and curriculum.note == ""
+    state.env_frames = 101
+    curriculum.on_train_epoch_start(None, learner)
+    assert learner.forgotten == 0
+
+
 def test_a_run_says_what_comes_first():
     assert Curriculum(first("stand", frames=40_000), LABELS, at(0)).note == "; first stand, for 40,000 frames"
     assert Curriculum(first("stand", frames=0), LABELS, at(0)).note == ""
