@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from latentplan.config import UserError
 from latentplan.envs.quantities import clause_degree, scales
-from latentplan.goals.expression import GoalImage, LearnedReturn, evaluate
-from latentplan.goals.parser import parse_objective
+from latentplan.goals.expression import evaluate
+from latentplan.goals.parser import parse_reward
 
 
 class ObjectiveReward:
@@ -22,11 +21,8 @@ class ObjectiveReward:
     """
 
     def __init__(self, text: str, domain: str) -> None:
-        self._expression = parse_objective(text, scales(domain))
+        self._expression = parse_reward(text, scales(domain), "env.objective")
         self._names = tuple(scales(domain))
-        for _, term in self._expression.terms:
-            if isinstance(term, LearnedReturn | GoalImage):
-                raise UserError(f"env.objective {text!r} must be made of named quantities and tasks alone")
 
     def __call__(self, values: np.ndarray) -> float:
         """The reward where the quantities have these true values, (quantity,)."""

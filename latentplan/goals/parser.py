@@ -72,6 +72,18 @@ def parse_objective(text: str, scales: Mapping[str, float]) -> Expression:
     return Expression(text.strip(), tuple(parser.split_sum(parser.parse(), 1.0)))
 
 
+def parse_reward(text: str, scales: Mapping[str, float], setting: str) -> Expression:
+    """What a body is to be paid: an objective of quantities and tasks alone, without `return` and goal images.
+
+    Raises:
+        UserError: The text is no such thing; names the setting.
+    """
+    expression = parse_objective(text, scales)
+    if any(isinstance(term, LearnedReturn | GoalImage) for _, term in expression.terms):
+        raise UserError(f"{setting} {text!r} must be made of named quantities and tasks alone")
+    return expression
+
+
 def parse_constraints(text: str, scales: Mapping[str, float]) -> tuple[Clause, ...]:
     """Inequalities that must hold at every moment, separated by `;` or joined by `and`.
 

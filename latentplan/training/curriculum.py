@@ -16,8 +16,8 @@ from torch import Tensor
 from latentplan.config import Config, UserError
 from latentplan.config.quantities import TASK_PREFIX
 from latentplan.goals.box import paid_degree
-from latentplan.goals.expression import GoalImage, LearnedReturn, Name, Node, evaluate
-from latentplan.goals.parser import parse_objective
+from latentplan.goals.expression import Name, Node, evaluate
+from latentplan.goals.parser import parse_reward
 from latentplan.replay import Batch
 from latentplan.training.state import RunState
 
@@ -77,16 +77,13 @@ def _read(text: str, labels: Mapping[str, float]) -> tuple[tuple[float, Node], .
     if TASK_PREFIX + text in labels:
         return ((1.0, Name(TASK_PREFIX + text)),)
     try:
-        expression = parse_objective(text, labels)
+        return parse_reward(text, labels, "learning.curriculum_task").terms
     except UserError as error:
         tasks = [name.removeprefix(TASK_PREFIX) for name in labels if name.startswith(TASK_PREFIX)]
         raise UserError(
             f"learning.curriculum_task {text!r} is unknown; this body's simulator tells what these tasks pay: "
             f"{', '.join(tasks) or 'none'}; as an expression: {error}"
         ) from None
-    if any(isinstance(node, LearnedReturn | GoalImage) for _, node in expression.terms):
-        raise UserError(f"learning.curriculum_task {text!r} must be made of named quantities and tasks alone")
-    return expression.terms
 
 
 def summed_reward(values: Tensor, action_repeat: int) -> Tensor:

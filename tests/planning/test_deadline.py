@@ -160,6 +160,16 @@ def test_a_slower_model_is_noticed(warm, model, state, clock):
     assert plan.info["iterations"].tolist() == [2, 2] and spent <= 50
 
 
+def test_a_wrapper_around_another_model_is_another_problem(make, model, state, clock):
+    class Wrapper(FunctionModel):
+        def __init__(self, model):
+            self.model, self.step, self.rollout = model, model.step, model.rollout
+
+    planner, slower = make(), type("Slower", (TimedModel,), {})
+    planner.plan(Wrapper(slower(clock, 50.0)), state)
+    assert planner.plan(Wrapper(model), state, deadline_ms=35).info["iterations"].sum() > 0
+
+
 def test_what_never_fitted_is_never_tried_again(warm, model, state):
     planner, _ = warm
     before = model.num_rollouts
