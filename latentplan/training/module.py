@@ -16,7 +16,7 @@ from latentplan.models.heads import ScalarHead
 from latentplan.replay import Batch, Replay
 from latentplan.training.augmentation import quarter_turns
 from latentplan.training.losses import Learned, imagine, imitation_loss, lambda_return, value_loss, world_model_loss
-from latentplan.training.optimization import descend, follow, return_scale
+from latentplan.training.optimization import descend, follow, keep_freed_memory, return_scale
 from latentplan.training.snapshot import Snapshot
 
 
@@ -39,6 +39,7 @@ class Learner(lightning.LightningModule):
 
     def __init__(self, model: WorldModel, config: LearningConfig, discount: float, replay: Replay, seed: int) -> None:
         super().__init__()
+        keep_freed_memory()
         self.automatic_optimization = False
         self.model, self.config, self.discount, self.replay, self.seed = model, config, discount, replay, seed
         self.target_value = copy.deepcopy(model.value_head).requires_grad_(False)

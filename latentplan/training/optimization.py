@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import ctypes
+import os
 from typing import Any
 
 import torch
 from torch import Tensor, nn
 
 RETURN_RANGE_RATE = 0.01
+_M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD = -1, -3  # names of <malloc.h>
+_KEPT_BYTES = {_M_TRIM_THRESHOLD: 2**31 - 1, _M_MMAP_THRESHOLD: 32 * 2**20}
 
 
 def descend(optimizer: torch.optim.Optimizer, loss: Tensor, max_norm: float, update: int) -> Tensor:
@@ -71,3 +75,13 @@ def return_scale(range_so_far: Tensor, returns: Tensor) -> Tensor:
     spread = torch.quantile(flat, 0.95) - torch.quantile(flat, 0.05)
     range_so_far.lerp_(torch.where(torch.isfinite(spread), spread, range_so_far), RETURN_RANGE_RATE)
     return range_so_far.clamp_min(1.0)
+
+
+def keep_freed_memory() -> bool:
+    """Ask the C library to keep the memory that this process frees, for the next update; False where it cannot.
+
+    Every update allocates the same large tensors. By default glibc hands such blocks back to the system at once, which
+    then clears each page again before its next use (mallopt(3): M_MMAP_THRESHOLD, M_TRIM_THRESHOLD).
+    """
+    mallopt = getattr(ctypes.CDLL(None), "mallopt", None) if os.name == "posix" else None
+    return mallopt is not None and all(mallopt(option, size) == 1 for option, size in _KEPT_BYTES.items())
