@@ -217,6 +217,7 @@ def test_the_program_ends_though_nobody_closed_and_leaves_no_process(run_python,
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="reads /proc")
 def test_processes_are_spawned_not_forked():
     with BackgroundPlanner(CEM, MODEL) as background:
+        background.wait_until_ready(60.0)  # a process that has not yet begun its program names none
         command = open(f"/proc/{background.process.pid}/cmdline").read()
         assert "spawn_main" in command
         assert type(background.process).__name__ == "SpawnProcess" and background.process.daemon
