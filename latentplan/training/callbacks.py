@@ -25,6 +25,8 @@ if TYPE_CHECKING:
     from latentplan.training.module import Learner
     from latentplan.training.progress import Progress
 
+SAVE_MINUTES = 5.0
+
 COLUMNS = (
     *("env_frames", "decisions", "updates", "minutes", "episode_return"),
     *("planner_return", "actor_return", "planner_minus_actor"),
@@ -205,14 +207,15 @@ class Save(lightning.Callback):
         self.folder, self.config, self.experience, self.state, self.facts = folder, config, experience, state, facts
         self._loaded_optimizers = optimizers
         self._kept_evaluations = len(state.evaluations)
+        self._saved_minutes = state.minutes
 
     def on_train_epoch_end(self, trainer: lightning.Trainer, learner: Learner) -> None:  # type: ignore[override]
-        """Save after every evaluation."""
-        if len(self.state.evaluations) == self._kept_evaluations:
+        """Save after every evaluation, and `SAVE_MINUTES` after the last save."""
+        is_judged = len(self.state.evaluations) > self._kept_evaluations
+        if not is_judged and self.state.minutes < self._saved_minutes + SAVE_MINUTES:
             return
         self._kept_evaluations = len(self.state.evaluations)
-        latest = self.state.evaluations[-1]
-        if latest["planner"] > self.state.best_return:
+        if is_judged and (latest := self.state.evaluations[-1])["planner"] > self.state.best_return:
             self.state.best_return = latest["planner"]
             judged = copy.deepcopy(learner.model)
             weights = self.experience.evaluated_weights
@@ -224,6 +227,7 @@ class Save(lightning.Callback):
         """Save the last agent and the state of the run."""
         self.save_agent("last", learner.model, self.clocks(learner))
         self.save_run(trainer, learner)
+        self._saved_minutes = self.state.minutes
 
     def save_run(self, trainer: lightning.Trainer, learner: Learner) -> None:
         """Save what it takes to resume."""

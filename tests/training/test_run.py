@@ -1,6 +1,7 @@
 """Whole runs, tiny: what they leave behind, how they repeat, stop and go on."""
 
 import csv
+import itertools
 import os
 import shutil
 import signal
@@ -11,8 +12,7 @@ import torch
 
 from latentplan.checkpoint import load_agent, read_info
 from latentplan.config import UserError
-from latentplan.training import resume, train
-from latentplan.training.callbacks import COLUMNS
+from latentplan.training import callbacks, resume, train
 from latentplan.training.claim import claim
 from latentplan.training.run import INTERRUPTED
 
@@ -70,10 +70,10 @@ def test_every_update_was_made(finished):
 
 def test_metrics_have_the_promised_columns(finished):
     rows, epochs = rows_of(finished.run_dir), epochs_of(finished.run_dir)
-    assert tuple(rows[0]) == COLUMNS
+    assert tuple(rows[0]) == callbacks.COLUMNS
     clocks = [[float(row[name]) for row in epochs] for name in ("env_frames", "decisions", "updates", "minutes")]
     assert all(np.all(np.diff(clock) >= 0) for clock in clocks)
-    losses = COLUMNS[COLUMNS.index("reconstruction") :]
+    losses = callbacks.COLUMNS[callbacks.COLUMNS.index("reconstruction") :]
     assert all(np.isfinite(float(row[name])) for row in epochs for name in losses)
     assert any(row["episode_return"] for row in epochs)
 
@@ -281,6 +281,18 @@ def test_metrics_after_the_last_save_are_written_anew(tiny, dot, tmp_path):
     resume(run.run_dir, frames=75, make_env=dot)
     assert [int(row["updates"]) for row in epochs_of(run.run_dir)] == [6, 12, 18, 24]
     assert lost not in (run.run_dir / "metrics.csv").read_text()
+
+
+def test_what_a_crash_loses_is_minutes_not_evaluations(tiny, dot, tmp_path, monkeypatch):
+    steps = itertools.count(-45 - 2 * 20 - 3 * 15)  # of the prefill, its evaluation and three rounds
+    monkeypatch.setattr(callbacks, "SAVE_MINUTES", 0.0)
+    step = {"step": lambda self, action: dot.step(self, action) if next(steps) < 5 else 1 / 0}
+    config = tiny(tmp_path / "run", evaluation={"every_frames": 10**6}, run={"frames": 120})
+    with pytest.raises(ZeroDivisionError):
+        train(config, type("Crashing", (dot,), step))
+    assert (before := saved_state(tmp_path / "run"))["run"]["env_frames"] == 75
+    resume(tmp_path / "run", make_env=dot)
+    assert_goes_on(before, saved_state(tmp_path / "run"))
 
 
 def test_a_small_budget_cuts_the_prefill_short(tiny, dot, tmp_path):
