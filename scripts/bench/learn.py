@@ -1,19 +1,26 @@
-"""`benchmark.py learn`: learning curves over tasks and seeds."""
+"""`benchmark.py learn`: learning curves over tasks and seeds, beside published returns."""
 
 from __future__ import annotations
 
+import itertools
 import json
+import math
+import statistics
 import subprocess
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
+from bench.anchors import FRAMES, published
 from bench.options import Flags, choice, numbers, words
 from bench.report import format_table, interval, number, write_csv, write_json
 from latentplan.cli import parse_train
 from latentplan.compose import SECTIONS
 from latentplan.config import UserError
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 FLAGS = {
     "--tasks": ("T,T", "domain-task each (cartpole-swingup,walker-walk)"),
@@ -31,6 +38,8 @@ SETTINGS = tuple(SECTIONS)
 FORWARDED = ("--preset", "--device", "--config")
 FINISHED = "finished.json"
 MODES = ("planner", "actor")
+NEAR = 0.03  # of a number of frames: how far from it an evaluation may be that stands for it
+OWN = "latentplan"
 
 
 class Point(NamedTuple):
@@ -63,19 +72,23 @@ def run(flags: Flags) -> int:
     out.mkdir(parents=True, exist_ok=True)
     for (task, seed), folder in folders.items():
         _train(task, seed, folder, budget, extra)
-    curves = [read_run(task, seed, folder / "metrics.csv", mode) for (task, seed), folder in folders.items()]
+    curves = [read_run(task, seed, folder, mode) for (task, seed), folder in folders.items()]
     write_csv(out / "curves.csv", [{"task": c.task, "seed": c.seed, **p._asdict()} for c in curves for p in c.points])
     print(run_table(curves, thresholds))
     finals = final_estimates(curves)
     print(format_table(["task", "runs", "interquartile mean", "95 %"], [_final_row(*item) for item in finals.items()]))
-    write_json(out / "summary.json", {"mode": mode, "runs": run_facts(curves, thresholds), "final": finals})
+    anchors = {task: compare(task, curves, thresholds) for task in dict.fromkeys(tasks)}
+    for task, rows in anchors.items():
+        print(anchor_table(task, rows, thresholds))
+    runs = run_facts(curves, thresholds)
+    write_json(out / "summary.json", {"mode": mode, "runs": runs, "final": finals, "anchors": anchors})
     plot_runs(curves, mode, out / "curves.png")
     print(f"curves.csv, summary.json and curves.png are in {out}")
     return 0
 
 
-def read_run(task: str, seed: int, metrics_csv: Path, mode: str) -> Curve:
-    """The evaluations that a run recorded.
+def read_run(task: str, seed: int, folder: Path, mode: str) -> Curve:
+    """The evaluations that a run recorded, and the one that ended it.
 
     Raises:
         UserError: There are none.
@@ -83,11 +96,16 @@ def read_run(task: str, seed: int, metrics_csv: Path, mode: str) -> Curve:
     from latentplan.reporting.curves import read_curve
 
     column = f"{mode}_return"
-    frames, returns = read_curve(metrics_csv, "env_frames", column)
-    minutes, _ = read_curve(metrics_csv, "minutes", column)
-    if not frames:
-        raise UserError(f"{metrics_csv} holds no evaluation; lower --evaluation.every_frames or train longer")
-    return Curve(task, seed, [Point(*point) for point in zip(frames, minutes, returns, strict=True)])
+    frames, returns = read_curve(folder / "metrics.csv", "env_frames", column)
+    minutes, _ = read_curve(folder / "metrics.csv", "minutes", column)
+    points = [Point(*point) for point in zip(frames, minutes, returns, strict=True)]
+    if (folder / "final.json").exists():
+        final = json.loads((folder / "final.json").read_text())
+        points = [point for point in points if point.env_frames < final["env_frames"]]
+        points.append(Point(final["env_frames"], final["minutes"], final[mode]))
+    if not points:
+        raise UserError(f"{folder} holds no evaluation; lower --evaluation.every_frames or train longer")
+    return Curve(task, seed, points)
 
 
 def first_reaching(curve: Curve, threshold: float) -> Point | None:
@@ -144,24 +162,88 @@ def final_estimates(curves: Sequence[Curve]) -> dict[str, dict[str, Any]]:
     }
 
 
+def compare(task: str, curves: Sequence[Curve], thresholds: Sequence[int]) -> dict[str, dict[str, Any]]:
+    """A task's runs beside what is published, by method, its own first.
+
+    Returns:
+        Per method `returns` by frames (of its own runs the interquartile mean over those evaluated near so many frames,
+        with `intervals`), and `frames_to` each threshold: of published methods the first of the frames at which a
+        return is known, of the runs their median, None where half of them or more do not reach it.
+    """
+    own = [curve for curve in curves if curve.task == task]
+    returns, intervals = {}, {}
+    for frames in FRAMES:
+        near = [point.total_return for curve in own if (point := _nearest(curve, frames)) is not None]
+        if near:
+            returns[frames], *intervals[frames] = _interquartile(near)
+    rows: dict[str, dict[str, Any]] = {OWN: {"returns": returns, "intervals": intervals}}
+    rows[OWN]["frames_to"] = {str(threshold): _median_frames(own, threshold) for threshold in thresholds}
+    for method, known in published(task).items():
+        reached = {
+            str(threshold): next((frames for frames in sorted(known) if known[frames] >= threshold), None)
+            for threshold in thresholds
+        }
+        rows[method] = {"returns": dict(known), "frames_to": reached}
+    return rows
+
+
+def anchor_table(task: str, rows: Mapping[str, Mapping[str, Any]], thresholds: Sequence[int]) -> str:
+    """What `compare` found, for people."""
+    table = []
+    for method, facts in rows.items():
+        cells = [number(facts["returns"].get(frames), 0) for frames in FRAMES]
+        reached = [number(facts["frames_to"][str(threshold)], 0) for threshold in thresholds]
+        table.append([method, *cells, *reached])
+    columns = [*(f"at {frames:,}" for frames in FRAMES), *(f"frames to {threshold}" for threshold in thresholds)]
+    return format_table([task, *columns], table)
+
+
 def plot_runs(curves: Sequence[Curve], mode: str, png: Path) -> None:
     """Evaluation return against frames: a panel per task, a line per seed."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
     tasks = list(dict.fromkeys(curve.task for curve in curves))
-    figure = Figure(figsize=(5 * len(tasks), 4), layout="constrained")
+    figure = Figure(figsize=(6.5 * len(tasks), 4), layout="constrained")
     FigureCanvasAgg(figure)
     panels = figure.subplots(1, len(tasks), squeeze=False)[0]
     for axes, task in zip(panels, tasks, strict=True):
         for curve in (curve for curve in curves if curve.task == task):
             frames, _, returns = zip(*curve.points, strict=True)
             axes.plot(frames, returns, marker="o", markersize=3, label=f"seed {curve.seed}")
+        _mark_published(axes, task, axes.get_xlim()[1])
         axes.set(title=task, xlabel="environment frames", ylabel=f"evaluation return, {mode}")
         axes.set_ylim(bottom=min(0.0, axes.get_ylim()[0]))
         axes.grid(alpha=0.25)
-        axes.legend(loc="upper left", frameon=False)
+        axes.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), frameon=False, fontsize="small")
     figure.savefig(png, dpi=120, format="png")
+
+
+def _mark_published(axes: Axes, task: str, last: float) -> None:
+    """What methods are known to earn at the frames that a panel shows."""
+    for method, marker in zip(published(task).items(), itertools.cycle("sD^v<>PX*hp")):
+        name, known = method
+        shown = {frames: value for frames, value in known.items() if frames <= last}
+        if shown:
+            axes.plot(*zip(*shown.items(), strict=True), marker, color="0.45", markersize=5, label=name)
+
+
+def _nearest(curve: Curve, frames: int) -> Point | None:
+    """The evaluation nearest to so many frames; None where all are too far off."""
+    point = min(curve.points, key=lambda point: abs(point.env_frames - frames))
+    return point if abs(point.env_frames - frames) <= NEAR * frames else None
+
+
+def _interquartile(returns: Sequence[float]) -> tuple[float, float | None, float | None]:
+    from bench.statistics import interquartile_estimate
+
+    return interquartile_estimate([returns])
+
+
+def _median_frames(curves: Sequence[Curve], threshold: int) -> float | None:
+    reached = [point.env_frames if (point := first_reaching(curve, threshold)) else math.inf for curve in curves]
+    middle = statistics.median_high(reached)
+    return None if math.isinf(middle) else middle
 
 
 def _train(task: str, seed: int, folder: Path, budget: list[str], extra: list[str]) -> None:
