@@ -36,6 +36,8 @@ class LearningConfig:
         entropy_scale: Weight of the actor's entropy, in units of the normalised return.
         imitation_scale: Weight of the actor's KL to the plans it was collected with; 0 leaves it out.
         target_rate: Share of the value network that its slow target takes over at each update.
+        average_rate: Least weight of the latest update in the average of the weights that acts, is judged and is kept:
+            0.01 averages over some hundred updates (early on over fewer), 1 over none.
         curriculum_task: Task of the same domain, or expression over its quantities such as `upright`, whose reward is
             learned first, on the way to the run's own task or `env.objective`; None starts with that.
         curriculum_frames: Simulator frames of the run for which it is, counted before action repeat.
@@ -65,6 +67,7 @@ class LearningConfig:
     entropy_scale: float = 3e-4
     imitation_scale: float = 0.0
     target_rate: float = 0.02
+    average_rate: float = 0.01
     curriculum_task: str | None = None
     curriculum_frames: int = 0
     cuda_graph: bool = False
@@ -76,8 +79,10 @@ class LearningConfig:
         at_least(self, reconstruction_scale=0.0, dynamics_scale=0.0, representation_scale=0.0, free_nats=0.0)
         at_least(self, overshooting_scale=0.0, reward_scale=0.0, replay_value_scale=0.0, entropy_scale=0.0)
         at_least(self, imitation_scale=0.0, random_shift=0, curriculum_frames=0)
-        above_zero(self, "model_learning_rate", "behaviour_learning_rate", "max_grad_norm", "target_rate")
-        within(self, lambda_=(0.0, 1.0), turned_share=(0.0, 1.0), target_rate=(0.0, 1.0))
+        above_zero(
+            self, "model_learning_rate", "behaviour_learning_rate", "max_grad_norm", "target_rate", "average_rate"
+        )
+        within(self, lambda_=(0.0, 1.0), turned_share=(0.0, 1.0), target_rate=(0.0, 1.0), average_rate=(0.0, 1.0))
         if self.discount is not None and not 0.0 < self.discount <= 1.0:
             raise ValueError(f"discount must lie in (0, 1], got {self.discount}")
 

@@ -65,7 +65,7 @@ class Experience(lightning.Callback):
             self.worker.submit("collect", None, "random", missing, state.rounds)
             self._take_round()
         self.take()
-        weights = {name: value.detach().cpu().numpy().copy() for name, value in learner.model.state_dict().items()}
+        weights = {name: value.detach().cpu().numpy().copy() for name, value in learner.averaged.state_dict().items()}
         behaviour, noisy, goal = turn(settings, state.rounds, state.env_frames)
         decisions = min(settings.round_decisions, self._decisions_left())
         if decisions > 0:
@@ -217,7 +217,7 @@ class Save(lightning.Callback):
         self._kept_evaluations = len(self.state.evaluations)
         if is_judged and (latest := self.state.evaluations[-1])["planner"] > self.state.best_return:
             self.state.best_return = latest["planner"]
-            judged = copy.deepcopy(learner.model)
+            judged = copy.deepcopy(learner.averaged)
             weights = self.experience.evaluated_weights
             judged.load_state_dict({name: torch.from_numpy(value) for name, value in weights.items()})
             self.save_agent("best", judged, {name: latest[name] for name in ("env_frames", "updates", "minutes")})
@@ -225,7 +225,7 @@ class Save(lightning.Callback):
 
     def save(self, trainer: lightning.Trainer, learner: Learner) -> None:
         """Save the last agent and the state of the run."""
-        self.save_agent("last", learner.model, self.clocks(learner))
+        self.save_agent("last", learner.averaged, self.clocks(learner))
         self.save_run(trainer, learner)
         self._saved_minutes = self.state.minutes
 

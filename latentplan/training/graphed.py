@@ -26,9 +26,9 @@ class GraphedLearner(Learner):
     """Learns what `Learner` does, in one thread and one CUDA graph: recorded once, replayed for other sequences.
 
     `training_step` takes rows of replay, (batch, time + 1), instead of a batch. Gathering, augmentation, both losses,
-    clipping, both optimizers, the slow target and the refreshed beliefs are all in the graph, which reads nothing back
-    to the host. So it cannot raise: an update whose gradient is not finite changes no weights, and `catch_up` says so.
-    On a CPU nothing is recorded; the same update is run as it is.
+    clipping, both optimizers, the slow target, averages and the refreshed beliefs are all in the graph, which
+    reads nothing back to the host. So it cannot raise: an update whose gradient is not finite changes no weights, and
+    `catch_up` says so. On a CPU nothing is recorded; the same update is run as it is.
 
     Args:
         model: What is learned.
@@ -72,7 +72,7 @@ class GraphedLearner(Learner):
         if self._graph is not None:
             self._graph.replay()
             # What keeps copies of weights until they change sees it by this count, which a graph leaves alone.
-            torch.autograd.graph.increment_version(self.model.parameters())
+            torch.autograd.graph.increment_version([*self.model.parameters(), *self.averaged.parameters()])
         elif self.device.type == "cuda":
             self._run_aside()
         else:

@@ -8,7 +8,7 @@ from functools import cached_property
 
 import lightning
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from latentplan.config import LearningConfig, derive_seed
 from latentplan.models import State, WorldModel
@@ -16,8 +16,10 @@ from latentplan.models.heads import ScalarHead
 from latentplan.replay import Batch, Replay
 from latentplan.training.augmentation import quarter_turns
 from latentplan.training.losses import Learned, imagine, imitation_loss, lambda_return, value_loss, world_model_loss
-from latentplan.training.optimization import descend, follow, keep_freed_memory, return_scale
+from latentplan.training.optimization import average, descend, follow, keep_freed_memory, return_scale
 from latentplan.training.snapshot import Snapshot
+
+MODEL, BEHAVIOUR = 0, 1  # the two halves of an update, of its parameters and of its optimizers
 
 
 class Learner(lightning.LightningModule):
@@ -26,6 +28,9 @@ class Learner(lightning.LightningModule):
     Behaviour learns in a thread of its own, from a snapshot of the model as it was after its latest update, while the
     model takes the next one; both wait for each other after every update, so results do not depend on timing.
     `catch_up` ends an epoch.
+
+    Who acts, is judged and is kept is `averaged`: what the weights were over the latest updates, on average. From one
+    update to the next they jump about what they tend to, the more so as the learning rates stay what they are.
 
     Args:
         model: What is learned.
@@ -36,6 +41,7 @@ class Learner(lightning.LightningModule):
     """
 
     return_range: Tensor
+    averaged_updates: Tensor
 
     def __init__(self, model: WorldModel, config: LearningConfig, discount: float, replay: Replay, seed: int) -> None:
         super().__init__()
@@ -43,7 +49,9 @@ class Learner(lightning.LightningModule):
         self.automatic_optimization = False
         self.model, self.config, self.discount, self.replay, self.seed = model, config, discount, replay, seed
         self.target_value = copy.deepcopy(model.value_head).requires_grad_(False)
+        self.averaged = copy.deepcopy(model).requires_grad_(False)
         self.register_buffer("return_range", torch.zeros(()))
+        self.register_buffer("averaged_updates", torch.zeros(2))  # of the model, of behaviour
         self.updates = 0
         self.metrics: dict[str, Tensor] = {}
         self._thread = ThreadPoolExecutor(1, thread_name_prefix="behaviour")
@@ -51,14 +59,11 @@ class Learner(lightning.LightningModule):
 
     def configure_optimizers(self) -> list[torch.optim.Optimizer]:
         """One Adam for the world model, one for actor and value."""
-        behaviour = [*self.model.actor.parameters(), *self.model.value_head.parameters()]
-        chosen = {id(parameter) for parameter in behaviour}
-        world = [parameter for parameter in self.model.parameters() if id(parameter) not in chosen]
         rates = (self.config.model_learning_rate, self.config.behaviour_learning_rate)
         capturable = self.device.type == "cuda"
         return [
             torch.optim.Adam(parameters, lr=rate, eps=1e-6, fused=True, capturable=capturable)
-            for parameters, rate in zip((world, behaviour), rates, strict=True)
+            for parameters, rate in zip(_halves(self.model), rates, strict=True)
         ]
 
     def training_step(self, batch: Batch, batch_index: int) -> None:
@@ -90,11 +95,11 @@ class Learner(lightning.LightningModule):
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(derive_seed(self.seed, "values", self.updates))
             fresh = ScalarHead(config.deter_dim + config.latent_dim, config.hidden_dim, config.num_bins)
-        head.load_state_dict(fresh.state_dict())
-        self.target_value.load_state_dict(fresh.state_dict())
+        for values in (head, self.target_value, self.averaged.value_head):
+            values.load_state_dict(fresh.state_dict())
         self.return_range.zero_()
         for parameter in head.parameters():
-            self._optimizers()[1].state.pop(parameter, None)
+            self._optimizers()[BEHAVIOUR].state.pop(parameter, None)
 
     def teardown(self, stage: str) -> None:
         """End the thread."""
@@ -114,14 +119,20 @@ class Learner(lightning.LightningModule):
         """What was learned, the batch as it was seen, and which of its sequences were seen as they are, (batch,)."""
         batch, unturned = quarter_turns(batch, self.config.turned_share, generator)
         learned = world_model_loss(self.model, batch, self.config, generator)
-        learned.parts["model_grad_norm"] = self._descend(self._optimizers()[0], learned.loss)
+        learned.parts["model_grad_norm"] = self._descend(self._optimizers()[MODEL], learned.loss)
+        self._average(MODEL)
         return learned._replace(loss=learned.loss.detach()), batch, unturned
 
     def _learn_behaviour(self, learned: Learned, batch: Batch, generator: torch.Generator) -> dict[str, Tensor]:
         loss, parts = self._behaviour_loss(learned, batch, generator)
-        parts["behaviour_grad_norm"] = self._descend(self._optimizers()[1], loss)
+        parts["behaviour_grad_norm"] = self._descend(self._optimizers()[BEHAVIOUR], loss)
+        self._average(BEHAVIOUR)
         follow(self.target_value, self.model.value_head, self.config.target_rate)
         return parts
+
+    def _average(self, half: int) -> None:
+        running, latest = _halves(self.averaged)[half], _halves(self.model)[half]
+        average(running, latest, self.averaged_updates[half], self.config.average_rate)
 
     def _optimizers(self) -> list[torch.optim.Optimizer]:
         optimizers = self.optimizers(use_pl_optimizer=False)
@@ -188,3 +199,10 @@ class Learner(lightning.LightningModule):
 
     def _descend(self, optimizer: torch.optim.Optimizer, loss: Tensor) -> Tensor:
         return descend(optimizer, loss, self.config.max_grad_norm, self.updates)
+
+
+def _halves(model: WorldModel) -> tuple[list[nn.Parameter], list[nn.Parameter]]:
+    """The parameters of the world model, and those of actor and value."""
+    behaviour = [*model.actor.parameters(), *model.value_head.parameters()]
+    chosen = {id(parameter) for parameter in behaviour}
+    return [parameter for parameter in model.parameters() if id(parameter) not in chosen], behaviour

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import ctypes
 import os
+from collections.abc import Sequence
 from typing import Any
 
 import torch
 from torch import Tensor, nn
 
 RETURN_RANGE_RATE = 0.01
+AVERAGED_SHARE = 0.1
 _M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD = -1, -3  # names of <malloc.h>
 _KEPT_BYTES = {_M_TRIM_THRESHOLD: 2**31 - 1, _M_MMAP_THRESHOLD: 32 * 2**20}
 
@@ -62,6 +64,23 @@ def follow(slow: nn.Module, fast: nn.Module, rate: float) -> None:
     """Move the parameters of a slow copy towards those that learn."""
     for behind, ahead in zip(slow.parameters(), fast.parameters(), strict=True):
         behind.lerp_(ahead, rate)
+
+
+@torch.no_grad()
+def average(running: Sequence[Tensor], latest: Sequence[Tensor], count: Tensor, rate: float) -> None:
+    """Take the latest parameters into a running average over about the last tenth of all, and no more than 1 / rate.
+
+    Args:
+        running: The average.
+        latest: The parameters as they are now.
+        count: How many there have been before, a scalar; grows by one. On the parameters' device, so that a CUDA graph
+            can record this.
+        rate: The least weight of the latest; with 1 there is no averaging.
+    """
+    count += 1.0
+    weight = (1.0 / (AVERAGED_SHARE * count)).clamp(rate, 1.0)
+    for mean, parameter in zip(running, latest, strict=True):
+        mean.lerp_(parameter, weight)
 
 
 def return_scale(range_so_far: Tensor, returns: Tensor) -> Tensor:

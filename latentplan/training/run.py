@@ -219,7 +219,7 @@ class _Run:
 
     def _finish(self, trainer: lightning.Trainer, save: Save, film: Path) -> dict[str, float]:
         clocks = save.clocks(self.learner)
-        weights = {name: value.detach().cpu().numpy() for name, value in self.learner.model.state_dict().items()}
+        weights = {name: value.detach().cpu().numpy() for name, value in self.learner.averaged.state_dict().items()}
         episodes = self.config.evaluation.final_episodes
         self.console.console.print(f"final evaluation: {episodes} episodes each of planner and actor")
         self.worker.submit("evaluate", episodes, film if self.config.evaluation.video else None, weights)
@@ -227,9 +227,9 @@ class _Run:
         summary = {mode: float(np.mean(values)) for mode, values in returns.items()}
         info = clocks | {"final_evaluation": returns}
         (self.folder / "final.json").write_text(json.dumps(info | summary, indent=1))
-        save.save_agent("last", self.learner.model, info)
+        save.save_agent("last", self.learner.averaged, info)
         if summary["planner"] >= self.state.best_return:
-            save.save_agent("best", self.learner.model, info)
+            save.save_agent("best", self.learner.averaged, info)
             self.state.best_return = summary["planner"]
             save.save_run(trainer, self.learner)
         self.console.console.print(

@@ -78,13 +78,15 @@ def load_state(folder: Path, device: torch.device) -> tuple[RunState, dict[str, 
 
 
 def restore(learner: Learner, saved: dict[str, Any], folder: Path) -> None:
-    """Put a learner where `save_state` found it.
+    """Put a learner where `save_state` found it; one saved before weights were averaged begins its average there.
 
     Raises:
         UserError: The weights are not those of this model.
     """
+    weights = saved["weights"]
+    averaged = {name.replace("model", "averaged", 1): value for name, value in weights.items() if name[:6] == "model."}
     try:
-        learner.load_state_dict(saved["weights"])
+        learner.load_state_dict({"averaged_updates": learner.averaged_updates, **averaged, **weights})
     except RuntimeError as error:
         reason = str(error).splitlines()[-1].strip()
         raise UserError(f"what {folder} holds does not fit the settings in its config.yaml: {reason}") from None

@@ -1,11 +1,14 @@
 """The learner: model and behaviour side by side, as if one after the other."""
 
+from pathlib import Path
+
 import pytest
 import torch
 
 from latentplan.models import WorldModel
 from latentplan.replay import Replay
 from latentplan.training.module import Learner
+from latentplan.training.state import restore
 
 
 class Standalone(Learner):
@@ -74,6 +77,8 @@ def test_a_value_that_is_forgotten_begins_anew_and_nothing_else_does(batch, tiny
         learner.catch_up()
     before = {name: value.clone() for name, value in learner.model.state_dict().items()}
     learner.forget_values()
+    fresh = learner.model.value_head.mlp.output.bias.clone()
+    assert torch.equal(learner.averaged.value_head.mlp.output.bias, fresh)
     changed = {name for name, value in learner.model.state_dict().items() if not torch.equal(value, before[name])}
     assert changed and all(name.startswith("value_head") for name in changed)
     twin = learner.model.value_head.state_dict()
@@ -84,3 +89,42 @@ def test_a_value_that_is_forgotten_begins_anew_and_nothing_else_does(batch, tiny
     learner.training_step(batch, 0)
     learner.catch_up()
     assert set(learner.optimizers()[1].state) > held
+
+
+def averages_of(learner, batch, updates):
+    """The weights of all updates, oldest first, and what they were on average after each."""
+    seen = []
+    for _ in range(updates):
+        learner.training_step(batch, 0)
+        learner.catch_up()
+        seen.append(
+            [{name: value.clone() for name, value in m.state_dict().items()} for m in (learner.model, learner.averaged)]
+        )
+    return seen
+
+
+def test_who_acts_is_the_average_of_the_latest_weights(batch, tiny):
+    seen = averages_of(standalone(tiny, average_rate=0.4), batch, 30)
+    for name in ("dynamics.gates.weight", "actor.mlp.output.weight", "value_head.mlp.output.bias"):
+        weights, averages = ([pair[which][name] for pair in seen] for which in (0, 1))
+        assert torch.equal(averages[9], weights[9])  # the last tenth of ten is one
+        torch.testing.assert_close(averages[19], averages[18] + 0.5 * (weights[19] - averages[18]))
+        torch.testing.assert_close(averages[29], averages[28] + 0.4 * (weights[29] - averages[28]))
+
+
+def test_without_averaging_who_acts_is_the_latest(batch, tiny):
+    latest, averaged = averages_of(standalone(tiny, average_rate=1.0), batch, 12)[-1]
+    assert all(torch.equal(averaged[name], value) for name, value in latest.items())
+
+
+def test_a_run_saved_before_weights_were_averaged_begins_its_average_where_it_is(batch, tiny):
+    learner, resumed = standalone(tiny), standalone(tiny)
+    averages_of(learner, batch, 12)
+    saved = {name: value for name, value in learner.state_dict().items() if not name.startswith("averaged")}
+    restore(resumed, {"weights": saved, "updates": 12}, Path("run"))
+    assert resumed.averaged_updates.tolist() == [0.0, 0.0]
+    latest = learner.model.state_dict()
+    assert all(torch.equal(value, latest[name]) for name, value in resumed.averaged.state_dict().items())
+    restore(resumed, {"weights": learner.state_dict(), "updates": 12}, Path("run"))
+    kept = learner.averaged.state_dict()
+    assert all(torch.equal(value, kept[name]) for name, value in resumed.averaged.state_dict().items())
