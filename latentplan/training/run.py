@@ -21,7 +21,7 @@ from latentplan.config import USER_DOMAIN, Config, RunConfig, UserError, derive_
 from latentplan.envs import default_task
 from latentplan.models import WorldModel
 from latentplan.replay import Replay
-from latentplan.training.callbacks import Experience, Record, Save, Stop
+from latentplan.training.callbacks import Experience, Record, Save, Stop, weights_of
 from latentplan.training.claim import claim
 from latentplan.training.collector import Description, EnvFactory
 from latentplan.training.curriculum import Curriculum
@@ -219,7 +219,7 @@ class _Run:
 
     def _finish(self, trainer: lightning.Trainer, save: Save, film: Path) -> dict[str, float]:
         clocks = save.clocks(self.learner)
-        weights = {name: value.detach().cpu().numpy() for name, value in self.learner.averaged.state_dict().items()}
+        weights = weights_of(self.learner.averaged)
         episodes = self.config.evaluation.final_episodes
         self.console.console.print(f"final evaluation: {episodes} episodes each of planner and actor")
         self.worker.submit("evaluate", episodes, film if self.config.evaluation.video else None, weights)

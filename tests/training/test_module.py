@@ -103,7 +103,7 @@ def averages_of(learner, batch, updates):
     return seen
 
 
-def test_who_acts_is_the_average_of_the_latest_weights(batch, tiny):
+def test_what_is_kept_is_the_average_of_the_latest_weights(batch, tiny):
     seen = averages_of(standalone(tiny, average_rate=0.4), batch, 30)
     for name in ("dynamics.gates.weight", "actor.mlp.output.weight", "value_head.mlp.output.bias"):
         weights, averages = ([pair[which][name] for pair in seen] for which in (0, 1))
@@ -112,7 +112,7 @@ def test_who_acts_is_the_average_of_the_latest_weights(batch, tiny):
         torch.testing.assert_close(averages[29], averages[28] + 0.4 * (weights[29] - averages[28]))
 
 
-def test_without_averaging_who_acts_is_the_latest(batch, tiny):
+def test_without_averaging_the_latest_is_kept(batch, tiny):
     latest, averaged = averages_of(standalone(tiny, average_rate=1.0), batch, 12)[-1]
     assert all(torch.equal(averaged[name], value) for name, value in latest.items())
 
