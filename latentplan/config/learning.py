@@ -36,8 +36,8 @@ class LearningConfig:
         entropy_scale: Weight of the actor's entropy, in units of the normalised return.
         imitation_scale: Weight of the actor's KL to the plans it was collected with; 0 leaves it out.
         target_rate: Share of the value network that its slow target takes over at each update.
-        average_rate: Least weight of the latest update in the average of the weights that is judged and kept: 0.01
-            averages over some hundred updates (early on over fewer), 1 over none.
+        average_rate: Least weight of the latest update in the average of the weights that acts, is judged and is kept:
+            0.01 averages over some hundred updates (early on over fewer), 1 over none.
         curriculum_task: Task of the same domain, or expression over its quantities such as `upright`, whose reward is
             learned first, on the way to the run's own task or `env.objective`; None starts with that.
         curriculum_frames: Simulator frames of the run for which it is, counted before action repeat.

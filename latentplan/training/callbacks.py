@@ -48,8 +48,7 @@ class Experience(lightning.Callback):
     """Collects one round per epoch, and evaluates when it is due.
 
     A round is asked for when an epoch starts and taken when the next one does, so a worker in another process acts,
-    with the weights of its start, while the learner learns. It collects with the latest weights, and judges their
-    average.
+    with the averaged weights of its start, while the learner learns.
     """
 
     def __init__(self, config: Config, replay: Replay, state: RunState, worker: Worker, videos: Path) -> None:
@@ -66,14 +65,14 @@ class Experience(lightning.Callback):
             self.worker.submit("collect", None, "random", missing, state.rounds)
             self._take_round()
         self.take()
-        weights = weights_of(learner.model)
+        weights = weights_of(learner.averaged)
         behaviour, noisy, goal = turn(settings, state.rounds, state.env_frames)
         decisions = min(settings.round_decisions, self._decisions_left())
         if decisions > 0:
             self.worker.submit("collect", weights, behaviour, decisions, state.rounds, noisy, goal)
             self._asked_round = True
         if self._asked_round and state.env_frames >= state.next_evaluation:
-            self._ask_evaluation(learner)
+            self._ask_evaluation(learner.updates, weights)
 
     def on_train_epoch_end(self, trainer: lightning.Trainer, learner: Learner) -> None:  # type: ignore[override]
         """Bring the behaviour up to date before anything else looks at the learner."""
@@ -100,12 +99,12 @@ class Experience(lightning.Callback):
             return sys.maxsize
         return -(-(frames - self.state.env_frames) // self.config.env.action_repeat)
 
-    def _ask_evaluation(self, learner: Learner) -> None:
-        state, settings, weights = self.state, self.config.evaluation, weights_of(learner.averaged)
-        clocks = {"env_frames": state.env_frames, "decisions": state.decisions, "updates": learner.updates}
+    def _ask_evaluation(self, updates: int, weights: dict[str, np.ndarray]) -> None:
+        state, settings = self.state, self.config.evaluation
+        clocks = {"env_frames": state.env_frames, "decisions": state.decisions, "updates": updates}
         self._asked_evaluation = clocks | {"minutes": round(state.minutes, 3)}, weights
         film = self.videos / f"{state.env_frames:09d}.webm" if settings.video else None
-        self.worker.submit("evaluate", settings.episodes, film, weights)
+        self.worker.submit("evaluate", settings.episodes, film)
 
     def _take_round(self) -> None:
         collected: Collected = self.worker.result()

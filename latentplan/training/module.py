@@ -29,8 +29,8 @@ class Learner(lightning.LightningModule):
     model takes the next one; both wait for each other after every update, so results do not depend on timing.
     `catch_up` ends an epoch.
 
-    What is judged and kept is `averaged`: what the weights were over the latest updates, on average. From one update to
-    the next they jump about what they tend to, since the learning rates stay what they are.
+    Who acts, is judged and is kept is `averaged`: what the weights were over the latest updates, on average. From one
+    update to the next they jump about what they tend to, since the learning rates stay what they are.
 
     Args:
         model: What is learned.

@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from latentplan.training import train
-from latentplan.training.callbacks import Save
+from latentplan.training.callbacks import Experience, Save
 from latentplan.training.collector import Collector
 
 
@@ -35,21 +35,28 @@ def test_the_best_agent_is_the_one_that_was_judged(tiny, dot, tmp_path, monkeypa
 
 
 @pytest.mark.parametrize("rate", [0.01, 1.0])
-def test_rounds_are_collected_with_the_latest_weights_and_their_average_is_judged(
-    tiny, dot, tmp_path, monkeypatch, rate
-):
-    latest, same, collect = [], [], Collector.collect
+def test_who_collects_and_is_judged_is_the_average_of_the_latest_weights(tiny, dot, tmp_path, monkeypatch, rate):
+    collected, is_latest, collect = [], [], Collector.collect
+    start = Experience.on_train_epoch_start
+
+    def equal(weights, model):
+        return all(np.array_equal(weights[name], value.numpy()) for name, value in model.state_dict().items())
 
     def keep(collector, weights, *arguments):
-        latest.append(weights)
+        collected.append(weights)
         return collect(collector, weights, *arguments)
 
-    def judge(collector, episodes, film=None, weights=None):
-        same.append(all(np.array_equal(latest[-1][name], value) for name, value in weights.items()))
-        return {"planner": [0.0], "actor": [0.0]}
+    def compare(experience, trainer, learner):
+        before = len(collected)
+        start(experience, trainer, learner)
+        if len(collected) == before or collected[-1] is None:  # the last epoch learns from what there is
+            return
+        assert equal(collected[-1], learner.averaged)
+        is_latest.append(equal(collected[-1], learner.model))
 
     monkeypatch.setattr(Collector, "collect", keep)
-    monkeypatch.setattr(Collector, "evaluate", judge)
-    train(tiny(tmp_path / "run", evaluation={"every_frames": 15}, learning={"average_rate": rate}), dot)
-    during = same[1:-1]  # before the first update there is nothing to average, and the last is not beside a round
-    assert len(during) > 1 and (all(during) if rate == 1.0 else not any(during[1:]))
+    monkeypatch.setattr(Experience, "on_train_epoch_start", compare)
+    settings = {"evaluation": {"every_frames": 15}, "learning": {"average_rate": rate}}
+    train(tiny(tmp_path / "run", **settings), dot)
+    assert len(is_latest) > 2 and is_latest[0]  # before the first update there is nothing to average
+    assert all(is_latest) if rate == 1.0 else not all(is_latest)
