@@ -17,9 +17,10 @@ sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "scripts"))
 
 import benchmark  # noqa: E402
 from bench.ablate import compare_arms  # noqa: E402
+from bench.anchors import METHODS, published  # noqa: E402
 from bench.arms import NAMES, Arm, Outcome, parse_arms  # noqa: E402
 from bench.decide import measure_decisions  # noqa: E402
-from bench.learn import Curve, Point, compare, first_reaching, read_run, run_facts  # noqa: E402
+from bench.learn import MARKERS, Curve, Point, compare, first_reaching, read_run, run_facts  # noqa: E402
 from bench.machine import product_limits  # noqa: E402
 from bench.render import measure_qualities  # noqa: E402
 from bench.report import format_table, interval, number  # noqa: E402
@@ -271,6 +272,7 @@ def test_runs_stand_beside_what_is_published_at_as_many_frames():
     assert own["frames_to"] == {"600": 100_500, "800": None}
     assert (other["returns"][100_000], other["frames_to"]) == (605, {"600": 100_000, "800": 200_000})
     assert rows["ResAct (own repeat)"]["returns"] == {100_000: 772}
+    assert len(MARKERS) == len(METHODS) and set(published("walker-walk")) == set(METHODS)
     assert list(compare("fish-swim", [curves[0]._replace(task="fish-swim")], [600])) == ["latentplan"]
 
 

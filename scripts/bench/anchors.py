@@ -85,7 +85,8 @@ _REPEAT_2: dict[str, dict[str, Row]] = {
 }
 
 # Action repeat 8 for cartpole, 4 for reacher, cheetah and cup, 2 for finger and walker; after 100,000 frames.
-_METHODS = ("PlaNet", "Dreamer", "CURL", "DrQ", "ResAct", "COVR")
+_METHODS = tuple(f"{name} (own repeat)" for name in ("PlaNet", "Dreamer", "CURL", "DrQ", "ResAct", "COVR"))
+METHODS = ("TD-MPC2", "DreamerV3", "MR.Q", "DrQ-v2", "EfficientZero V2", *_METHODS)
 _OWN_REPEAT: dict[str, tuple[float, ...]] = {
     "cartpole-swingup": (563, 326, 582, 759, 819, 872),
     "reacher-easy": (82, 314, 538, 601, 917, 969),
@@ -103,7 +104,7 @@ def published(task: str) -> dict[str, Mapping[int, float]]:
     """
     rows: dict[str, Row] = dict(_REPEAT_2.get(task, {}))
     for method, value in zip(_METHODS, _OWN_REPEAT.get(task, ()), strict=False):
-        rows[f"{method} (own repeat)"] = (value,)
+        rows[method] = (value,)
     return {
         method: {frames: value for frames, value in zip(FRAMES, row, strict=False) if value is not None}
         for method, row in rows.items()

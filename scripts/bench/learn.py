@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import json
 import math
 import statistics
@@ -12,7 +11,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from bench.anchors import FRAMES, published
+from bench.anchors import FRAMES, METHODS, published
 from bench.options import Flags, choice, numbers, words
 from bench.report import format_table, interval, number, write_csv, write_json
 from latentplan.cli import parse_train
@@ -40,6 +39,7 @@ FINISHED = "finished.json"
 MODES = ("planner", "actor")
 NEAR = 0.03  # of a number of frames: how far from it an evaluation may be that stands for it
 OWN = "latentplan"
+MARKERS = "sD^v<>PX*hp"  # of METHODS
 
 
 class Point(NamedTuple):
@@ -202,6 +202,7 @@ def plot_runs(curves: Sequence[Curve], mode: str, png: Path) -> None:
     """Evaluation return against frames: a panel per task, a line per seed."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
+    from matplotlib.ticker import EngFormatter
 
     tasks = list(dict.fromkeys(curve.task for curve in curves))
     figure = Figure(figsize=(6.5 * len(tasks), 4), layout="constrained")
@@ -214,6 +215,7 @@ def plot_runs(curves: Sequence[Curve], mode: str, png: Path) -> None:
         _mark_published(axes, task, axes.get_xlim()[1])
         axes.set(title=task, xlabel="environment frames", ylabel=f"evaluation return, {mode}")
         axes.set_ylim(bottom=min(0.0, axes.get_ylim()[0]))
+        axes.xaxis.set_major_formatter(EngFormatter(sep=""))
         axes.grid(alpha=0.25)
         axes.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), frameon=False, fontsize="small")
     figure.savefig(png, dpi=120, format="png")
@@ -221,11 +223,11 @@ def plot_runs(curves: Sequence[Curve], mode: str, png: Path) -> None:
 
 def _mark_published(axes: Axes, task: str, last: float) -> None:
     """What methods are known to earn at the frames that a panel shows."""
-    for method, marker in zip(published(task).items(), itertools.cycle("sD^v<>PX*hp")):
-        name, known = method
+    for method, known in published(task).items():
+        marker = MARKERS[METHODS.index(method)]
         shown = {frames: value for frames, value in known.items() if frames <= last}
         if shown:
-            axes.plot(*zip(*shown.items(), strict=True), marker, color="0.45", markersize=5, label=name)
+            axes.plot(*zip(*shown.items(), strict=True), marker, color="0.45", markersize=5, label=method)
 
 
 def _nearest(curve: Curve, frames: int) -> Point | None:
