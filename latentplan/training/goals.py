@@ -150,7 +150,7 @@ class GoalLearner:
             logits = heads.judge(features[:-1].detach(), code)
         loss = (reach * (heads.value_head.loss(logits, returns.detach()) - gains)).mean()
         descend(self.optimizer, loss, self.learning.max_grad_norm, self.updates)
-        follow(self.target, heads, self.learning.target_rate)
+        follow(self.target.parameters(), heads.parameters(), self.learning.target_rate)
         self.updates += 1
         return {"worth": float(worth.detach().mean()), "entropy": float(entropies.detach().mean())}
 

@@ -127,7 +127,7 @@ class Learner(lightning.LightningModule):
         loss, parts = self._behaviour_loss(learned, batch, generator)
         parts["behaviour_grad_norm"] = self._descend(self._optimizers()[BEHAVIOUR], loss)
         self._average(BEHAVIOUR)
-        follow(self.target_value, self.model.value_head, self.config.target_rate)
+        follow(self.target_value.parameters(), self.model.value_head.parameters(), self.config.target_rate)
         return parts
 
     def _average(self, half: int) -> None:

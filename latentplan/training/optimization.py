@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import ctypes
 import os
-from collections.abc import Sequence
+from collections.abc import Iterable
 from typing import Any
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 RETURN_RANGE_RATE = 0.01
-AVERAGED_SHARE = 0.1
+AVERAGED_SHARE = 0.1  # of all updates, that the average is over at most
 _M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD = -1, -3  # names of <malloc.h>
 _KEPT_BYTES = {_M_TRIM_THRESHOLD: 2**31 - 1, _M_MMAP_THRESHOLD: 32 * 2**20}
 
@@ -60,14 +60,14 @@ def take_up(optimizer: torch.optim.Optimizer, saved: dict[str, Any]) -> None:
 
 
 @torch.no_grad()
-def follow(slow: nn.Module, fast: nn.Module, rate: float) -> None:
-    """Move the parameters of a slow copy towards those that learn."""
-    for behind, ahead in zip(slow.parameters(), fast.parameters(), strict=True):
+def follow(slow: Iterable[Tensor], fast: Iterable[Tensor], rate: float | Tensor) -> None:
+    """Move the parameters of a slow copy towards those that learn, by a share in [0, 1] of what is between them."""
+    for behind, ahead in zip(slow, fast, strict=True):
         behind.lerp_(ahead, rate)
 
 
 @torch.no_grad()
-def average(running: Sequence[Tensor], latest: Sequence[Tensor], count: Tensor, rate: float) -> None:
+def average(running: Iterable[Tensor], latest: Iterable[Tensor], count: Tensor, rate: float) -> None:
     """Take the latest parameters into a running average over about the last tenth of all, and no more than 1 / rate.
 
     Args:
@@ -78,9 +78,7 @@ def average(running: Sequence[Tensor], latest: Sequence[Tensor], count: Tensor, 
         rate: The least weight of the latest; with 1 there is no averaging.
     """
     count += 1.0
-    weight = (1.0 / (AVERAGED_SHARE * count)).clamp(rate, 1.0)
-    for mean, parameter in zip(running, latest, strict=True):
-        mean.lerp_(parameter, weight)
+    follow(running, latest, (1.0 / (AVERAGED_SHARE * count)).clamp(rate, 1.0))
 
 
 def return_scale(range_so_far: Tensor, returns: Tensor) -> Tensor:

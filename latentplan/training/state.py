@@ -84,7 +84,7 @@ def restore(learner: Learner, saved: dict[str, Any], folder: Path) -> None:
         UserError: The weights are not those of this model.
     """
     weights = saved["weights"]
-    averaged = {name.replace("model", "averaged", 1): value for name, value in weights.items() if name[:6] == "model."}
+    averaged = {f"averaged.{name[6:]}": value for name, value in weights.items() if name.startswith("model.")}
     try:
         learner.load_state_dict({"averaged_updates": learner.averaged_updates, **averaged, **weights})
     except RuntimeError as error:

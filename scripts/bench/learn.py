@@ -170,12 +170,14 @@ def compare(task: str, curves: Sequence[Curve], thresholds: Sequence[int]) -> di
         with `intervals`), and `frames_to` each threshold: of published methods the first of the frames at which a
         return is known, of the runs their median, None where half of them or more do not reach it.
     """
+    from bench.statistics import interquartile_estimate
+
     own = [curve for curve in curves if curve.task == task]
     returns, intervals = {}, {}
     for frames in FRAMES:
         near = [point.total_return for curve in own if (point := _nearest(curve, frames)) is not None]
         if near:
-            returns[frames], *intervals[frames] = _interquartile(near)
+            returns[frames], *intervals[frames] = interquartile_estimate([near])
     rows: dict[str, dict[str, Any]] = {OWN: {"returns": returns, "intervals": intervals}}
     rows[OWN]["frames_to"] = {str(threshold): _median_frames(own, threshold) for threshold in thresholds}
     for method, known in published(task).items():
@@ -234,12 +236,6 @@ def _nearest(curve: Curve, frames: int) -> Point | None:
     """The evaluation nearest to so many frames; None where all are too far off."""
     point = min(curve.points, key=lambda point: abs(point.env_frames - frames))
     return point if abs(point.env_frames - frames) <= NEAR * frames else None
-
-
-def _interquartile(returns: Sequence[float]) -> tuple[float, float | None, float | None]:
-    from bench.statistics import interquartile_estimate
-
-    return interquartile_estimate([returns])
 
 
 def _median_frames(curves: Sequence[Curve], threshold: int) -> float | None:

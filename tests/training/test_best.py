@@ -35,7 +35,7 @@ def test_the_best_agent_is_the_one_that_was_judged(tiny, dot, tmp_path, monkeypa
 
 
 @pytest.mark.parametrize("rate", [0.01, 1.0])
-def test_who_collects_and_is_judged_is_the_average_of_the_latest_weights(tiny, dot, tmp_path, monkeypatch, rate):
+def test_who_collects_is_the_average_of_the_latest_weights(tiny, dot, tmp_path, monkeypatch, rate):
     collected, is_latest, collect = [], [], Collector.collect
     start = Experience.on_train_epoch_start
 
