@@ -1,6 +1,6 @@
 """Settings from several sources, laid over one another into one validated `Config`.
 
-Later sources win: the defaults of `latentplan/config.py`, `configs/default.yaml`, `configs/<domain>.yaml`,
+Later sources win: the defaults of `latentplan/config`, `configs/default.yaml`, `configs/<domain>.yaml`,
 `configs/<domain>-<task>.yaml`, `configs/<preset>.yaml`, the file given with `--config`, the command line.
 Nothing here imports torch, lightning or a simulator.
 """
@@ -97,7 +97,7 @@ def read_config(path: Path) -> Config:
 
 
 def dump_config(config: Config, path: Path) -> None:
-    """Write every setting as YAML, in the order of `latentplan/config.py`."""
+    """Write every setting as YAML, in the order of `latentplan/config`."""
     import yaml
 
     Path(path).write_text(yaml.safe_dump(to_dict(config), sort_keys=False))

@@ -160,7 +160,8 @@ class RunConfig:
         minutes: Minutes of wall clock to train for; None leaves it to `frames`.
         seed: Seed of every random stream of the run.
         device: `auto`, `cpu` or `cuda`.
-        threads: CPU threads for learning, in [1, 1024]; None takes every core but the one that collects.
+        threads: CPU threads of each half of an update (model and behaviour learn side by side), in [1, 1024]; None
+            shares every core but the one that collects between the two.
         run_dir: Folder of the run; None makes `runs/<domain>-<task>-<date>`.
     """
 
