@@ -56,8 +56,8 @@ def save_checkpoint(folder: Path, model: WorldModel, config: Config, info: dict[
     digest = hashlib.sha256(content).hexdigest()
     sizes = {"action_dim": model.action_dim, "labels": model.labels, "goal_dim": model.goal_dim}
     facts = info | sizes | {"config": to_dict(config), "sha256": digest}
-    part.replace(folder / WEIGHTS)
     (folder / f"{INFO}.part").write_text(json.dumps(facts, indent=1) + "\n")
+    part.replace(folder / WEIGHTS)
     (folder / f"{INFO}.part").replace(folder / INFO)
 
 
@@ -92,7 +92,11 @@ def load_model(path: str | Path, device: str = "cpu") -> tuple[WorldModel, Confi
     """
     info, folder = read_info(path), resolve_checkpoint(path)
     weights = folder / WEIGHTS
-    if hashlib.sha256(weights.read_bytes()).hexdigest() != info["sha256"]:
+    try:
+        content = weights.read_bytes()
+    except OSError as error:
+        raise UserError(f"{weights} cannot be read: {error.strerror}") from None
+    if hashlib.sha256(content).hexdigest() != info["sha256"]:
         raise UserError(f"{weights} is damaged: its checksum is not the one in {INFO}")
     try:
         config = from_dict(info["config"])

@@ -97,10 +97,12 @@ def read_config(path: Path) -> Config:
 
 
 def dump_config(config: Config, path: Path) -> None:
-    """Write every setting as YAML, in the order of `latentplan/config`."""
+    """Write every setting as YAML, in the order of `latentplan/config`; the file is replaced whole."""
     import yaml
 
-    Path(path).write_text(yaml.safe_dump(to_dict(config), sort_keys=False))
+    part = path.with_name(f"{path.name}.part")
+    part.write_text(yaml.safe_dump(to_dict(config), sort_keys=False))
+    part.replace(path)
 
 
 def read_layer(path: Path) -> Layer:

@@ -102,9 +102,10 @@ def _evaluate(argv: Sequence[str]) -> int:
             for phase in goals.phases
         )
         horizon = planner.goal_horizon if is_foreign else None
-        return _play_and_report(request, played, agent, about, horizon or planner.horizon, clock)
-    except OSError as error:
-        raise UserError(f"an output could not be written: {error}") from error
+        try:
+            return _play_and_report(request, played, agent, about, horizon or planner.horizon, clock)
+        except OSError as error:
+            raise UserError(f"an output could not be written: {error}") from error
     finally:
         env.close()
 

@@ -181,7 +181,8 @@ class Replay:
     def save(self, folder: Path) -> None:
         """Write what is new since the last save; `load` restores exactly what the last whole save held.
 
-        Unless the capacity has been exceeded: then a save that is cut off leaves new frames beside the older rows.
+        Unless the capacity has been exceeded: then a save that is cut off leaves new frames beside the older rows (the
+        first save after a capacity was changed writes all of them).
         """
         folder.mkdir(parents=True, exist_ok=True)
         for lane in range(self.num_lanes):
@@ -242,10 +243,13 @@ class Replay:
         held = np.minimum(self.written, self.lane_size)
         oldest = self.written - held
         lanes, starts = np.empty(0, np.int64), np.empty(0, np.int64)
-        advice = "raise --replay.capacity" if self.lane_size <= length else "lower --learning.sequence_length"
-        too_short = f"no episode in replay has sequence_length ({length}) decisions: {advice}"
+        too_short = f"no episode in replay has sequence_length ({length}) decisions"
+        if self.lane_size <= length:
+            raise UserError(f"{too_short}: raise --replay.capacity")
         if held.max() <= length:
-            raise UserError(too_short)
+            raise UserError(
+                f"{too_short}, of {held.max()} collected in each environment: raise --collection.prefill_decisions"
+            )
         for _ in range(SAMPLING_ROUNDS):
             lane = rng.choice(self.num_lanes, size=2 * count, p=held / held.sum())
             offset = rng.integers(0, held[lane])
@@ -256,7 +260,7 @@ class Replay:
             lanes, starts = np.concatenate([lanes, lane[keep]]), np.concatenate([starts, start[keep]])
             if len(starts) >= count:
                 return lanes[:count], starts[:count]
-        raise UserError(too_short)
+        raise UserError(f"{too_short}: lower --learning.sequence_length")
 
 
 def read_saved(path: Path, device: torch.device | str = "cpu") -> Any:

@@ -10,6 +10,7 @@ import torch
 
 from latentplan.agent import ActorAgent, PlanningAgent
 from latentplan.checkpoint import save_checkpoint
+from latentplan.compose import dump_config
 from latentplan.config import Config, EnvConfig, LearningConfig, ModelConfig, PlannerConfig, UserError
 from latentplan.models import WorldModel
 
@@ -20,7 +21,7 @@ from bench.ablate import compare_arms  # noqa: E402
 from bench.anchors import METHODS, published  # noqa: E402
 from bench.arms import NAMES, Arm, Outcome, parse_arms  # noqa: E402
 from bench.decide import measure_decisions  # noqa: E402
-from bench.learn import MARKERS, Curve, Point, compare, first_reaching, read_run, run_facts  # noqa: E402
+from bench.learn import MARKERS, Curve, Point, check_same, compare, first_reaching, read_run, run_facts  # noqa: E402
 from bench.machine import product_limits  # noqa: E402
 from bench.render import measure_qualities  # noqa: E402
 from bench.report import format_table, interval, number  # noqa: E402
@@ -292,3 +293,14 @@ def test_finished_runs_are_collected_and_not_repeated(tmp_path, capsys):
     assert (tmp_path / "curves.png").stat().st_size > 0
     printed = capsys.readouterr().out
     assert "not repeated" in printed and "EfficientZero V2" in printed
+
+
+def test_a_folder_of_other_settings_is_not_taken_for_these(tmp_path):
+    begun = replace(CONFIG, run=replace(CONFIG.run, frames=100, run_dir=str(tmp_path)))
+    dump_config(begun, tmp_path / "config.yaml")
+    check_same(begun, tmp_path / "nothing yet")
+    check_same(replace(begun, run=replace(begun.run, frames=200)), tmp_path)  # a budget may grow
+    with pytest.raises(UserError, match=r"--planner\.horizon 3, not 7"):
+        check_same(replace(begun, planner=replace(PLANNER, horizon=7)), tmp_path)
+    with pytest.raises(UserError, match=r"--run\.seed"):
+        check_same(replace(begun, run=replace(begun.run, seed=1)), tmp_path)

@@ -268,6 +268,14 @@ def test_a_replay_too_small_for_a_sequence_says_so():
         sample(filled(lengths=(9,), capacity=4), length=5)
 
 
+@pytest.mark.parametrize(
+    ("lengths", "advice"), [((4, 4, 4), "lower --learning.sequence_length"), ((2,), "raise --collection.prefill")]
+)
+def test_what_is_too_short_decides_what_is_advised(lengths, advice):
+    with pytest.raises(UserError, match=advice):
+        sample(filled(lengths=lengths), length=5)
+
+
 def test_an_episode_of_the_sequence_length_is_long_enough():
     assert_aligned(sample(filled(lengths=(2, 5, 3)), length=5))
 

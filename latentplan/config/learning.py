@@ -104,7 +104,7 @@ class CollectionConfig:
         prefill_decisions: Random decisions before learning starts.
         round_decisions: Decisions per epoch: this many are collected, then learned from.
         updates_per_decision: Updates per collected decision (the replay ratio, in updates).
-        overlap: Whether the next round is collected in another process while this one is learned from.
+        overlap: Whether the next round is collected in another process while this one is learned from; never on a GPU.
     """
 
     behaviour: str = "planner"
@@ -126,4 +126,6 @@ class CollectionConfig:
         within(self, noise_correlation=(0.0, 0.99), noise_share=(0.0, 1.0), goal_share=(0.0, 1.0))
         if self.goal_share > 0.0 and not self.goals:
             raise ValueError("goal_share needs goals; name at least one expression in collection.goals")
+        if self.goals and self.goal_share == 0.0:
+            raise ValueError("goals need a goal_share above 0: the share of rounds in which they are pursued")
         above_zero(self, "updates_per_decision", "episode_decisions")

@@ -180,10 +180,8 @@ def risk(objective: Term, *, measure: str = "cvar", num_particles: int = 8, wors
         raise ValueError(f"measure must be mean, worst or cvar, got {measure!r}")
     if num_particles < 1 or not 0.0 < worst_share <= 1.0:
         raise ValueError(f"risk needs particles and a share in (0, 1], got {num_particles} and {worst_share}")
-    inner = as_objective(objective)
-    num_worst = {"mean": num_particles, "worst": 1, "cvar": max(1, round(worst_share * num_particles))}[measure]
-
-    return Objective(partial(_worst, inner, num_worst), inner.needs_states, num_particles, inner.needs)
+    inner, share = as_objective(objective), {"mean": 1.0, "worst": 0.0, "cvar": worst_share}[measure]
+    return Objective(partial(_worst, inner, share), inner.needs_states, num_particles, inner.needs)
 
 
 def at_every_state(function: Callable[[State], Tensor]) -> Objective:
@@ -279,7 +277,8 @@ def _doubt(rollout: Rollout) -> Tensor:
     return -(rollout.weights[..., :-1] * doubts).sum(dim=1)
 
 
-def _worst(inner: Term, num_worst: int, rollout: Rollout) -> Tensor:
+def _worst(inner: Term, share: float, rollout: Rollout) -> Tensor:
+    num_worst = max(1, round(share * rollout.num_particles))  # a model may have more particles than were asked for
     values = rearrange(inner(rollout), "(row particle) -> row particle", particle=rollout.num_particles)
     worst = torch.topk(values, num_worst, dim=1, largest=False).values.mean(dim=1)
     # NaN sorts as the largest number: without this it would hide among the particles that do not count.

@@ -164,7 +164,7 @@ class Search:
             if iteration == 0:  # what a policy says may be NaN, and a model may not mind: it must not become an elite
                 is_finite = torch.isfinite(fresh).flatten(2).all(dim=2)
                 scores = scores._replace(returns=scores.returns.masked_fill(~is_finite, float("nan")))
-            updated = self._refit(progress, [(fresh, scores), *known, *self._kept(progress)], scores.returns)
+            updated = self._refit(progress, [(fresh, scores), *known, *self._kept(progress, known)], scores.returns)
             if iteration == 0:  # the policy's proposals and the shifted last plan stay among the candidates
                 known = [(fresh[:, num_fresh:], scores.rest(num_fresh)), (fresh[:, :1], scores.first(1))]
             elif iteration >= num_common or options.stop_std > 0:
@@ -214,12 +214,16 @@ class Search:
             is_warm = start.is_warm.to(self.device)[:, None, None, None]
             fresh[:, 1:end] = torch.where(is_warm, start.elites[:, : end - 1], fresh[:, 1:end])
 
-    def _kept(self, progress: Progress) -> list[Candidates]:
+    def _kept(self, progress: Progress, known: Sequence[Candidates]) -> list[Candidates]:
+        """The best of the last elites, which stay candidates; one that is `known` anyway does not count twice."""
         needs_best = self.options.final == "best" or bool(self.scorer.constraints)
         num = max(self.options.num_kept, int(needs_best))
         if progress.elites is None or num == 0:
             return []
-        return [(progress.elites.actions[:, :num], progress.elites.scores.first(num))]
+        actions, scores = progress.elites.actions[:, :num], progress.elites.scores.first(num)
+        others = torch.cat([sequences for sequences, _ in known], dim=1)
+        is_known = (actions[:, :, None] == others[:, None]).flatten(3).all(dim=3).any(dim=2)
+        return [(actions, scores._replace(returns=scores.returns.masked_fill(is_known, float("nan"))))]
 
     def _refit(self, progress: Progress, candidates: list[Candidates], fresh_returns: Tensor) -> Progress:
         options = self.options

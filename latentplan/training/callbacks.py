@@ -1,9 +1,8 @@
-"""When things happen in a run: collecting, evaluating, recording, saving, stopping."""
+"""When things happen in a run: collecting, evaluating, saving, stopping."""
 
 from __future__ import annotations
 
 import copy
-import csv
 import signal
 import sys
 from pathlib import Path
@@ -18,30 +17,14 @@ from latentplan.config import CollectionConfig, Config
 from latentplan.models import WorldModel
 from latentplan.replay import Replay
 from latentplan.training.collector import Collected
+from latentplan.training.optimization import take_up
 from latentplan.training.state import INTERRUPTED, RunState, save_state
 from latentplan.training.worker import Worker
 
 if TYPE_CHECKING:
     from latentplan.training.module import Learner
-    from latentplan.training.progress import Progress
 
 SAVE_MINUTES = 5.0
-
-COLUMNS = (
-    *("env_frames", "decisions", "updates", "minutes", "episode_return"),
-    *("planner_return", "actor_return", "planner_minus_actor"),
-    *(
-        "reconstruction",
-        "reward",
-        "open_loop_reward",
-        "continue",
-        "dynamics",
-        "representation",
-        "overshooting",
-        "probe",
-    ),
-    *("actor", "imitation", "value", "imagined_return", "entropy", "model_grad_norm", "behaviour_grad_norm"),
-)
 
 
 class Experience(lightning.Callback):
@@ -65,6 +48,8 @@ class Experience(lightning.Callback):
             self.worker.submit("collect", None, "random", missing, state.rounds)
             self._take_round()
         self.take()
+        if state.interrupted:
+            return
         weights = weights_of(learner.averaged)
         behaviour, noisy, goal = turn(settings, state.rounds, state.env_frames)
         decisions = min(settings.round_decisions, self._decisions_left())
@@ -79,7 +64,18 @@ class Experience(lightning.Callback):
         learner.catch_up()
 
     def take(self) -> None:
-        """Wait for what was asked for, if anything was."""
+        """Wait for what was asked for, if anything was.
+
+        A signal to the whole group of processes ends the one that was asked: what it owed is due again after a resume.
+        """
+        try:
+            self._take()
+        except RuntimeError:
+            if not self.state.interrupted:
+                raise
+            self._asked_round, self._asked_evaluation = False, None
+
+    def _take(self) -> None:
         if self._asked_round:
             self._take_round()
             self._asked_round = False
@@ -142,61 +138,6 @@ def _has_noise(settings: CollectionConfig, own: int) -> bool:
     return int((own + 1) * settings.noise_share) > int(own * settings.noise_share)
 
 
-class Record(lightning.Callback):
-    """Writes metrics.csv and TensorBoard once per epoch, and shows progress."""
-
-    def __init__(self, path: Path, state: RunState, experience: Experience, progress: Progress) -> None:
-        self.path, self.state, self.experience, self.progress = path, state, experience, progress
-        self._shown_evaluations = len(state.evaluations)
-
-    def on_fit_start(self, trainer: lightning.Trainer, learner: Learner) -> None:  # type: ignore[override]
-        """Drop the rows that a killed run wrote after its last save: they are about to be written again."""
-        if not self.path.exists():
-            return
-        with self.path.open(newline="") as file:
-            rows = [row for row in csv.DictReader(file) if None not in row.values()]
-        with self.path.open("w", newline="") as file:
-            writer = csv.DictWriter(file, COLUMNS)
-            writer.writeheader()
-            writer.writerows(row for row in rows if int(row["updates"]) <= learner.updates)
-
-    def on_train_batch_end(self, trainer: lightning.Trainer, learner: Learner, *_: Any) -> None:  # type: ignore[override]
-        """Move the progress display on."""
-        self.progress.update(self.state, learner.updates)
-
-    def on_train_epoch_end(self, trainer: lightning.Trainer, learner: Learner) -> None:  # type: ignore[override]
-        """Append one row for the epoch, after those of the evaluations that came in."""
-        self.write_evaluations(trainer)
-        state = self.state
-        row: dict[str, float] = {name: float(value) for name, value in learner.metrics.items()}
-        clocks = {"env_frames": state.env_frames, "decisions": state.decisions, "updates": learner.updates}
-        row |= clocks | {"minutes": round(state.minutes, 3)}
-        if self.experience.episode_returns:
-            row["episode_return"] = float(np.mean(self.experience.episode_returns))
-            self.progress.episode_return = row["episode_return"]
-            self.experience.episode_returns.clear()
-        self._append(trainer, row)
-
-    def write_evaluations(self, trainer: lightning.Trainer) -> None:
-        """Append one row for each new evaluation, with the clocks of the weights that were judged."""
-        for entry in self.state.evaluations[self._shown_evaluations :]:
-            clocks = {name: entry[name] for name in ("env_frames", "decisions", "updates", "minutes")}
-            returns = {"planner_return": entry["planner"], "actor_return": entry["actor"]}
-            self._append(trainer, clocks | returns | {"planner_minus_actor": entry["planner"] - entry["actor"]})
-            self.progress.show_evaluation(entry)
-        self._shown_evaluations = len(self.state.evaluations)
-
-    def _append(self, trainer: lightning.Trainer, row: dict[str, float]) -> None:
-        if trainer.logger is not None:
-            trainer.logger.log_metrics(row, step=int(row["env_frames"]))
-        is_new = not self.path.exists()
-        with self.path.open("a", newline="") as file:
-            writer = csv.DictWriter(file, COLUMNS)
-            if is_new:
-                writer.writeheader()
-            writer.writerow(row)
-
-
 class Save(lightning.Callback):
     """Keeps the last agent, the best one, and what it takes to resume."""
 
@@ -216,17 +157,21 @@ class Save(lightning.Callback):
 
     def on_train_epoch_end(self, trainer: lightning.Trainer, learner: Learner) -> None:  # type: ignore[override]
         """Save after every evaluation, and `SAVE_MINUTES` after the last save."""
-        is_judged = len(self.state.evaluations) > self._kept_evaluations
-        if not is_judged and self.state.minutes < self._saved_minutes + SAVE_MINUTES:
-            return
+        if self.keep_best(learner) or self.state.minutes >= self._saved_minutes + SAVE_MINUTES:
+            self.save(trainer, learner)
+
+    def keep_best(self, learner: Learner) -> bool:
+        """Keep the agent of an evaluation that has come in, if it is the best; whether one has come in."""
+        if len(self.state.evaluations) == self._kept_evaluations:
+            return False
         self._kept_evaluations = len(self.state.evaluations)
-        if is_judged and (latest := self.state.evaluations[-1])["planner"] > self.state.best_return:
+        if (latest := self.state.evaluations[-1])["planner"] > self.state.best_return:
             self.state.best_return = latest["planner"]
             judged = copy.deepcopy(learner.averaged)
             weights = self.experience.evaluated_weights
             judged.load_state_dict({name: torch.from_numpy(value) for name, value in weights.items()})
             self.save_agent("best", judged, {name: latest[name] for name in ("env_frames", "updates", "minutes")})
-        self.save(trainer, learner)
+        return True
 
     def save(self, trainer: lightning.Trainer, learner: Learner) -> None:
         """Save the last agent and the state of the run."""
@@ -248,6 +193,18 @@ class Save(lightning.Callback):
     def clocks(self, learner: Learner) -> dict[str, Any]:
         """Where the present agent stands."""
         return {"env_frames": self.state.env_frames, "updates": learner.updates, "minutes": self.state.minutes}
+
+
+class Restore(lightning.Callback):
+    """Gives the optimizers the state they were saved with, if they were."""
+
+    def __init__(self, optimizers: list[Any]) -> None:
+        self.optimizers = optimizers
+
+    def on_fit_start(self, trainer: lightning.Trainer, learner: lightning.LightningModule) -> None:
+        """Take up what was saved."""
+        for optimizer, saved in zip(trainer.optimizers, self.optimizers, strict=True) if self.optimizers else ():
+            take_up(optimizer, saved)
 
 
 class Stop(lightning.Callback):

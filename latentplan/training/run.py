@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import logging
-import os
 import warnings
 from dataclasses import dataclass, replace
 from datetime import datetime
@@ -16,26 +15,26 @@ import numpy as np
 import torch
 from lightning.pytorch.loggers import TensorBoardLogger
 
+from latentplan.checkpoint import load_model
 from latentplan.compose import dump_config, read_config
-from latentplan.config import USER_DOMAIN, Config, RunConfig, UserError, derive_seed
+from latentplan.config import USER_DOMAIN, Config, UserError, derive_seed
 from latentplan.envs import default_task
 from latentplan.models import WorldModel
 from latentplan.replay import Replay
-from latentplan.training.callbacks import Experience, Record, Save, Stop, weights_of
+from latentplan.training.callbacks import Experience, Restore, Save, Stop, weights_of
 from latentplan.training.claim import claim
 from latentplan.training.collector import Description, EnvFactory
 from latentplan.training.curriculum import Curriculum
 from latentplan.training.data import ReplayBatches, ReplayData
 from latentplan.training.graphed import make_learner
-from latentplan.training.optimization import take_up
 from latentplan.training.progress import Progress
+from latentplan.training.record import Record
+from latentplan.training.resources import choose_device, choose_threads, replay_capacity
 from latentplan.training.state import INTERRUPTED, RunState, load_state, restore
 from latentplan.training.worker import LocalWorker, RemoteWorker, Worker
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
-
-UNKNOWN_LENGTH_CAPACITY = 200_000
 
 
 @dataclass(frozen=True)
@@ -82,10 +81,7 @@ def train(config: Config, make_env: EnvFactory | None = None) -> Result:
     folder = Path(str(config.run.run_dir))
     if (folder / "config.yaml").exists():
         raise UserError(f"{folder} already holds a run: continue with --resume {folder}, or choose another --run-dir")
-    with claim(folder):
-        run = _Run(config, folder, make_env, resume=False)
-        dump_config(config, folder / "config.yaml")
-        return run.execute()
+    return _start(config, folder, make_env, resume=False)
 
 
 def resume(
@@ -100,9 +96,10 @@ def resume(
 
     Args:
         run_dir: Folder of the run.
-        frames: New budget of frames in all; with None for both, the old budget stays.
+        frames: New budget of frames in all; with None for both, the old budget stays. A new one is the run's from now
+            on, so that it goes on to it after an interruption too.
         minutes: New budget of minutes in all.
-        device: New device; None keeps the old one.
+        device: New device, from now on; None keeps the old one.
         make_env: As given to `train`.
 
     Raises:
@@ -119,8 +116,14 @@ def resume(
         run = replace(run, frames=frames, minutes=minutes)
     if device is not None:
         run = replace(run, device=device)
+    return _start(replace(config, run=run), folder, make_env, resume=True)
+
+
+def _start(config: Config, folder: Path, make_env: EnvFactory | None, *, resume: bool) -> Result:
     with claim(folder):
-        return _Run(replace(config, run=run), folder, make_env, resume=True).execute()
+        run = _Run(config, folder, make_env, resume=resume)
+        dump_config(config, folder / "config.yaml")
+        return run.execute()
 
 
 class _Run:
@@ -128,10 +131,10 @@ class _Run:
 
     def __init__(self, config: Config, folder: Path, make_env: EnvFactory | None, *, resume: bool) -> None:
         self.config, self.folder = config, folder
-        self.device = _choose_device(config.run)
+        self.device = choose_device(config.run)
         self.console = Progress(config.run)
         overlap = config.collection.overlap and self.device.type == "cpu"
-        torch.set_num_threads(config.run.threads or _choose_threads(overlap))
+        torch.set_num_threads(config.run.threads or choose_threads(overlap))
         self.worker: Worker = (
             RemoteWorker(config, make_env) if overlap else LocalWorker(config, make_env, str(self.device))
         )
@@ -149,7 +152,7 @@ class _Run:
             torch.manual_seed(derive_seed(config.run.seed, "weights"))
             model = WorldModel(config.model, self.description.action_dim, self.description.labels).to(self.device)
         on = self.device if config.replay.on_device else torch.device("cpu")
-        capacity, num_labels = _capacity(config), len(model.labels)
+        capacity, num_labels = replay_capacity(config), len(model.labels)
         self.replay = Replay(capacity, model.action_dim, config.model.deter_dim, config.env.num_envs, on, num_labels)
         self.state, saved = RunState(), None
         self._saved_optimizers: list[Any] = []
@@ -179,6 +182,8 @@ class _Run:
         record = Record(self.folder / "metrics.csv", self.state, experience, self.console)
         trainer = self._trainer([experience, self.curriculum, record, save, stop])
         batches = ReplayBatches(self.replay, config, self.curriculum, self.learner)
+        if not self._saved_optimizers:
+            save.save_run(trainer, self.learner)  # so that what ends before the first save can be resumed too
         if not stop.is_spent():
             self.console.start(self.learner.updates)
             try:
@@ -188,6 +193,7 @@ class _Run:
             if not self.state.interrupted:
                 experience.take()
                 record.write_evaluations(trainer)
+                save.keep_best(self.learner)
             save.save(trainer, self.learner)
         if self.state.interrupted:
             self.console.console.print(f"stopped; to go on: python scripts/train.py --resume {self.folder}")
@@ -197,19 +203,11 @@ class _Run:
     def _trainer(self, callbacks: list[lightning.Callback]) -> lightning.Trainer:
         logging.getLogger("lightning.pytorch").setLevel(logging.ERROR)
         warnings.filterwarnings("ignore", module="lightning")
-        optimizers = self._saved_optimizers
-
-        class Restore(lightning.Callback):
-            def on_fit_start(self, trainer: lightning.Trainer, learner: lightning.LightningModule) -> None:
-                if optimizers:
-                    for optimizer, saved in zip(trainer.optimizers, optimizers, strict=True):
-                        take_up(optimizer, saved)
-
         return lightning.Trainer(
             accelerator="gpu" if self.device.type == "cuda" else "cpu",
             devices=1,
             max_epochs=-1,
-            callbacks=[Restore(), *callbacks],
+            callbacks=[Restore(self._saved_optimizers), *callbacks],
             logger=TensorBoardLogger(self.folder, name="tensorboard", version=""),
             enable_checkpointing=False,
             enable_progress_bar=False,
@@ -219,24 +217,43 @@ class _Run:
 
     def _finish(self, trainer: lightning.Trainer, save: Save, film: Path) -> dict[str, float]:
         clocks = save.clocks(self.learner)
-        weights = weights_of(self.learner.averaged)
         episodes = self.config.evaluation.final_episodes
         self.console.console.print(f"final evaluation: {episodes} episodes each of planner and actor")
-        self.worker.submit("evaluate", episodes, film if self.config.evaluation.video else None, weights)
-        returns = self.worker.result()
+        returns = self._judge(self.learner.averaged, film if self.config.evaluation.video else None)
         summary = {mode: float(np.mean(values)) for mode, values in returns.items()}
         info = clocks | {"final_evaluation": returns}
         (self.folder / "final.json").write_text(json.dumps(info | summary, indent=1))
         save.save_agent("last", self.learner.averaged, info)
-        if summary["planner"] >= self.state.best_return:
-            save.save_agent("best", self.learner.averaged, info)
-            self.state.best_return = summary["planner"]
-            save.save_run(trainer, self.learner)
         self.console.console.print(
             f"trained {clocks['env_frames']:,} frames in {clocks['minutes']:.1f} min: planner "
-            f"{summary['planner']:.1f}, actor {summary['actor']:.1f} ({episodes} episodes)\nrun folder: {self.folder}"
+            f"{summary['planner']:.1f}, actor {summary['actor']:.1f} ({episodes} episodes)"
         )
+        if summary["planner"] >= self.state.best_return or not self._is_best_better(summary["planner"]):
+            save.save_agent("best", self.learner.averaged, info)
+            self.state.best_return = summary["planner"]
+        save.save_run(trainer, self.learner)
+        self.console.console.print(f"run folder: {self.folder}")
         return summary
+
+    def _judge(self, model: WorldModel, film: Path | None = None) -> dict[str, list[float]]:
+        self.worker.submit("evaluate", self.config.evaluation.final_episodes, film, weights_of(model))
+        return self.worker.result()  # type: ignore[no-any-return]
+
+    def _is_best_better(self, planner: float) -> bool:
+        """Whether the agent kept as the best also earns more on the starts that judged the last one.
+
+        The best mean of many evaluations of few episodes is high by chance too.
+        """
+        folder = self.folder / "checkpoints" / "best"
+        if not (folder / "info.json").exists():
+            return False
+        model, _, info = load_model(folder, str(self.device))
+        self.state.best_return = float(np.mean(self._judge(model)["planner"]))
+        self.console.console.print(
+            f"on the same starts the agent of {info['env_frames']:,} frames: planner {self.state.best_return:.1f}; "
+            "checkpoints/best is the better of the two"
+        )
+        return self.state.best_return > planner
 
     def _announce(self) -> None:
         config, description, run = self.config, self.description, self.config.run
@@ -273,28 +290,3 @@ class _Run:
 
 def _task_name(config: Config) -> str:
     return f"{config.env.domain}-{config.env.task}"
-
-
-def _choose_device(run: RunConfig) -> torch.device:
-    if run.device == "cuda" and not torch.cuda.is_available():
-        raise UserError("device cuda was asked for, but torch finds no CUDA device: use --device cpu")
-    if run.device == "auto":
-        return torch.device("cuda" if torch.cuda.is_available() else "cpu")
-    return torch.device(run.device)
-
-
-def _choose_threads(overlap: bool) -> int:
-    # Model and behaviour each take this many, and one core is left to the process that collects: threads that wait for
-    # each other on a shared core crawl.
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    return max(1, (cores - overlap) // 2)
-
-
-def _capacity(config: Config) -> int:
-    if config.replay.capacity is not None:
-        return config.replay.capacity
-    if config.run.frames is None:
-        return UNKNOWN_LENGTH_CAPACITY
-    # Two rounds may run past the budget, and every episode ends with one frame without an action.
-    decisions = config.run.frames / config.env.action_repeat
-    return int(1.05 * decisions) + 2 * config.collection.round_decisions + config.collection.prefill_decisions

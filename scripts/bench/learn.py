@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import json
 import math
+import signal
 import statistics
 import subprocess
 import sys
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -15,8 +17,8 @@ from bench.anchors import FRAMES, METHODS, published
 from bench.options import Flags, choice, numbers, words
 from bench.report import format_table, interval, number, write_csv, write_json
 from latentplan.cli import parse_train
-from latentplan.compose import SECTIONS
-from latentplan.config import UserError
+from latentplan.compose import SECTIONS, read_config
+from latentplan.config import Config, RunConfig, UserError, to_dict
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -67,8 +69,8 @@ def run(flags: Flags) -> int:
     extra = [word for name, value in flags.items() if name in FORWARDED or "." in name for word in (name, value)]
     out = Path(flags.get("--out", "runs/learn"))
     folders = {(task, seed): out / f"{task}-seed{seed}" for task in tasks for seed in seeds}
-    for (task, seed), folder in folders.items():
-        parse_train(_new_run(task, seed, folder, budget, extra))  # a mistake in any run stops before the first
+    for (task, seed), folder in folders.items():  # a mistake in any run stops before the first
+        check_same(parse_train(_new_run(task, seed, folder, budget, extra)).config, folder)
     out.mkdir(parents=True, exist_ok=True)
     for (task, seed), folder in folders.items():
         _train(task, seed, folder, budget, extra)
@@ -106,6 +108,25 @@ def read_run(task: str, seed: int, folder: Path, mode: str) -> Curve:
     if not points:
         raise UserError(f"{folder} holds no evaluation; lower --evaluation.every_frames or train longer")
     return Curve(task, seed, points)
+
+
+def check_same(config: Config, folder: Path) -> None:
+    """That what a folder holds, if anything, was begun with these settings; only its budget may have been another.
+
+    Raises:
+        UserError: It was not; the first setting that differs is named.
+    """
+    if not (folder / "config.yaml").exists():
+        return
+    asked, begun = (_settings(each) for each in (config, read_config(folder / "config.yaml")))
+    for name, value in asked.items():
+        if value is not None and begun[name] != value:
+            raise UserError(f"{folder} was begun with --{name} {begun[name]}, not {value}: choose another --out")
+
+
+def _settings(config: Config) -> dict[str, Any]:
+    sections = to_dict(replace(config, run=RunConfig(seed=config.run.seed)))
+    return {f"{section}.{name}": value for section, fields in sections.items() for name, value in fields.items()}
 
 
 def first_reaching(curve: Curve, threshold: float) -> Point | None:
@@ -254,7 +275,12 @@ def _train(task: str, seed: int, folder: Path, budget: list[str], extra: list[st
     arguments = ["--resume", str(folder), *budget] if is_begun else _new_run(task, seed, folder, budget, extra)
     script = Path(__file__).resolve().parent.parent / "train.py"
     print(f"training {task}, seed {seed}", flush=True)
-    code = subprocess.run([sys.executable, str(script), *arguments], check=False).returncode
+    training = subprocess.Popen([sys.executable, str(script), *arguments])
+    previous = signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches the run too, which has to save itself
+    try:
+        code = training.wait()
+    finally:
+        signal.signal(signal.SIGINT, previous)
     if code == 130:
         raise KeyboardInterrupt
     if code != 0:

@@ -125,6 +125,14 @@ def test_risk_measures_look_at_their_share_of_the_outcomes():
         torch.testing.assert_close(measured, torch.tensor([[bad, good / 2, good]]).expand(2, 3))
 
 
+def test_the_mean_of_a_model_with_particles_of_its_own_is_of_all_of_them():
+    model = Gamble()
+    model.num_particles = 8
+    actions = torch.tensor([-1.0, 1.0]).reshape(1, 2, 1, 1)
+    objective = risk(learned_return(), measure="mean", num_particles=1)
+    torch.testing.assert_close(returns(model, objective, torch.zeros(1, 1), actions), torch.tensor([[-0.75, 0.75]]))
+
+
 def test_risk_changes_the_plan_and_composes(make_planner, seeded):
     mean, worst = (
         make_planner(horizon=1, action_dim=1).plan(

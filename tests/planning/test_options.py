@@ -144,6 +144,24 @@ def test_the_best_candidate_is_worth_at_least_every_elite(point, states, make_pl
     assert (plan.expected_return >= plan.info["elite_return"][:, -1]).all()
 
 
+@pytest.mark.parametrize("options", [{"keep_elite_fraction": 1.0}, {"final": "best"}])
+def test_no_candidate_counts_twice(states, make_planner, seeded, options):
+    """Not even what a policy proposes, which stays a candidate anyway."""
+    model = FunctionModel(
+        lambda state, action: state + action[:, :1],
+        lambda state, action: -action.square().sum(dim=1),  # doing next to nothing, as the policy does, is best
+        policy=lambda state, generator: torch.full((len(state), 2), 0.01),
+    )
+    planner = make_planner(num_policy_samples=1, num_iterations=4, num_elites=8, **options)
+    plan = planner.plan(model, states, generator=seeded())
+    if plan.elites is not None:
+        for elites in plan.elites:
+            assert len(torch.unique(elites.flatten(1), dim=0)) == len(elites)
+    alone = make_planner(num_policy_samples=1, num_iterations=4, num_elites=8).plan(model, states, generator=seeded())
+    if options == {"final": "best"}:  # there is nothing better to keep than what is known
+        torch.testing.assert_close(plan.mean, alone.mean)
+
+
 def test_a_search_stops_early_where_its_distribution_is_narrow(states, make_planner, seeded):
     """The first environment's return falls steeply away from its optimum, the second's hardly varies."""
     model = FunctionModel(

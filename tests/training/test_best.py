@@ -4,9 +4,11 @@ import numpy as np
 import pytest
 import torch
 
-from latentplan.training import train
-from latentplan.training.callbacks import Experience, Save
+from latentplan.checkpoint import read_info
+from latentplan.training import resume, train
+from latentplan.training.callbacks import Experience, Save, Stop
 from latentplan.training.collector import Collector
+from latentplan.training.state import RunState
 
 
 def test_the_best_agent_is_the_one_that_was_judged(tiny, dot, tmp_path, monkeypatch):
@@ -32,6 +34,48 @@ def test_the_best_agent_is_the_one_that_was_judged(tiny, dot, tmp_path, monkeypa
     assert len(kept) == len(judged) > 3
     for theirs, ours in zip(judged, kept, strict=True):
         assert all(torch.equal(theirs[name], ours[name]) for name in theirs)
+
+
+@pytest.mark.parametrize(("again", "best"), [(3.0, "last"), (7.0, "early")])
+def test_at_the_end_the_best_and_the_last_agent_meet_the_same_starts(tiny, dot, tmp_path, monkeypatch, again, best):
+    """The best of many short evaluations is good by chance too."""
+    returns = iter([10.0, 5.0, again, 5.0, again])  # an evaluation, then last and best at the end and when resumed
+
+    def judge(collector, episodes, film=None, weights=None):
+        mean = next(returns)
+        return {"planner": [mean] * episodes, "actor": [0.0] * episodes}
+
+    monkeypatch.setattr(Collector, "evaluate", judge)
+    first = train(tiny(tmp_path / "run", evaluation={"every_frames": 45}), dot)
+    for run in (first, resume(first.run_dir, make_env=dot)):
+        assert run.summary["planner"] == 5.0
+        frames = {name: read_info(run.run_dir / "checkpoints" / name)["env_frames"] for name in ("best", "last")}
+        assert (frames["last"], frames["best"]) == (90, {"last": 90, "early": 45}[best])
+
+
+def test_an_evaluation_that_is_under_way_when_time_is_up_can_be_the_best(tiny, dot, tmp_path, monkeypatch):
+    returns = iter([1.0, -1.0, 1.0])
+    monkeypatch.setattr(Stop, "_is_late", lambda stop: stop.state.decisions >= 45)
+    monkeypatch.setattr(Collector, "evaluate", lambda *_: {"planner": [next(returns)], "actor": [0.0]})
+    run = train(tiny(tmp_path / "run"), dot)
+    state = torch.load(run.run_dir / "resume" / "state.pt", weights_only=True)["run"]
+    assert [entry["planner"] for entry in state["evaluations"]] == [1.0]
+    assert read_info(run.run_dir / "checkpoints" / "best")["env_frames"] == 45
+
+
+def test_a_signal_that_ends_the_process_that_collects_too_ends_the_run_in_order(tiny, tmp_path):
+    class Gone:
+        def result(self):
+            raise RuntimeError("the process that collects has ended unexpectedly")
+
+    state = RunState()
+    experience = Experience(tiny(tmp_path), None, state, Gone(), tmp_path)
+    experience._asked_round = True
+    with pytest.raises(RuntimeError, match="ended unexpectedly"):
+        experience.take()
+    state.interrupted = True
+    experience.take()
+    assert not experience._asked_round
 
 
 @pytest.mark.parametrize("rate", [0.01, 1.0])

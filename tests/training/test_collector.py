@@ -156,6 +156,8 @@ def test_goals_take_their_share_in_turn_and_leave_the_rest_as_it_was():
 def test_a_share_of_no_goals_is_refused():
     with pytest.raises(ValueError, match="goal_share needs goals"):
         CollectionConfig(goal_share=0.1)
+    with pytest.raises(ValueError, match="need a goal_share"):
+        CollectionConfig(goals=("upright",))
 
 
 def test_planner_and_actor_share_the_noise_evenly():
@@ -185,10 +187,10 @@ def make_cart(tiny):
 
 def test_a_round_for_a_goal_plans_for_it_and_leaves_nothing_to_imitate(make_cart):
     goals = ("cart -> 0.8", "cart -> -0.8")
-    both = make_cart(goals=goals, noise_std=0.0)
+    both = make_cart(goals=goals, goal_share=0.5, noise_std=0.0)
     weights = {name: value.numpy().copy() for name, value in both.model.state_dict().items()}
     plain, *pursued = (
-        make_cart(goals=goals, noise_std=0.0).collect(weights, "planner", 8, 0, True, goal).rows[0]
+        make_cart(goals=goals, goal_share=0.5, noise_std=0.0).collect(weights, "planner", 8, 0, True, goal).rows[0]
         for goal in (None, *goals)
     )
     assert (plain.plan != 0.0).any() and all((rows.plan == 0.0).all() for rows in pursued)

@@ -14,6 +14,7 @@ from latentplan.checkpoint import load_agent, read_info
 from latentplan.config import UserError
 from latentplan.training import callbacks, resume, train
 from latentplan.training.claim import claim
+from latentplan.training.record import COLUMNS
 from latentplan.training.run import INTERRUPTED
 
 
@@ -70,10 +71,10 @@ def test_every_update_was_made(finished):
 
 def test_metrics_have_the_promised_columns(finished):
     rows, epochs = rows_of(finished.run_dir), epochs_of(finished.run_dir)
-    assert tuple(rows[0]) == callbacks.COLUMNS
+    assert tuple(rows[0]) == COLUMNS
     clocks = [[float(row[name]) for row in epochs] for name in ("env_frames", "decisions", "updates", "minutes")]
     assert all(np.all(np.diff(clock) >= 0) for clock in clocks)
-    losses = callbacks.COLUMNS[callbacks.COLUMNS.index("reconstruction") :]
+    losses = COLUMNS[COLUMNS.index("reconstruction") :]
     assert all(np.isfinite(float(row[name])) for row in epochs for name in losses)
     assert any(row["episode_return"] for row in epochs)
 
@@ -206,6 +207,27 @@ def test_a_finished_run_can_be_extended(tiny, dot, tmp_path):
     after = saved_state(run.run_dir)
     assert_goes_on(before, after)
     assert after["run"]["env_frames"] == 90
+
+
+def test_an_extension_that_is_interrupted_goes_on_to_its_new_budget(tiny, dot, tmp_path):
+    run = train(tiny(tmp_path / "run", run={"frames": 60}), dot)
+    stopped = resume(run.run_dir, frames=105, make_env=Interrupting(dot, at_step=20).make)
+    assert stopped.exit_code == INTERRUPTED and saved_state(run.run_dir)["run"]["env_frames"] < 105
+    resume(run.run_dir, make_env=dot)
+    assert saved_state(run.run_dir)["run"]["env_frames"] == 105
+
+
+def test_a_run_that_ends_before_its_first_save_can_be_resumed(finished, tiny, dot, tmp_path):
+    """Of the same run as if it had not ended: nothing that it had written stays twice."""
+    steps = itertools.count()
+    step = {"step": lambda self, action: dot.step(self, action) if next(steps) < 100 else 1 / 0}
+    with pytest.raises(ZeroDivisionError):
+        train(tiny(tmp_path / "run", evaluation={"every_frames": 10**6}), type("Crashing", (dot,), step))
+    assert len(rows_of(tmp_path / "run")) > 0 and saved_state(tmp_path / "run")["learner"]["updates"] == 0
+    resume(tmp_path / "run", make_env=dot)
+    assert saved_state(tmp_path / "run")["learner"]["updates"] == saved_state(finished.run_dir)["learner"]["updates"]
+    updates = [int(row["updates"]) for row in rows_of(tmp_path / "run")]
+    assert len(updates) == len(set(updates))
 
 
 def test_resuming_a_finished_run_judges_the_same_agent(finished, dot):

@@ -1,0 +1,45 @@
+"""What a run takes of its machine: device, threads, replay."""
+
+from __future__ import annotations
+
+import os
+
+import torch
+
+from latentplan.config import Config, RunConfig, UserError
+
+UNKNOWN_LENGTH_CAPACITY = 200_000
+
+
+def choose_device(run: RunConfig) -> torch.device:
+    """The device a run learns on.
+
+    Raises:
+        UserError: CUDA was asked for, and there is none.
+    """
+    if run.device == "cuda" and not torch.cuda.is_available():
+        raise UserError("device cuda was asked for, but torch finds no CUDA device: use --device cpu")
+    if run.device == "auto":
+        return torch.device("cuda" if torch.cuda.is_available() else "cpu")
+    return torch.device(run.device)
+
+
+def choose_threads(overlap: bool) -> int:
+    """Threads of each half of an update.
+
+    Model and behaviour each take this many, and one core is left to the process that collects, if there is one: threads
+    that wait for each other on a shared core crawl.
+    """
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    return max(1, (cores - overlap) // 2)
+
+
+def replay_capacity(config: Config) -> int:
+    """Rows that hold everything a run collects, unless the settings say how many."""
+    if config.replay.capacity is not None:
+        return config.replay.capacity
+    if config.run.frames is None:
+        return UNKNOWN_LENGTH_CAPACITY
+    # Two rounds may run past the budget, and every episode ends with one frame without an action.
+    decisions = config.run.frames / config.env.action_repeat
+    return int(1.05 * decisions) + 2 * config.collection.round_decisions + config.collection.prefill_decisions
