@@ -10,7 +10,6 @@ import torch
 
 from latentplan.agent import ActorAgent, PlanningAgent
 from latentplan.checkpoint import save_checkpoint
-from latentplan.compose import dump_config
 from latentplan.config import Config, EnvConfig, LearningConfig, ModelConfig, PlannerConfig, UserError
 from latentplan.models import WorldModel
 
@@ -18,10 +17,8 @@ sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "scripts"))
 
 import benchmark  # noqa: E402
 from bench.ablate import compare_arms  # noqa: E402
-from bench.anchors import METHODS, published  # noqa: E402
 from bench.arms import NAMES, Arm, Outcome, parse_arms  # noqa: E402
 from bench.decide import measure_decisions  # noqa: E402
-from bench.learn import MARKERS, Curve, Point, check_same, compare, first_reaching, read_run, run_facts  # noqa: E402
 from bench.machine import product_limits  # noqa: E402
 from bench.render import measure_qualities  # noqa: E402
 from bench.report import format_table, interval, number  # noqa: E402
@@ -245,62 +242,3 @@ def test_returns_do_not_depend_on_the_number_of_workers(tmp_path, checkpoint):
     )
     for name in ("full", "actor"):
         assert alone[name]["returns"] == together[name]["returns"]
-
-
-def test_a_threshold_is_reached_at_the_first_evaluation_above_it():
-    curve = Curve("walker-walk", 0, [Point(10, 1.0, 50.0), Point(20, 2.0, 400.0), Point(30, 3.0, 300.0)])
-    assert first_reaching(curve, 300) == Point(20, 2.0, 400.0)
-    (facts,) = run_facts([curve], [300, 900])
-    assert facts["frames_to"] == {"300": 20, "900": None}
-    assert facts["final_return"] == 300.0
-
-
-def test_the_evaluation_that_ends_a_run_is_the_last_of_its_curve(tmp_path):
-    (tmp_path / "metrics.csv").write_text("env_frames,minutes,planner_return,actor_return\n80,4.0,1,2\n100,5.0,3,4\n")
-    assert read_run("walker-walk", 0, tmp_path, "actor").points == [Point(80, 4.0, 2.0), Point(100, 5.0, 4.0)]
-    (tmp_path / "final.json").write_text(json.dumps({"env_frames": 100, "minutes": 5.5, "planner": 7, "actor": 8}))
-    assert read_run("walker-walk", 0, tmp_path, "actor").points == [Point(80, 4.0, 2.0), Point(100, 5.5, 8.0)]
-
-
-def test_runs_stand_beside_what_is_published_at_as_many_frames():
-    curves = [
-        Curve("walker-walk", seed, [Point(60_000, 30.0, 100.0), Point(100_500, 60.0, final)])
-        for seed, final in enumerate((500.0, 700.0, 900.0))
-    ]
-    rows = compare("walker-walk", curves, [600, 800])
-    own, other = rows["latentplan"], rows["DreamerV3"]
-    assert own["returns"] == {100_000: 700.0} and own["intervals"][100_000][0] < 700.0
-    assert own["frames_to"] == {"600": 100_500, "800": None}
-    assert (other["returns"][100_000], other["frames_to"]) == (605, {"600": 100_000, "800": 200_000})
-    assert rows["ResAct (own repeat)"]["returns"] == {100_000: 772}
-    assert len(MARKERS) == len(METHODS) and set(published("walker-walk")) == set(METHODS)
-    assert list(compare("fish-swim", [curves[0]._replace(task="fish-swim")], [600])) == ["latentplan"]
-
-
-def test_finished_runs_are_collected_and_not_repeated(tmp_path, capsys):
-    for seed in (0, 1):
-        folder = tmp_path / f"walker-walk-seed{seed}"
-        folder.mkdir()
-        (folder / "finished.json").write_text(json.dumps({"budget": ["--frames", "100"]}))
-        rows = f"env_frames,minutes,planner_return,actor_return\n50,1.0,{seed},0\n60,1.5,,\n100,2.0,{seed + 300},1\n"
-        (folder / "metrics.csv").write_text(rows)
-    flags = ["--tasks", "walker-walk", "--frames", "100", "--out", str(tmp_path)]
-    assert benchmark.main(["learn", *flags]) == 0
-    summary = json.loads((tmp_path / "summary.json").read_text())
-    assert summary["final"]["walker-walk"]["mean"] == 300.5
-    assert summary["anchors"]["walker-walk"]["TD-MPC2"]["frames_to"]["750"] == 200_000
-    assert len(list(csv.DictReader((tmp_path / "curves.csv").open()))) == 4
-    assert (tmp_path / "curves.png").stat().st_size > 0
-    printed = capsys.readouterr().out
-    assert "not repeated" in printed and "EfficientZero V2" in printed
-
-
-def test_a_folder_of_other_settings_is_not_taken_for_these(tmp_path):
-    begun = replace(CONFIG, run=replace(CONFIG.run, frames=100, run_dir=str(tmp_path)))
-    dump_config(begun, tmp_path / "config.yaml")
-    check_same(begun, tmp_path / "nothing yet")
-    check_same(replace(begun, run=replace(begun.run, frames=200)), tmp_path)  # a budget may grow
-    with pytest.raises(UserError, match=r"--planner\.horizon 3, not 7"):
-        check_same(replace(begun, planner=replace(PLANNER, horizon=7)), tmp_path)
-    with pytest.raises(UserError, match=r"--run\.seed"):
-        check_same(replace(begun, run=replace(begun.run, seed=1)), tmp_path)

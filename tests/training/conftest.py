@@ -18,6 +18,7 @@ from latentplan.config import (
     RunConfig,
 )
 from latentplan.replay import Batch
+from latentplan.training import train
 
 TINY = Config(
     env=EnvConfig(action_repeat=1),
@@ -70,6 +71,13 @@ def tiny():
         return replace(config, run=replace(config.run, run_dir=str(folder)))
 
     return make
+
+
+@pytest.fixture(scope="session")
+def finished(tiny, dot, tmp_path_factory):
+    """A run that came to its end."""
+    folder = tmp_path_factory.mktemp("runs") / "finished"
+    return train(tiny(folder), dot)
 
 
 @pytest.fixture
