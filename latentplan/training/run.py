@@ -228,9 +228,12 @@ class _Run:
             f"trained {clocks['env_frames']:,} frames in {clocks['minutes']:.1f} min: planner "
             f"{summary['planner']:.1f}, actor {summary['actor']:.1f} ({episodes} episodes)"
         )
-        if summary["planner"] >= self.state.best_return or not self._is_best_better(summary["planner"]):
+        best = self.state.best_return
+        if summary["planner"] < best:
+            best = self._judge_best()
+        if summary["planner"] >= best:
             save.save_agent("best", self.learner.averaged, info)
-            self.state.best_return = summary["planner"]
+        self.state.best_return = max(best, summary["planner"])
         save.save_run(trainer, self.learner)
         self.console.console.print(f"run folder: {self.folder}")
         return summary
@@ -239,21 +242,21 @@ class _Run:
         self.worker.submit("evaluate", self.config.evaluation.final_episodes, film, weights_of(model))
         return self.worker.result()  # type: ignore[no-any-return]
 
-    def _is_best_better(self, planner: float) -> bool:
-        """Whether the agent kept as the best also earns more on the starts that judged the last one.
+    def _judge_best(self) -> float:
+        """What the planner of the best agent kept earns on the starts that judged the last one; -inf without one.
 
         The best mean of many evaluations of few episodes is high by chance too.
         """
         folder = self.folder / "checkpoints" / "best"
         if not (folder / "info.json").exists():
-            return False
+            return float("-inf")
         model, _, info = load_model(folder, str(self.device))
-        self.state.best_return = float(np.mean(self._judge(model)["planner"]))
+        earned = float(np.mean(self._judge(model)["planner"]))
         self.console.console.print(
-            f"on the same starts the agent of {info['env_frames']:,} frames: planner {self.state.best_return:.1f}; "
+            f"on the same starts the agent of {info['env_frames']:,} frames: planner {earned:.1f}; "
             "checkpoints/best is the better of the two"
         )
-        return self.state.best_return > planner
+        return earned
 
     def _announce(self) -> None:
         config, description, run = self.config, self.description, self.config.run

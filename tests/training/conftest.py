@@ -1,5 +1,7 @@
 """A world small enough to learn from within seconds: a dot to be kept in the middle of a picture."""
 
+import os
+import signal
 from dataclasses import replace
 
 import gymnasium
@@ -78,6 +80,29 @@ def finished(tiny, dot, tmp_path_factory):
     """A run that came to its end."""
     folder = tmp_path_factory.mktemp("runs") / "finished"
     return train(tiny(folder), dot)
+
+
+class Interrupting:
+    """A factory of environments that press Ctrl-C at a given step of all, once."""
+
+    def __init__(self, kind, at_step):
+        self.steps_left = at_step
+        outer = self
+
+        class Interrupted(kind):
+            def step(self, action):
+                outer.steps_left -= 1
+                if outer.steps_left == 0:
+                    os.kill(os.getpid(), signal.SIGINT)
+                return super().step(action)
+
+        self.make = Interrupted
+
+
+@pytest.fixture(scope="session")
+def interrupting():
+    """`interrupting(kind, at_step).make` makes environments of a kind; one of them interrupts the run."""
+    return Interrupting
 
 
 @pytest.fixture

@@ -1,8 +1,5 @@
 """Distillation: the actor comes to do what the planner does, and nothing else changes."""
 
-import os
-import signal
-
 import numpy as np
 import pytest
 import torch
@@ -126,30 +123,13 @@ def test_an_actor_that_earns_more_than_its_planner_is_kept(checkpoint, push, tmp
     assert "an improvement is not to be expected" in out and "that actor is kept, unchanged" in out
 
 
-class Interrupting:
-    """A factory of environments that press Ctrl-C at a given step of all, once."""
-
-    def __init__(self, kind, at_step):
-        self.steps_left = at_step
-        outer = self
-
-        class Interrupted(kind):
-            def step(self, action):
-                outer.steps_left -= 1
-                if outer.steps_left == 0:
-                    os.kill(os.getpid(), signal.SIGINT)
-                return super().step(action)
-
-        self.make = Interrupted
-
-
 # Steps: 6 episodes of 20 to begin with; then in each round 2 driven and 2 judged.
 @pytest.mark.parametrize("at_step", [50, 180])
 def test_an_interrupted_distillation_ends_as_if_nothing_had_happened(
-    at_step, finished, checkpoint, push, tmp_path, capsys
+    at_step, finished, checkpoint, push, tmp_path, capsys, interrupting
 ):
     out = tmp_path / "out"
-    stopped = distill(checkpoint, out, SETTINGS, make_env=Interrupting(push, at_step).make)
+    stopped = distill(checkpoint, out, SETTINGS, make_env=interrupting(push, at_step).make)
     assert (stopped.exit_code, dict(stopped.summary)) == (INTERRUPTED, {})
     assert f"--resume {out}" in " ".join(capsys.readouterr().out.split())
     gone_on = resume_distillation(out, make_env=push)

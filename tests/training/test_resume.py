@@ -2,7 +2,6 @@
 
 import csv
 import itertools
-import os
 import shutil
 import signal
 
@@ -38,27 +37,10 @@ def assert_goes_on(before, after):
         assert {entry["step"].item() for entry in optimizer["state"].values()} == {updates}
 
 
-class Interrupting:
-    """A factory of environments that press Ctrl-C at a given step of all, once."""
-
-    def __init__(self, kind, at_step):
-        self.steps_left = at_step
-        outer = self
-
-        class Interrupted(kind):
-            def step(self, action):
-                outer.steps_left -= 1
-                if outer.steps_left == 0:
-                    os.kill(os.getpid(), signal.SIGINT)
-                return super().step(action)
-
-        self.make = Interrupted
-
-
-def test_an_interrupted_run_is_saved_and_goes_on_where_it_was(tiny, dot, tmp_path):
+def test_an_interrupted_run_is_saved_and_goes_on_where_it_was(tiny, dot, tmp_path, interrupting):
     handlers = [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)]
     # Steps: 45 of the prefill, 15 of the first round, 2 x 20 of the first evaluation, then into the second round.
-    stopped = train(tiny(tmp_path / "run"), Interrupting(dot, at_step=105).make)
+    stopped = train(tiny(tmp_path / "run"), interrupting(dot, at_step=105).make)
     assert (stopped.exit_code, dict(stopped.summary)) == (INTERRUPTED, {})
     assert [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)] == handlers
     before = saved_state(stopped.run_dir)
@@ -81,9 +63,9 @@ def test_a_finished_run_can_be_extended(tiny, dot, tmp_path):
     assert after["run"]["env_frames"] == 90
 
 
-def test_an_extension_that_is_interrupted_goes_on_to_its_new_budget(tiny, dot, tmp_path):
+def test_an_extension_that_is_interrupted_goes_on_to_its_new_budget(tiny, dot, tmp_path, interrupting):
     run = train(tiny(tmp_path / "run", run={"frames": 60}), dot)
-    stopped = resume(run.run_dir, frames=105, make_env=Interrupting(dot, at_step=20).make)
+    stopped = resume(run.run_dir, frames=105, make_env=interrupting(dot, at_step=20).make)
     assert stopped.exit_code == INTERRUPTED and saved_state(run.run_dir)["run"]["env_frames"] < 105
     resume(run.run_dir, make_env=dot)
     assert saved_state(run.run_dir)["run"]["env_frames"] == 105
@@ -119,17 +101,17 @@ def test_a_finished_run_that_is_judged_again_can_still_be_extended(finished, dot
     assert states[0] == states[1] and all(states[0])
 
 
-def test_an_interruption_loses_no_evaluation(finished, tiny, dot, tmp_path):
+def test_an_interruption_loses_no_evaluation(finished, tiny, dot, tmp_path, interrupting):
     # Step 50 lies in the first round, when the evaluation of the prefill has been asked for but not taken.
-    stopped = train(tiny(tmp_path / "run"), Interrupting(dot, at_step=50).make)
+    stopped = train(tiny(tmp_path / "run"), interrupting(dot, at_step=50).make)
     resume(stopped.run_dir, make_env=dot)
     judged = [entry["env_frames"] for entry in saved_state(stopped.run_dir)["run"]["evaluations"]]
     assert judged == [entry["env_frames"] for entry in saved_state(finished.run_dir)["run"]["evaluations"]]
 
 
-def test_a_second_interruption_ends_the_run_at_once(tiny, dot, tmp_path):
-    first = Interrupting(dot, at_step=50)
-    second = Interrupting(first.make, at_step=52)
+def test_a_second_interruption_ends_the_run_at_once(tiny, dot, tmp_path, interrupting):
+    first = interrupting(dot, at_step=50)
+    second = interrupting(first.make, at_step=52)
     with pytest.raises(SystemExit) as ended:
         train(tiny(tmp_path / "run"), second.make)
     assert ended.value.code == INTERRUPTED
