@@ -30,6 +30,7 @@ class LearningConfig:
         reward_scale: Weight of the reward loss.
         imagination_horizon: Model steps of each imagined rollout.
         imagination_starts: Rollouts imagined per update, drawn from the batch's states.
+        gradient_decay: Share of the actor's gradient that each imagined step passes back to the one before, in [0, 1].
         lambda_: Mixing of n-step returns into the lambda-return, in [0, 1].
         discount: Discount per decision; None derives 1 - 5 / (decisions per episode).
         replay_value_scale: Weight of the value loss on replayed rewards beside the imagined one.
@@ -61,6 +62,7 @@ class LearningConfig:
     reward_scale: float = 1.0
     imagination_horizon: int = 10
     imagination_starts: int = 160
+    gradient_decay: float = 1.0
     lambda_: float = 0.95
     discount: float | None = None
     replay_value_scale: float = 0.3
@@ -82,7 +84,8 @@ class LearningConfig:
         above_zero(
             self, "model_learning_rate", "behaviour_learning_rate", "max_grad_norm", "target_rate", "average_rate"
         )
-        within(self, lambda_=(0.0, 1.0), turned_share=(0.0, 1.0), target_rate=(0.0, 1.0), average_rate=(0.0, 1.0))
+        within(self, gradient_decay=(0.0, 1.0), lambda_=(0.0, 1.0))
+        within(self, turned_share=(0.0, 1.0), target_rate=(0.0, 1.0), average_rate=(0.0, 1.0))
         if self.discount is not None and not 0.0 < self.discount <= 1.0:
             raise ValueError(f"discount must lie in (0, 1], got {self.discount}")
 

@@ -103,9 +103,11 @@ def world_model_loss(model: WorldModel, batch: Batch, config: LearningConfig, ge
     return Learned(loss, State(*(part.detach() for part in states)), open_loop.detach(), detached)
 
 
-def imagine(model: WorldModel, start: State, horizon: int, generator: torch.Generator) -> Imagination:
-    """Roll the actor out in the model for `horizon` steps from rows of states, with gradients through the dynamics."""
-    stacked, entropies = roll_out(model, model.actor, start, horizon, generator)
+def imagine(
+    model: WorldModel, start: State, horizon: int, generator: torch.Generator, decay: float = 1.0
+) -> Imagination:
+    """Roll the actor out in the model for `horizon` steps from rows of states; gradients and decay as in `roll_out`."""
+    stacked, entropies = roll_out(model, model.actor, start, horizon, generator, decay)
     rewards = model.reward_head.mean(model.reward_head(stacked[1:]))
     continues = torch.sigmoid(model.continue_head(stacked[1:])).squeeze(-1)
     return Imagination(stacked, rewards, continues, entropies)
@@ -117,6 +119,7 @@ def roll_out(
     start: State,
     horizon: int,
     generator: torch.Generator,
+    decay: float = 1.0,
 ) -> tuple[Tensor, Tensor]:
     """Follow samples of a policy and of the prior, with gradients through the dynamics.
 
@@ -129,6 +132,8 @@ def roll_out(
         start: Rows of states.
         horizon: Steps.
         generator: Of the samples.
+        decay: Share of a state's gradient that a step passes back to the state before, in [0, 1]. Where bodies touch,
+            gradients grow from step to step until they say nothing (Schrittwieser et al. 2020, appendix G, halve them).
 
     Returns:
         Features, the start first, (horizon + 1, rows, feature); entropies of the actions, in nats, (horizon, rows).
@@ -141,7 +146,7 @@ def roll_out(
         mean, std = policy(features[-1].detach())
         action = sample_action(mean, std, action_noise[step])
         stds.append(std)
-        deter = model.dynamics.advance(state, action)
+        deter = model.dynamics.advance(State(*(_decayed(part, decay) for part in state)), action)
         prior = model.dynamics.prior(deter)
         state = State(deter, torch.addcmul(prior.mean, prior.std, noise[step]))
         features.append(state.features)
@@ -229,6 +234,11 @@ def _probe_loss(model: WorldModel, features: Tensor, labels: Tensor) -> Tensor:
 
 def _free_kl(left: Gaussian, right: Gaussian, free_nats: float) -> Tensor:
     return kl_divergence(left, right).clamp_min(free_nats).mean()
+
+
+def _decayed(values: Tensor, share: float) -> Tensor:
+    """The same values, of whose gradient a share goes on."""
+    return values if share == 1.0 else values.detach().lerp(values, share)
 
 
 def _detached(gaussian: Gaussian) -> Gaussian:

@@ -152,6 +152,7 @@ class Learner(lightning.LightningModule):
                 State(flat.deter[chosen], flat.stoch[chosen]),
                 config.imagination_horizon,
                 generator,
+                config.gradient_decay,
             )
             values = self.target_value.mean(self.target_value(dream.features[1:]))
         discounts = self.discount * dream.continues

@@ -5,7 +5,7 @@ import torch
 
 from latentplan.models import Gaussian, State, WorldModel, kl_divergence
 from latentplan.replay import Replay
-from latentplan.training.losses import imagine, imitation_loss, lambda_return, world_model_loss
+from latentplan.training.losses import imagine, imitation_loss, lambda_return, roll_out, world_model_loss
 from latentplan.training.module import Learner
 from latentplan.training.optimization import return_scale
 
@@ -148,6 +148,24 @@ def test_the_actor_learns_through_the_dynamics(model):
     assert dream.rewards.shape == dream.continues.shape == dream.entropies.shape == (4, 3)
     dream.rewards.sum().backward()
     assert "actor" in names_with_gradient(model)
+
+
+def gradients_of_the_end(model, decay):
+    """Features of an imagined end, and its gradient with respect to the mean of every action on the way there."""
+    means = torch.zeros(4, 3, 1, requires_grad=True)
+    actions = iter(means)
+    start = State(torch.zeros(3, 16), torch.zeros(3, 32))
+    features, _ = roll_out(model, lambda _: (next(actions), torch.ones(3, 1)), start, 4, stream(), decay)
+    features[-1].square().sum().backward()
+    return features, means.grad
+
+
+def test_a_decayed_gradient_loses_a_share_with_every_step_and_the_rollout_nothing(model):
+    (whole, gradient), (same, decayed) = (gradients_of_the_end(model, decay) for decay in (1.0, 0.5))
+    assert torch.equal(whole, same)
+    assert gradient.abs().min() > 0.0
+    shares = torch.tensor([0.125, 0.25, 0.5, 1.0]).view(4, 1, 1)
+    assert torch.allclose(decayed, shares * gradient, rtol=1e-3)
 
 
 def test_imagined_rewards_belong_to_the_states_they_arrive_with(model):
