@@ -18,7 +18,7 @@ def test_the_best_agent_is_the_one_that_was_judged(tiny, dot, tmp_path, monkeypa
     def weights_of(model):
         return {name: value.clone() for name, value in model.state_dict().items()}
 
-    def judge(collector, episodes, film=None, weights=None):
+    def judge(collector, episodes, film=None, weights=None, modes=()):
         if weights is not None:
             collector._load(weights)
         judged.append(weights_of(collector.model))
@@ -41,7 +41,7 @@ def test_at_the_end_the_best_and_the_last_agent_meet_the_same_starts(tiny, dot, 
     """The best of many short evaluations is good by chance too."""
     returns = iter([10.0, 5.0, again, 5.0, again])  # an evaluation, then last and best at the end and when resumed
 
-    def judge(collector, episodes, film=None, weights=None):
+    def judge(collector, episodes, film=None, weights=None, modes=()):
         mean = next(returns)
         return {"planner": [mean] * episodes, "actor": [0.0] * episodes}
 
@@ -51,6 +51,20 @@ def test_at_the_end_the_best_and_the_last_agent_meet_the_same_starts(tiny, dot, 
         assert run.summary["planner"] == 5.0
         frames = {name: read_info(run.run_dir / "checkpoints" / name)["env_frames"] for name in ("best", "last")}
         assert (frames["last"], frames["best"]) == (90, {"last": 90, "early": 45}[best])
+
+
+def test_who_is_only_compared_with_the_last_agent_plays_as_a_planner_alone(tiny, dot, tmp_path, monkeypatch):
+    judged, evaluate = [], Collector.evaluate
+    means = iter([10.0, 5.0, 7.0])  # an evaluation, then last and best at the end
+
+    def judge(collector, episodes, *arguments):
+        returns = evaluate(collector, episodes, *arguments)
+        judged.append(tuple(returns))
+        return returns | {"planner": [next(means)]}
+
+    monkeypatch.setattr(Collector, "evaluate", judge)
+    train(tiny(tmp_path / "run", evaluation={"every_frames": 45}), dot)
+    assert judged == [("planner", "actor"), ("planner", "actor"), ("planner",)]
 
 
 def test_an_evaluation_that_is_under_way_when_time_is_up_can_be_the_best(tiny, dot, tmp_path, monkeypatch):
