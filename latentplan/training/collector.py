@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import time
-from collections.abc import Callable, Collection
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -164,7 +164,7 @@ class Collector:
         episodes: int,
         film: Path | None = None,
         weights: dict[str, np.ndarray] | None = None,
-        modes: Collection[str] = ("planner", "actor"),
+        actor: bool = True,
     ) -> dict[str, list[float]]:
         """Returns of planner and actor on the same starts, without exploration.
 
@@ -172,23 +172,22 @@ class Collector:
             episodes: Episodes of each.
             film: Where the planner's first episode is filmed, if anywhere.
             weights: State of the world model; None keeps that of the last round.
-            modes: Who plays: `planner`, `actor` or both.
+            actor: Whether the actor plays too; without, only the planner's returns are given.
         """
         if weights is not None:
             self._load(weights)
         stream = derive_seed(self.config.run.seed, "evaluation")
         seeds = [episode_seed(stream, index) for index in range(episodes)]
-        returns = {}
-        for mode in modes:
-            agent = self._judged[mode]
-            with contextlib.ExitStack() as stack:
-                on_step = None
-                if film is not None and mode == "planner":
-                    horizon, every = self.config.planner.horizon, -(-(self._decisions or 0) // FILMED_FRAMES) or 1
-                    on_step = stack.enter_context(filming(film, self._eval_env, agent, horizon, every=every))
-                played = run_episodes(self._eval_env, agent, seeds, on_step=on_step)
-            returns[mode] = [episode.total_return for episode in played]
-        return returns
+        planner = self._judged["planner"]
+        with contextlib.ExitStack() as stack:
+            on_step = None
+            if film is not None:
+                horizon, every = self.config.planner.horizon, -(-(self._decisions or 0) // FILMED_FRAMES) or 1
+                on_step = stack.enter_context(filming(film, self._eval_env, planner, horizon, every=every))
+            played = {"planner": run_episodes(self._eval_env, planner, seeds, on_step=on_step)}
+        if actor:
+            played["actor"] = run_episodes(self._eval_env, self._judged["actor"], seeds)
+        return {mode: [episode.total_return for episode in rollouts] for mode, rollouts in played.items()}
 
     def close(self) -> None:
         """Free simulators and processes."""

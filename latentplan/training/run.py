@@ -219,9 +219,7 @@ class _Run:
         clocks = save.clocks(self.learner)
         episodes = self.config.evaluation.final_episodes
         self.console.console.print(f"final evaluation: {episodes} episodes each of planner and actor")
-        returns = self._judge(
-            self.learner.averaged, film if self.config.evaluation.video else None, ("planner", "actor")
-        )
+        returns = self._judge(self.learner.averaged, film if self.config.evaluation.video else None)
         summary = {mode: float(np.mean(values)) for mode, values in returns.items()}
         info = clocks | {"final_evaluation": returns}
         (self.folder / "final.json").write_text(json.dumps(info | summary, indent=1))
@@ -240,8 +238,8 @@ class _Run:
         self.console.console.print(f"run folder: {self.folder}")
         return summary
 
-    def _judge(self, model: WorldModel, film: Path | None, modes: tuple[str, ...]) -> dict[str, list[float]]:
-        self.worker.submit("evaluate", self.config.evaluation.final_episodes, film, weights_of(model), modes)
+    def _judge(self, model: WorldModel, film: Path | None = None, actor: bool = True) -> dict[str, list[float]]:
+        self.worker.submit("evaluate", self.config.evaluation.final_episodes, film, weights_of(model), actor)
         return self.worker.result()  # type: ignore[no-any-return]
 
     def _judge_best(self) -> float:
@@ -253,7 +251,7 @@ class _Run:
         if not (folder / "info.json").exists():
             return float("-inf")
         model, _, info = load_model(folder, str(self.device))
-        earned = float(np.mean(self._judge(model, None, ("planner",))["planner"]))
+        earned = float(np.mean(self._judge(model, actor=False)["planner"]))
         self.console.console.print(
             f"on the same starts the agent of {info['env_frames']:,} frames: planner {earned:.1f}; "
             "checkpoints/best is the better of the two"

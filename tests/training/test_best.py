@@ -18,7 +18,7 @@ def test_the_best_agent_is_the_one_that_was_judged(tiny, dot, tmp_path, monkeypa
     def weights_of(model):
         return {name: value.clone() for name, value in model.state_dict().items()}
 
-    def judge(collector, episodes, film=None, weights=None, modes=()):
+    def judge(collector, episodes, film=None, weights=None, actor=True):
         if weights is not None:
             collector._load(weights)
         judged.append(weights_of(collector.model))
@@ -41,7 +41,7 @@ def test_at_the_end_the_best_and_the_last_agent_meet_the_same_starts(tiny, dot, 
     """The best of many short evaluations is good by chance too."""
     returns = iter([10.0, 5.0, again, 5.0, again])  # an evaluation, then last and best at the end and when resumed
 
-    def judge(collector, episodes, film=None, weights=None, modes=()):
+    def judge(collector, episodes, film=None, weights=None, actor=True):
         mean = next(returns)
         return {"planner": [mean] * episodes, "actor": [0.0] * episodes}
 
