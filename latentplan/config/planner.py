@@ -30,7 +30,8 @@ class PlannerConfig:
         start: Centre of the search: `shifted` (the last plan), `policy` (the actor's) or `both`.
         tail: What fills the end of the shifted plan: `zero`, `hold` or `policy`.
         warm_start_variance: Variance of a warm start: `reset`, `keep` or `inflate`.
-        final: What is executed: the `mean` of the distribution or the `best` candidate.
+        final: What is executed: the `mean` of the distribution, the `best` candidate, or the `better` of the mean and
+            the actor's own plan, by their predicted returns.
         noise_beta: Exponent of coloured sampling noise; 0 is white.
         keep_elite_fraction: Share of the elites kept for the next iteration and the next plan.
         deadline_ms: Milliseconds that a search may take; null lets it do all its iterations.
@@ -63,7 +64,7 @@ class PlannerConfig:
         above_zero(self, "goal_horizon", "smoothing", "deadline_ms")
         within(self, smoothing=(0.0, 1.0), keep_elite_fraction=(0.0, 1.0))
         one_of(self, start=("shifted", "policy", "both"), tail=("zero", "hold", "policy"))
-        one_of(self, warm_start_variance=("reset", "keep", "inflate"), final=("mean", "best"))
+        one_of(self, warm_start_variance=("reset", "keep", "inflate"), final=("mean", "best", "better"))
         for name in ("num_elites", "num_policy_samples"):
             if getattr(self, name) > self.num_samples - (name == "num_policy_samples"):
                 raise ValueError(f"{name} ({getattr(self, name)}) is too many for num_samples ({self.num_samples})")

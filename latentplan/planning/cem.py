@@ -24,7 +24,7 @@ from latentplan.planning.search import Search
 Bound = float | Sequence[float] | Tensor
 _CHOICES = {
     "start": ("shifted", "policy", "both"),
-    "final": ("mean", "best"),
+    "final": ("mean", "best", "better"),
     "tail": ("zero", "hold", "policy"),
     "warm_start_variance": ("reset", "keep", "inflate"),
 }
@@ -58,7 +58,8 @@ class CEMPlanner:
             candidates of the first iteration around each). Without policy samples it is `shifted`.
         tail: What fills the end of the shifted plan: `zero`, `hold` or `policy`.
         warm_start_variance: Variance of a warm start: `reset`, `keep`, or `inflate` (halfway between these).
-        final: What is executed: the `mean` of the distribution or the `best` candidate.
+        final: What is executed: the `mean` of the distribution, the `best` candidate, or the `better` of the mean and
+            the policy's mode, by their predicted returns; where the policy has no say `better` is `mean`.
         noise_beta: Exponent of coloured sampling noise, 0 for white; larger is smoother over the horizon.
         keep_elite_fraction: Share of the elites that stay candidates in the next iteration and, shifted, the next plan.
         stop_std: Stop early where the search distribution is narrower than this everywhere, in action units; 0 never.

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
+from latentplan.planning.choice import choose
 from latentplan.planning.conditioned import seen_for
 from latentplan.planning.deadline import Budget
 from latentplan.planning.elites import Scores, mean_return, move_towards, select_elites
@@ -92,7 +93,8 @@ class Search:
         progress, history, stopped = self._iterate(start, proposals)
         # Where nothing finite was found: the last plan's tail, or zeros clamped into the bounds.
         mean = torch.where(progress.is_found[:, None, None], progress.mean, last.mean).clamp(self.low, self.high)
-        actions, expected, violation = self._choose(progress, mean)
+        mode = proposals[:, 0] if proposals is not None and self.may_follow_policy else None
+        actions, expected, violation = choose(options.final, self.scorer, self.state, progress, mean, mode)
         self.budget.lap("choose")
         if options.gradient_steps and not self.budget.allows("gradient"):
             stopped = "deadline"
@@ -245,32 +247,6 @@ class Search:
             progress.num_nonfinite + (~torch.isfinite(fresh_returns)).sum(dim=1),
             progress.iterations + 1,
             progress.is_found | is_found,
-        )
-
-    def _choose(self, progress: Progress, mean: Tensor) -> tuple[Tensor, Tensor, Tensor | None]:
-        """What is executed, its expected return and its violation (when there are constraints)."""
-        assert progress.elites is not None
-        best, scores = progress.elites.actions[:, 0], progress.elites.scores
-        best_return = scores.returns[:, 0]
-        if scores.violations is None:
-            if self.options.final == "mean":
-                return mean, progress.expected_return, None
-            is_best = torch.isfinite(best_return)
-            actions = torch.where(is_best[:, None, None], best, mean)
-            return actions, torch.where(is_best, best_return, progress.expected_return), None
-        own = self.scorer.score(
-            self.scorer.start_rows(self.state, 1), mean[:, None]
-        )  # the mean of feasible sequences may itself be infeasible
-        assert own.violations is not None
-        violation, best_violation = own.violations[:, 0], scores.violations[:, 0]
-        is_best = torch.isfinite(best_return)
-        if self.options.final == "mean":
-            is_safer = best_violation < violation.nan_to_num(float("inf"))
-            is_best = is_best & is_safer if scores.is_ranked else torch.zeros_like(is_best)
-        return (
-            torch.where(is_best[:, None, None], best, mean),
-            torch.where(is_best, best_return, progress.expected_return),
-            torch.where(is_best, best_violation, violation),
         )
 
     def _cold_start(self) -> WarmStart:

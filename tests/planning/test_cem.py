@@ -17,7 +17,7 @@ def test_candidates_meet_their_own_environments_state(make_planner, seeded):
     torch.testing.assert_close(plan.action, goals, atol=0.02, rtol=0)
 
 
-@pytest.mark.parametrize("options", [{}, RICH, {"final": "best"}, {"gradient_steps": 3}])
+@pytest.mark.parametrize("options", [{}, RICH, {"final": "best"}, RICH | {"final": "better"}, {"gradient_steps": 3}])
 def test_asymmetric_bounds_hold_in_the_model_and_in_the_plan(point, states, make_planner, seeded, options):
     low, high = torch.tensor([0.2, -3.0]), torch.tensor([0.7, -0.5])
     seen = []

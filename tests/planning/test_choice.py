@@ -1,0 +1,67 @@
+"""What is executed of a finished search: of the mean and the policy's mode the better, by predicted return."""
+
+import math
+
+import pytest
+import torch
+
+from latentplan.planning import FunctionModel, learned_return
+
+NAN = float("nan")
+
+
+def needle(state, action):
+    """Near the state's number everything is paid a little, at exactly 0.625 a lot."""
+    return 1 - (action - state[:, :1]).square().sum(dim=1) + 10 * (action - 0.625).abs().amax(dim=1).lt(1e-6).float()
+
+
+def make_model(policy, reward=needle):
+    return FunctionModel(lambda state, action: state, reward, policy=policy)
+
+
+def constant(number):
+    return lambda state, generator: torch.full((len(state), 2), number)
+
+
+def test_each_environment_executes_the_better_of_the_mean_and_the_policys_mode(make_planner, seeded):
+    states = torch.tensor([[0.2], [-0.4], [0.3]])
+    knows = torch.tensor([[0.2], [0.3]])  # the first and the last policy know where the needle is
+    model = make_model(lambda state, generator: torch.where(torch.isin(state, knows), 0.625, 0.0).expand(len(state), 2))
+    plain, planner = (make_planner(num_policy_samples=1, final=final) for final in ("mean", "better"))
+    mean, plan = (each.plan(model, states, generator=seeded()) for each in (plain, planner))
+    torch.testing.assert_close(plan.mean, mean.mean)  # the search itself is the same
+    torch.testing.assert_close(plan.actions[0::2], torch.full_like(plan.actions[0::2], 0.625))
+    torch.testing.assert_close(plan.actions[1], plan.mean[1])
+    earned = sum(planner.discount**step * needle(states, plan.actions[:, step]) for step in range(planner.horizon))
+    torch.testing.assert_close(plan.expected_return, earned)
+
+
+@pytest.mark.parametrize("policy", [NAN, 5.0])
+def test_a_mode_that_is_no_number_is_not_executed_and_one_out_of_bounds_is_brought_in(make_planner, seeded, policy):
+    def reward(state, action):
+        return torch.nan_to_num(action, nan=9.0).sum(dim=1)
+
+    plan = make_planner(num_policy_samples=4, final="better").plan(
+        make_model(constant(policy), reward), torch.zeros(2, 1), generator=seeded()
+    )
+    expected = plan.mean if math.isnan(policy) else torch.ones_like(plan.mean)
+    torch.testing.assert_close(plan.actions, expected)
+
+
+def test_the_policy_has_no_say_in_what_it_does_not_know(make_planner, seeded):
+    model, states = make_model(constant(0.625)), torch.tensor([[0.2], [-0.4]])
+    planner = make_planner(num_policy_samples=4, final="better")
+    for given in ({"objective": learned_return()}, {"constraints": [lambda rollout: rollout.rewards[:, 0] * 0.0]}):
+        plan = planner.plan(model, states, generator=seeded(), **given)
+        assert torch.equal(plan.actions, plan.mean)
+    alone = make_planner(final="better").plan(model, states, generator=seeded())
+    assert torch.equal(alone.actions, alone.mean)
+
+
+def test_where_nothing_is_finite_the_last_plan_goes_on(point, states, make_planner, seeded):
+    planner = make_planner(num_policy_samples=4, final="better")
+    last = planner.plan(point, states, generator=seeded())
+    broken = make_model(point.policy, lambda state, action: torch.full_like(state[:, 0], NAN))
+    plan = planner.plan(broken, states, last, generator=seeded())
+    assert plan.info["is_fallback"].all() and plan.expected_return.isnan().all()
+    torch.testing.assert_close(plan.actions[:, :-1], last.actions[:, 1:])
