@@ -251,11 +251,9 @@ class _Run:
         if not (folder / "info.json").exists():
             return float("-inf")
         model, _, info = load_model(folder, str(self.device))
+        self.console.console.print(f"the same starts for the best agent so far, of {info['env_frames']:,} frames")
         earned = float(np.mean(self._judge(model, actor=False)["planner"]))
-        self.console.console.print(
-            f"on the same starts the agent of {info['env_frames']:,} frames: planner {earned:.1f}; "
-            "checkpoints/best is the better of the two"
-        )
+        self.console.console.print(f"its planner earned {earned:.1f}; checkpoints/best is the better of the two")
         return earned
 
     def _announce(self) -> None:

@@ -1,6 +1,5 @@
 """Runs that were interrupted, that crashed or that are to go on for longer."""
 
-import csv
 import itertools
 import shutil
 import signal
@@ -10,20 +9,7 @@ import torch
 
 from latentplan.training import callbacks, resume, train
 from latentplan.training.run import INTERRUPTED
-
-
-def rows_of(folder):
-    with (folder / "metrics.csv").open(newline="") as file:
-        return list(csv.DictReader(file))
-
-
-def epochs_of(folder):
-    """The rows of epochs, without those of evaluations."""
-    return [row for row in rows_of(folder) if row["reconstruction"]]
-
-
-def saved_state(folder):
-    return torch.load(folder / "resume" / "state.pt", weights_only=True)
+from tests.training.run_folder import epochs_of, rows_of, saved_state
 
 
 def assert_goes_on(before, after):

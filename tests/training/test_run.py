@@ -1,35 +1,20 @@
 """Whole runs, tiny: what they leave behind, how they repeat, stop and go on."""
 
-import csv
 import shutil
 
 import numpy as np
 import pytest
-import torch
 
 from latentplan.checkpoint import load_agent, read_info
 from latentplan.config import UserError
 from latentplan.training import resume, train
 from latentplan.training.claim import claim
 from latentplan.training.record import COLUMNS
-
-
-def rows_of(folder):
-    with (folder / "metrics.csv").open(newline="") as file:
-        return list(csv.DictReader(file))
-
-
-def epochs_of(folder):
-    """The rows of epochs, without those of evaluations."""
-    return [row for row in rows_of(folder) if row["reconstruction"]]
+from tests.training.run_folder import epochs_of, rows_of, saved_state
 
 
 def without_minutes(folder):
     return [{name: value for name, value in row.items() if name != "minutes"} for row in rows_of(folder)]
-
-
-def saved_state(folder):
-    return torch.load(folder / "resume" / "state.pt", weights_only=True)
 
 
 def test_a_run_ends_with_its_budget_and_a_summary(finished):
