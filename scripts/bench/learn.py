@@ -222,16 +222,17 @@ def anchor_table(task: str, rows: Mapping[str, Mapping[str, Any]], thresholds: S
 
 
 def plot_runs(curves: Sequence[Curve], mode: str, png: Path) -> None:
-    """Evaluation return against frames: a panel per task, a line per seed."""
+    """Evaluation return against frames: a panel per task, two in a row, and a line per seed."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
     from matplotlib.ticker import EngFormatter
 
     tasks = list(dict.fromkeys(curve.task for curve in curves))
-    figure = Figure(figsize=(6.5 * len(tasks), 4), layout="constrained")
+    rows, columns = (len(tasks) + 1) // 2, min(2, len(tasks))
+    figure = Figure(figsize=(6.5 * columns, 4 * rows), layout="constrained")
     FigureCanvasAgg(figure)
-    panels = figure.subplots(1, len(tasks), squeeze=False)[0]
-    for axes, task in zip(panels, tasks, strict=True):
+    for place, task in enumerate(tasks, start=1):
+        axes = figure.add_subplot(rows, columns, place)
         for curve in (curve for curve in curves if curve.task == task):
             frames, _, returns = zip(*curve.points, strict=True)
             axes.plot(frames, returns, marker="o", markersize=3, label=f"seed {curve.seed}")
