@@ -19,8 +19,8 @@ class Plan:
         actions: The chosen sequence within the bounds, (batch, horizon, action).
         mean: Mean of the search distribution, (batch, horizon, action).
         var: Variance of the search distribution, (batch, horizon, action).
-        expected_return: Predicted return of what the choice rests on, (batch,): of the last elites on average where
-            their mean is executed, else of the sequence that is. NaN where nothing finite was found.
+        expected_return: Predicted return of what the choice rests on, (batch,): of the last elites on average, or of
+            the executed sequence where it was chosen (`final` best or better). NaN where nothing finite was found.
         info: Diagnostics, (batch,) or (batch, iteration), and what stopped the search; see `CEMPlanner.plan`.
         elites: Kept elites, (batch, kept, horizon, action), when the planner keeps some.
         is_warm: Whether the next search may start here, (batch,) bool on the CPU.
