@@ -114,7 +114,7 @@ class SuiteEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         self.metadata = {**SuiteEnv.metadata, "render_fps": frames_per_second}
         self.decisions_per_episode = math.ceil(self._steps_per_episode / config.action_repeat)
         spec = self._task_env.action_spec()
-        bounded = np.isfinite(spec.minimum) & np.isfinite(spec.maximum)
+        bounded = self.physics.model.actuator_ctrllimited.astype(bool)
         self._action_low = np.where(bounded, spec.minimum, -1.0)
         self._action_high = np.where(bounded, spec.maximum, 1.0)
         self.observation_space = gymnasium.spaces.Box(0, 255, (FRAME_SIZE, FRAME_SIZE, 3), np.uint8)

@@ -140,6 +140,16 @@ def test_actions_beyond_the_bounds_act_like_the_bounds(env):
     assert np.array_equal(*states)
 
 
+@pytest.mark.parametrize(("domain", "largest"), [("lqr", 1.0), ("quadruped", [1.0, 1.1, 0.8] * 4)])
+def test_the_largest_action_is_the_bodys_largest_control_or_1_where_it_has_none(domain, largest):
+    env = make_env(config(domain=domain, action_repeat=1), seed=0)
+    env.reset(seed=0)
+    env.step(np.ones(env.action_space.shape))
+    controls = env.physics.control()
+    env.close()
+    assert controls == pytest.approx(np.broadcast_to(largest, controls.shape))
+
+
 @pytest.mark.parametrize("action", [np.zeros(2), np.array([np.nan])])
 def test_an_action_that_cannot_be_is_refused(env, action):
     env.reset(seed=0)
