@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 from latentplan.cli import run_guarded, use_device
 from latentplan.compose import build_config
-from latentplan.config import USER_DOMAIN, EnvConfig, PlannerConfig, UserError, from_dict, to_dict
+from latentplan.config import EnvConfig, PlannerConfig, UserError, from_dict, to_dict
 from latentplan.config.planner import override_planner
 from latentplan.evaluation_request import (
     PLANNING_MODES,
@@ -71,11 +71,6 @@ def _evaluate(argv: Sequence[str]) -> int:
         config = from_dict(info["config"])
     except (AttributeError, TypeError, ValueError) as error:
         raise UserError(f"{request.checkpoint} has settings of another version: {error}") from None
-    if config.env.domain == USER_DOMAIN:
-        raise UserError(
-            "this agent learned in an environment of your own, which a command cannot make: play it from Python, "
-            "agent = load_agent(DIR)"
-        )
     planner = build_config({"planner": override_planner(to_dict(config.planner), request.planner)}).planner
     overrides = {name: getattr(planner, name) for name in request.planner}
     if request.planning_budget is not None:

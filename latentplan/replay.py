@@ -248,7 +248,7 @@ class Replay:
             raise UserError(f"{too_short}: raise --replay.capacity")
         if held.max() <= length:
             raise UserError(
-                f"{too_short}, of {held.max()} collected in each environment: raise --collection.prefill_decisions"
+                f"{too_short}, of {held.max()} in each environment: raise --collection.prefill_decisions or --frames"
             )
         for _ in range(SAMPLING_ROUNDS):
             lane = rng.choice(self.num_lanes, size=2 * count, p=held / held.sum())

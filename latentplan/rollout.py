@@ -10,12 +10,12 @@ import math
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol, SupportsFloat
 
 import numpy as np
 from numpy.typing import NDArray
 
-from latentplan.config import derive_seed
+from latentplan.config import UserError, derive_seed
 
 if TYPE_CHECKING:
     import gymnasium
@@ -112,6 +112,18 @@ def run_episodes(
     return list(iterate_episodes(env, agent, seeds, on_step=on_step))
 
 
+def finite(reward: SupportsFloat) -> float:
+    """The reward as a number.
+
+    Raises:
+        UserError: It is none: a mean over episodes would hide where it came from.
+    """
+    value = float(reward)
+    if not math.isfinite(value):
+        raise UserError(f"the environment gave a reward that is not finite: {value}")
+    return value
+
+
 def iterate_episodes(
     env: gymnasium.Env[Any, Any], agent: Agent, seeds: Sequence[int], *, on_step: OnStep | None = None
 ) -> Iterator[Episode]:
@@ -135,7 +147,7 @@ def _run_episode(env: gymnasium.Env[Any, Any], agent: Agent, index: int, seed: i
         if on_step is not None:
             on_step(Step(index, len(decision_ms) - 1, total_return, frame, action))
         frame, reward, terminated, truncated, info = env.step(action)
-        total_return += float(reward)
+        total_return += finite(reward)
         env_frames += int(info.get("env_frames", 1))
         over = terminated or truncated
     if on_step is not None:

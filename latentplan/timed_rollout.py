@@ -29,7 +29,7 @@ from latentplan.agent import Agent as AnyAgent
 from latentplan.background import BackgroundAgent
 from latentplan.checkpoint import load_agent
 from latentplan.config import derive_seed
-from latentplan.rollout import SOURCES, Agent, Episode, Floats, OnStep, Step, latency_percentiles, summarize
+from latentplan.rollout import SOURCES, Agent, Episode, Floats, OnStep, Step, finite, latency_percentiles, summarize
 from latentplan.virtual_clock import VirtualClock, VirtualExecutor
 
 Action = NDArray[np.float32]
@@ -175,7 +175,7 @@ def _run_episode(
         if on_step is not None:
             on_step(Step(index, periods, total_return, frame, motors.latest))
         frame, reward, terminated, truncated, info = env.step_schedule(motors.next_period())
-        total_return += float(reward)
+        total_return += finite(reward)
         env_frames += int(info.get("env_frames", 1))
         periods += 1
         over = terminated or truncated

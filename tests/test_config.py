@@ -35,6 +35,12 @@ def test_the_latent_has_32_dimensions_in_every_preset(preset):
     assert config.model.latent_dim == 32
 
 
+def test_a_run_from_python_learns_as_one_from_the_command_line_does():
+    composed = compose({}, {"env": {"domain": "fish"}}, "cpu")  # a domain without a file of its own
+    for section in ("model", "planner", "learning", "collection", "replay", "evaluation"):
+        assert getattr(Config(), section) == getattr(composed, section)
+
+
 @pytest.mark.parametrize("config", [Config(), CHANGED, compose({}, {}, "cpu"), compose({}, {}, "gpu")])
 def test_settings_survive_plain_dictionaries(config):
     assert from_dict(to_dict(config)) == config

@@ -1,5 +1,7 @@
 """The gate: plans where it doubts, as often as the budget says, and from a plan that has aged."""
 
+import copy
+
 import numpy as np
 import pytest
 import torch
@@ -219,6 +221,17 @@ def test_a_signal_that_is_not_a_number_plans_and_is_not_learned(model, film):
     for frames in film[:5]:
         agent.act(frames[0])
     assert agent.planned_fraction == 1.0 and agent._scales["value"].num == 0
+
+
+def test_a_search_that_found_nothing_leaves_the_decision_to_the_actor(model, film):
+    broken = copy.deepcopy(model)
+    with torch.no_grad():
+        broken.reward_head.mlp.output.weight.fill_(torch.nan)
+    gated, actor = make(broken, planning_budget=1.0), ActorAgent(broken, CONFIG)
+    with pytest.warns(RuntimeWarning, match="nothing finite"):
+        for frames in film[:3]:
+            np.testing.assert_allclose(gated.act(frames), actor.act(frames), atol=0.02)  # bfloat16
+            assert gated.last_source == ["actor"] * 3
 
 
 def test_signals_choose_different_moments(model, film):

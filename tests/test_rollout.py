@@ -4,6 +4,7 @@ import gymnasium
 import numpy as np
 import pytest
 
+from latentplan.config import UserError
 from latentplan.rollout import (
     confidence_interval,
     episode_seed,
@@ -115,6 +116,12 @@ def test_the_agent_sees_every_frame_but_the_last_in_order():
 def test_episodes_end_where_the_environment_ends(terminates):
     (episode,) = run_episodes(ClockEnv(length=7, terminates=terminates), NoisyAgent(), [0])
     assert (episode.num_decisions, episode.env_frames, episode.decision_ms.shape) == (7, 28, (7,))
+
+
+@pytest.mark.parametrize("value", [math.nan, math.inf])
+def test_a_reward_that_is_no_number_is_an_error(value):
+    with pytest.raises(UserError, match="not finite"):
+        run_episodes(ClockEnv(), NoisyAgent(value), [0])
 
 
 def test_steps_tell_the_reward_before_the_action_and_then_the_end():

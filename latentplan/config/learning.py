@@ -60,13 +60,13 @@ class LearningConfig:
     overshooting_scale: float = 0.1
     overshooting_horizon: int = 8
     reward_scale: float = 1.0
-    imagination_horizon: int = 10
-    imagination_starts: int = 160
+    imagination_horizon: int = 15
+    imagination_starts: int = 128
     gradient_decay: float = 1.0
     lambda_: float = 0.95
     discount: float | None = None
     replay_value_scale: float = 0.3
-    entropy_scale: float = 3e-4
+    entropy_scale: float = 1e-3
     imitation_scale: float = 0.0
     target_rate: float = 0.02
     average_rate: float = 0.01
@@ -110,9 +110,9 @@ class CollectionConfig:
         overlap: Whether the next round is collected in another process while this one is learned from; never on a GPU.
     """
 
-    behaviour: str = "planner"
-    noise_std: float = 0.2
-    noise_correlation: float = 0.0
+    behaviour: str = "both"
+    noise_std: float = 0.4
+    noise_correlation: float = 0.5
     noise_share: float = 1.0
     goals: tuple[str, ...] = ()
     goal_share: float = 0.0

@@ -54,7 +54,7 @@ class PixelEnv(gymnasium.Env[np.ndarray, np.ndarray]):
 
     Attributes:
         action_repeat: Steps of the inner environment per decision; rewards are summed over them.
-        decisions_per_episode: Decisions until the time limit that the environment's spec states, or None.
+        decisions_per_episode: Decisions until the time limit of the environment's spec or `TimeLimit`, or None.
     """
 
     metadata = {"render_modes": ["rgb_array"]}
@@ -70,6 +70,10 @@ class PixelEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         self._needs_reset = True
         self.action_repeat = action_repeat
         limit = env.spec.max_episode_steps if env.spec is not None else None
+        if limit is None and env.has_wrapper_attr("_max_episode_steps"):  # of a `TimeLimit` around what has no spec
+            limit = env.get_wrapper_attr("_max_episode_steps")
+        if rate := env.metadata.get("render_fps"):
+            self.metadata = {**PixelEnv.metadata, "render_fps": rate / action_repeat}
         self.decisions_per_episode = None if limit is None else math.ceil(limit / action_repeat)
         self.observation_space = gymnasium.spaces.Box(0, 255, (FRAME_SIZE, FRAME_SIZE, 3), np.uint8)
         self.action_space = gymnasium.spaces.Box(-1.0, 1.0, self._inner_actions.shape, np.float32)
@@ -92,9 +96,9 @@ class PixelEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         """
         if self._needs_reset:
             raise ResetNeeded("the episode is over; call reset() first")
-        low, high = self._inner_actions.low, self._inner_actions.high
+        low, high = (bound.astype(np.float64) for bound in (self._inner_actions.low, self._inner_actions.high))
         scaled = low + (np.clip(action, -1.0, 1.0) + 1.0) * 0.5 * (high - low)
-        scaled = scaled.astype(self._inner_actions.dtype)
+        scaled = scaled.clip(low, high).astype(self._inner_actions.dtype)
         total, env_frames, terminated, truncated = 0.0, 0, False, False
         while env_frames < self.action_repeat and not (terminated or truncated):
             picture, reward, terminated, truncated, info = self._env.step(scaled)
@@ -139,7 +143,9 @@ def _checked_actions(space: gymnasium.Space[Any]) -> gymnasium.spaces.Box:
         raise UserError(f"{wanted}, got dtype {space.dtype}")
     if len(space.shape) != 1 or space.shape[0] == 0:
         raise UserError(f"{wanted}, got shape {space.shape}")
-    if not space.is_bounded("both"):
+    with np.errstate(over="ignore"):
+        is_bounded = bool(np.isfinite(space.high - space.low).all())
+    if not is_bounded:
         raise UserError(f"{wanted}, got bounds {space.low} to {space.high}")
     return space
 

@@ -14,7 +14,7 @@ import numpy as np
 from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv, VectorEnv
 from gymnasium.wrappers import TimeLimit
 
-from latentplan.config import EnvConfig
+from latentplan.config import USER_DOMAIN, EnvConfig, UserError
 from latentplan.envs.suite import SuiteEnv
 from latentplan.envs.user import make_from
 
@@ -34,6 +34,11 @@ def make_env(config: EnvConfig, seed: int | None = None) -> SuiteEnv:
     Raises:
         UserError: Domain, task or camera do not exist, or nothing can render.
     """
+    if config.domain == USER_DOMAIN:
+        raise UserError(
+            "this agent learned in an environment of your own, which a command cannot make: play it from Python, "
+            "agent = load_agent(DIR)"
+        )
     return SuiteEnv(config, seed)
 
 

@@ -32,7 +32,7 @@ class CEMTrajectoryOptimizer:
         num_iterations: Refits.
         smoothing: Weight of the new statistics, in (0, 1].
         action_low: Lowest action.
-        action_high: Highest action.
+        action_high: Highest action; a search begins with half the range as its standard deviation.
         seed: Of the sampling noise; the optimizer keeps its own stream.
     """
 
@@ -65,7 +65,6 @@ class CEMTrajectoryOptimizer:
             smoothing=smoothing,
             action_low=action_low,
             action_high=action_high,
-            init_std=1.0,
         )
         self._generator = torch.Generator().manual_seed(seed)
 

@@ -202,9 +202,9 @@ def predicted_return(model: Model, use_value: bool | None) -> Objective:
 
 
 def _compose(operation: Callable[[Any, Any], Any], left: Objective, right: Term | float) -> Objective:
-    if isinstance(right, int | float):
+    if not callable(right):
         return Objective(
-            partial(_with_number, operation, left, right), left.needs_states, left.num_particles, left.needs
+            partial(_with_number, operation, left, float(right)), left.needs_states, left.num_particles, left.needs
         )
     other = as_objective(right)
     particles = {left.num_particles, other.num_particles} - {1}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
@@ -56,6 +57,17 @@ class Plan:
         if not bool(self.info["is_fallback"][0]):
             return "plan"
         return "actor" if bool(self.info["is_policy"][0]) else "tail"
+
+    def failures(self) -> Tensor:
+        """Where neither a search nor a policy stands behind the actions, (batch,) bool on the CPU.
+
+        Whoever has a policy had better follow that than what is left there of the last plan, or zeros. Warns where
+        nothing finite was found.
+        """
+        failed: Tensor = (self.info["is_fallback"] & ~self.info["is_policy"]).cpu()
+        if bool((failed & (self.info["num_nonfinite"] > 0).cpu()).any()):
+            warnings.warn("a search found nothing finite; the policy acts", RuntimeWarning, stacklevel=2)
+        return failed
 
     def forget(self, mask: Tensor) -> Plan:
         """The same plan, except that environments in mask (batch,) bool start their next search cold."""

@@ -180,6 +180,8 @@ class PlanScheduler:
         self._is_warmed_up = True
         if asked is None or asked[1] != tick:  # asked for before a reset
             return
+        if bool(plan.failures().all()):
+            return
         self.buffer.submit(plan.actions, tick)
         now, nominals = self.tick, self._nominals.items()
         self._nominals = {first: nominal for first, nominal in nominals if now - first < nominal.actions.shape[1]}

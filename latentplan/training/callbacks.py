@@ -46,7 +46,11 @@ class Experience(lightning.Callback):
         settings, state = self.config.collection, self.state
         while (missing := min(settings.prefill_decisions - state.decisions, self._decisions_left())) > 0:
             self.worker.submit("collect", None, "random", missing, state.rounds)
-            self._take_round()
+            self._asked_round = True
+            self.take()
+            if state.interrupted:
+                trainer.should_stop = True
+                return
         self.take()
         if state.interrupted:
             return

@@ -38,6 +38,8 @@ class ReplayBatches(IterableDataset[Batch | Tensor]):
 
     def __iter__(self) -> Iterator[Batch | Tensor]:
         """Draw the batches of this epoch, each when it is asked for."""
+        if self.curriculum.state.interrupted:  # perhaps before there was anything to draw from
+            return
         learning = self.config.learning
         rng = np.random.default_rng(derive_seed(self.config.run.seed, "batches", self.learner.updates))
         gathers = isinstance(self.learner, GraphedLearner)

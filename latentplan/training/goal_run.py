@@ -119,7 +119,11 @@ def _learn(run: Path, folder: Path, settings: GoalsConfig, device: str, saved: d
         raise UserError(f"the agent of {run} was trained without named quantities, so there are no goals to learn")
     model.requires_grad_(False)
     line = StatusLine()
-    replay = _begin(run, folder, model, config, settings, line)
+    try:
+        replay = _begin(run, folder, model, config, settings, line)
+    except KeyboardInterrupt:
+        line.print("stopped before there was anything to learn from: nothing is kept")
+        return Result(folder, INTERRUPTED, {})
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(derive_seed(settings.seed, "heads"))
         model.add_goal_heads(settings.hidden_dim)

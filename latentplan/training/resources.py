@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import os
+from pathlib import Path
 
 import torch
 
 from latentplan.config import Config, RunConfig, UserError
+from latentplan.replay import FRAME_BYTES
 
 UNKNOWN_LENGTH_CAPACITY = 200_000
 
@@ -34,12 +36,20 @@ def choose_threads(overlap: bool) -> int:
     return max(1, (cores - overlap) // 2)
 
 
-def replay_capacity(config: Config) -> int:
-    """Rows that hold everything a run collects, unless the settings say how many."""
+def replay_capacity(config: Config, saved: Path) -> int:
+    """Rows that hold everything a run collects, unless the settings say how many.
+
+    Args:
+        config: Settings of the run.
+        saved: Where its replay is saved, if it is: what lies there stays, whatever the budget is now.
+    """
     if config.replay.capacity is not None:
         return config.replay.capacity
+    lanes = [path.stat().st_size // FRAME_BYTES for path in saved.glob("frames_*.u8")]
+    held = len(lanes) * max(lanes, default=0)
     if config.run.frames is None:
-        return UNKNOWN_LENGTH_CAPACITY
+        return max(UNKNOWN_LENGTH_CAPACITY, held)
     # Two rounds may run past the budget, and every episode ends with one frame without an action.
     decisions = config.run.frames / config.env.action_repeat
-    return int(1.05 * decisions) + 2 * config.collection.round_decisions + config.collection.prefill_decisions
+    rows = int(1.05 * decisions) + 2 * config.collection.round_decisions + config.collection.prefill_decisions
+    return max(rows, held)

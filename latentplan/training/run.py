@@ -152,13 +152,14 @@ class _Run:
             torch.manual_seed(derive_seed(config.run.seed, "weights"))
             model = WorldModel(config.model, self.description.action_dim, self.description.labels).to(self.device)
         on = self.device if config.replay.on_device else torch.device("cpu")
-        capacity, num_labels = replay_capacity(config), len(model.labels)
+        kept = self.folder / "resume" / "replay"
+        capacity, num_labels = replay_capacity(config, kept), len(model.labels)
         self.replay = Replay(capacity, model.action_dim, config.model.deter_dim, config.env.num_envs, on, num_labels)
         self.state, saved = RunState(), None
         self._saved_optimizers: list[Any] = []
         if resume:
             self.state, saved, self._saved_optimizers = load_state(self.folder / "resume", self.device)
-            self.replay.load(self.folder / "resume" / "replay")
+            self.replay.load(kept)
         self.curriculum = Curriculum(config, model.labels, self.state)
         self.learner = make_learner(model, config, self.description.discount, self.replay, self.curriculum)
         if saved is not None:

@@ -6,8 +6,8 @@ import pytest
 from gymnasium.spaces import Box, Dict, Discrete
 from gymnasium.wrappers import TimeLimit
 
-from latentplan.config import EnvConfig, UserError
-from latentplan.envs import make_from, wrap_user_env
+from latentplan.config import USER_DOMAIN, EnvConfig, UserError
+from latentplan.envs import make_env, make_from, wrap_user_env
 
 IMAGE = Box(0, 255, (48, 96, 3), np.uint8)
 ACTIONS = Box(np.array([0.0, -4.0], np.float32), np.array([2.0, 4.0], np.float32))
@@ -77,6 +77,27 @@ def test_a_time_limit_gives_the_decisions_per_episode():
     assert wrap_user_env(limited, action_repeat=4).decisions_per_episode == 3
 
 
+def test_a_time_limit_around_an_environment_without_a_spec_counts_too():
+    assert wrap_user_env(TimeLimit(Clock(), 10), action_repeat=4).decisions_per_episode == 3
+
+
+def test_films_keep_the_pace_of_the_environment():
+    clock = Clock()
+    clock.metadata = {"render_fps": 30}
+    assert wrap_user_env(clock, action_repeat=4).metadata["render_fps"] == 7.5
+    assert "render_fps" not in wrap_user_env(Clock()).metadata
+
+
+def test_extreme_actions_lie_within_the_users_bounds():
+    for low, high in np.random.default_rng(0).integers(-20, 20, (200, 2)) / 10.0:
+        space = Box(np.float32(min(low, high)), np.float32(max(low, high)) + np.float32(0.1), (2,), np.float32)
+        clock = Clock(action_space=space)
+        env = wrap_user_env(clock)
+        env.reset()
+        env.step(np.array([-1.0, 1.0]))
+        assert space.contains(clock.actions[0])
+
+
 def test_the_factory_builder_seeds_the_first_reset_only():
     build = make_from(Clock)
     starts = [build(EnvConfig(), 5).reset()[1]["start"] for _ in range(2)]
@@ -106,11 +127,17 @@ def test_observations_that_are_no_images_are_refused(space, got):
         (Box(0, 3, (2,), np.int32), "got dtype int32"),
         (Box(-1.0, 1.0, (2, 2), np.float32), r"got shape \(2, 2\)"),
         (Box(-np.inf, 1.0, (2,), np.float32), "got bounds"),
+        (Box(np.finfo(np.float32).min, np.finfo(np.float32).max, (2,), np.float32), "got bounds"),
     ],
 )
 def test_actions_that_are_no_bounded_box_are_refused(space, got):
     with pytest.raises(UserError, match=f"actions must be .*{got}"):
         wrap_user_env(Clock(action_space=space))
+
+
+def test_what_only_its_user_can_make_is_not_looked_for_in_the_suite():
+    with pytest.raises(UserError, match="an environment of your own"):
+        make_env(EnvConfig(domain=USER_DOMAIN))
 
 
 def test_a_factory_of_something_else_is_refused():

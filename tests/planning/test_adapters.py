@@ -92,6 +92,12 @@ def test_the_plan_is_numpy_and_its_warm_start_zero_padded():
     assert controller.warm_start is None
 
 
+def test_a_search_is_as_wide_as_its_bounds():
+    optimizer = CEMTrajectoryOptimizer(3, 1, action_low=-100.0, action_high=100.0)
+    mean, _ = optimizer.plan(np.zeros(1), lambda state, sequence: -float(((sequence - 50.0) ** 2).sum()))
+    assert np.abs(mean - 50.0).max() < 10.0
+
+
 def test_a_search_starts_from_the_warm_start_as_it_is_given():
     optimizer = CEMTrajectoryOptimizer(3, 2, num_candidates=4, num_elites=4, num_iterations=1, smoothing=1e-12)
     given = np.array([[0.1, 0.2], [0.3, 0.4], [0.5, 0.6]])

@@ -1,5 +1,6 @@
 """Objectives compose as their arithmetic says, and constraints come before returns."""
 
+import numpy as np
 import pytest
 import torch
 
@@ -51,6 +52,12 @@ def test_terms_add_and_multiply(point, states, actions):
     torch.testing.assert_close(returns(point, -learned_return(), states, actions), -reward)
     with_function = learned_return() + (lambda rollout: rollout.actions[:, 0, 0])
     torch.testing.assert_close(returns(point, with_function, states, actions), reward + actions[:, :, 0, 0])
+
+
+@pytest.mark.parametrize("half", [0.5, np.float32(0.5), torch.tensor(0.5)])
+def test_any_kind_of_number_is_one(point, states, actions, half):
+    expected = 0.5 * returns(point, learned_return(), states, actions)
+    torch.testing.assert_close(returns(point, learned_return() * half, states, actions), expected)
 
 
 def test_the_default_objective_is_reward_plus_value(point, states, actions):

@@ -1,5 +1,7 @@
 """Which action a tick takes, and what is asked for: no clock, no process, ticks only."""
 
+import itertools
+
 import pytest
 import torch
 
@@ -117,6 +119,14 @@ def policy(state, generator):
 @pytest.fixture
 def model():
     return FunctionModel(dynamics, reward, policy=policy)
+
+
+def test_a_search_that_found_nothing_leaves_the_decisions_to_the_policy():
+    broken = FunctionModel(dynamics, lambda state, action: reward(state, action) * torch.nan, policy=policy)
+    scheduler, executor = make(broken, itertools.repeat(0.5))
+    with pytest.warns(RuntimeWarning, match="nothing finite"):
+        decisions, _ = drive(scheduler, executor, 6)
+    assert [(decision.source, decision.action.item()) for decision in decisions] == [("actor", pytest.approx(0.05))] * 6
 
 
 def make(model, durations, **options):

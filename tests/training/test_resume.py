@@ -1,6 +1,7 @@
 """Runs that were interrupted, that crashed or that are to go on for longer."""
 
 import itertools
+import os
 import shutil
 import signal
 
@@ -9,6 +10,7 @@ import torch
 
 from latentplan.training import callbacks, resume, train
 from latentplan.training.run import INTERRUPTED
+from latentplan.training.worker import LocalWorker
 from tests.training.run_folder import epochs_of, rows_of, saved_state
 
 
@@ -47,6 +49,27 @@ def test_a_finished_run_can_be_extended(tiny, dot, tmp_path):
     after = saved_state(run.run_dir)
     assert_goes_on(before, after)
     assert after["run"]["env_frames"] == 90
+
+
+def test_a_run_is_interrupted_before_it_learns_and_goes_on(tiny, dot, tmp_path, monkeypatch):
+    class Gone(LocalWorker):
+        """Ends with the run, as a worker does to whose whole group a signal was sent."""
+
+        def submit(self, command, *arguments):
+            self.is_gone = command == "collect"
+            super().submit(command, *arguments)
+
+        def result(self):
+            if not self.is_gone:
+                return super().result()
+            os.kill(os.getpid(), signal.SIGTERM)
+            raise RuntimeError("the process that collects has ended unexpectedly")
+
+    with monkeypatch.context() as patch:
+        patch.setattr("latentplan.training.run.LocalWorker", Gone)
+        assert train(tiny(tmp_path / "run"), dot).exit_code == INTERRUPTED
+    assert saved_state(tmp_path / "run")["run"]["decisions"] == 0
+    assert resume(tmp_path / "run", make_env=dot).exit_code == 0
 
 
 def test_an_extension_that_is_interrupted_goes_on_to_its_new_budget(tiny, dot, tmp_path, interrupting):

@@ -1,0 +1,20 @@
+"""What a run takes of its machine."""
+
+from dataclasses import replace
+
+import pytest
+
+from latentplan.config import Config, ReplayConfig, RunConfig
+from latentplan.replay import FRAME_BYTES
+from latentplan.training.resources import replay_capacity
+
+
+@pytest.mark.parametrize("budget", [{"minutes": 600.0}, {"frames": 1000}])
+def test_what_is_saved_of_a_replay_stays_whatever_the_budget_is_now(budget, tmp_path):
+    config = Config(run=RunConfig(**budget))
+    fresh = replay_capacity(config, tmp_path)
+    for lane, rows in enumerate((300_000, 299_999)):
+        with (tmp_path / f"frames_{lane}.u8").open("wb") as file:
+            file.truncate(rows * FRAME_BYTES)  # sparse: takes no room
+    assert fresh < replay_capacity(config, tmp_path) == 600_000
+    assert replay_capacity(replace(config, replay=ReplayConfig(capacity=5)), tmp_path) == 5
