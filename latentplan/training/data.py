@@ -38,7 +38,7 @@ class ReplayBatches(IterableDataset[Batch | Tensor]):
 
     def __iter__(self) -> Iterator[Batch | Tensor]:
         """Draw the batches of this epoch, each when it is asked for."""
-        if self.curriculum.state.interrupted:  # perhaps before there was anything to draw from
+        if self.curriculum.state.interrupted and not self.replay.written.any():  # there is nothing to draw from
             return
         learning = self.config.learning
         rng = np.random.default_rng(derive_seed(self.config.run.seed, "batches", self.learner.updates))
