@@ -120,7 +120,8 @@ class ReplayConfig:
     """Where experience is kept.
 
     Attributes:
-        capacity: Decisions kept; None holds the whole run when its length is known, else 200,000.
+        capacity: Decisions kept; None holds the whole run when its length is known, else 200,000; and, when one is
+            resumed, no fewer than it has.
         on_device: Whether the frames live on the training device instead of in main memory.
     """
 

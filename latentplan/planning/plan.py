@@ -65,7 +65,7 @@ class Plan:
         nothing finite was found.
         """
         failed: Tensor = (self.info["is_fallback"] & ~self.info["is_policy"]).cpu()
-        if bool((failed & (self.info["num_nonfinite"] > 0).cpu()).any()):
+        if bool(failed.any()) and bool((failed & (self.info["num_nonfinite"] > 0).cpu()).any()):
             warnings.warn("a search found nothing finite; the policy acts", RuntimeWarning, stacklevel=2)
         return failed
 
