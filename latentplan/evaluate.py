@@ -176,9 +176,11 @@ def _report(request: EvaluationRequest, result: dict[str, Any]) -> None:
         means = "   ".join(f"{name} {value:.2f}" for name, value in result["quantities"].items())
         print(f"on average   {means}")
     print(f"decision ms  {latency}", flush=True)
-    tails = result["action_source"]["tail"]
-    if tails and request.mode == "planner" and result["planner"]["deadline_ms"] is None:
-        print(f"warning: at {tails} decisions the search found nothing finite", file=sys.stderr, flush=True)
+    failed = result["action_source"]["tail"] + result["action_source"]["actor"]
+    if failed and request.mode == "planner":
+        has_deadline = result["planner"]["deadline_ms"] is not None
+        why = "there was no time for a search" if has_deadline else "the search found nothing finite"
+        print(f"warning: at {failed} decisions {why}", file=sys.stderr, flush=True)
     if result["control_hz"] is not None:
         sources = "   ".join(f"{name} {count}" for name, count in result["action_source"].items())
         print(f"at {result['control_hz']:g} Hz  deadline misses {result['deadline_misses']}   {sources}", flush=True)

@@ -5,6 +5,7 @@ Same equations, same planner; only the arrays and the names of the arguments dif
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable
 from typing import TYPE_CHECKING
 
@@ -82,6 +83,8 @@ class CEMTrajectoryOptimizer:
         previous = None if warm_start_mean is None else _plan_around(warm_start_mean)
         nothing = torch.zeros(1, 0, dtype=torch.float64)  # the rollout function holds the state
         plan = self._planner.plan(model, nothing, previous, generator=self._generator)
+        if bool(plan.info["is_fallback"].any()):
+            warnings.warn("no sequence had a finite return, so nothing was found", RuntimeWarning, stacklevel=2)
         return plan.mean[0].numpy(), plan.var[0].numpy()
 
     def step_numerical_example(
@@ -137,7 +140,7 @@ class _RolloutModel:
     def rollout(self, state: Tensor, actions: Tensor) -> tuple[Tensor, Tensor]:
         rewards = torch.zeros(actions.shape[:2], dtype=torch.float64)
         for row, sequence in enumerate(actions.numpy()):
-            rewards[row, 0] = float(self._rollout_fn(self._state, sequence))
+            rewards[row, 0] = float(self._rollout_fn(self._state, sequence.copy()))
         return rewards, state
 
 

@@ -8,6 +8,7 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from numbers import Integral
 from typing import Any
 
 import torch
@@ -160,7 +161,7 @@ class CEMPlanner:
         Returns:
             The plan. Its `info`: `elite_return` and `std` (batch, iteration), `iterations`, `num_nonfinite` and
             `is_fallback` (batch,) (nothing finite was found, or there was no time for one iteration, so the last
-            plan's tail or zeros stand in), `is_policy` (batch,) (only time was short, so the policy's mode stands in;
+            plan's tail or zeros stand in), `is_policy` (batch,) (only time was short, so the policy stands in;
             proposals must be asked for, and nothing but the model's own return be wanted), `violation` (batch,) of the
             chosen sequence when there are constraints, and `stopped`, what ended the search: "iterations", "agreement"
             (of the elites: `stop_std`) or "deadline".
@@ -211,7 +212,7 @@ def _validate(planner: CEMPlanner) -> None:
 
 
 def _check_whole(name: str, value: int, least: int) -> None:
-    if value % 1 != 0 or value < least:  # NaN and infinity leave NaN
+    if isinstance(value, bool) or not isinstance(value, Integral) or value < least:
         raise ValueError(f"{name} must be a whole number, at least {least}, got {value}")
 
 

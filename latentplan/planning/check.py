@@ -2,17 +2,33 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import torch
 from torch import Tensor
 from torch.utils._pytree import tree_leaves, tree_map, tree_structure
 
-from latentplan.planning.model import Model, State, action_dtype, count_rows, repeat_rows, state_device, supports
+from latentplan.planning.model import Model, State, action_dtype, count_rows, state_device, supports
 
-_ROWS, _HORIZON = 4, 3
+_ROWS, _HORIZON, _NUM = 4, 3, 2
 _OPTIONAL = ("value", "policy", "continues", "uncertainty", "rollout", "fast_step", "propose", "particles")
+_PER_ROW = {"propose": _NUM, "particles": _NUM}  # rows that these methods answer for each that they are given
+
+Inputs = tuple[State, Tensor]
+"""States (rows, ...) and actions (rows, horizon, action)."""
+
+_ARGUMENTS: dict[str, Callable[[State, Tensor], tuple[Any, ...]]] = {
+    "step": lambda state, actions: (state, actions[:, 0]),
+    "value": lambda state, actions: (state,),
+    "policy": lambda state, actions: (state, None),
+    "continues": lambda state, actions: (state,),
+    "uncertainty": lambda state, actions: (state, actions[:, 0]),
+    "rollout": lambda state, actions: (state, actions),
+    "fast_step": lambda state, actions: (state, actions[:, 0]),
+    "propose": lambda state, actions: (state, _NUM, actions.shape[1], _generators(actions)),
+    "particles": lambda state, actions: (state, _NUM),
+}
 
 
 @torch.no_grad()
@@ -30,11 +46,11 @@ def check_model(model: Model, state: State, action_dim: int, *, tolerance: float
 
     Raises:
         TypeError: The state is not a tensor or a pytree of tensors.
-        ValueError: Lists every problem found, one per line: shapes, dtypes, NaN, rows that influence each other, a
-            rollout that does not agree with steps.
+        ValueError: Lists every problem found, one per line: exceptions, shapes, dtypes, NaN, rows that influence each
+            other or come in another order, inputs that are changed, a rollout that does not agree with steps.
     """
-    count_rows(state)
-    rows = repeat_rows(tree_map(lambda leaf: leaf[:1], state), _ROWS)
+    index = torch.arange(_ROWS) % count_rows(state)
+    rows = tree_map(lambda leaf: leaf[index.to(leaf.device)], state)
     generator = torch.Generator().manual_seed(0)
     actions = torch.rand(_ROWS, _HORIZON, action_dim, generator=generator, dtype=torch.float64) * 2 - 1
     actions = actions.to(dtype=action_dtype(state), device=state_device(state))
@@ -48,76 +64,111 @@ def _problems(model: Any, state: State, actions: Tensor, tolerance: float) -> It
     if not supports(model, "step"):
         yield "it has no step(state, action)"
         return
-    answer = model.step(state, actions[:, 0])
-    if not isinstance(answer, tuple) or len(answer) != 2:
-        yield f"step() must return (next_state, reward), got {type(answer).__name__}"
-        return
-    basic = [*_vector_problems("step()'s reward", answer[1], (_ROWS,)), *_state_problems(state, answer[0])]
-    yield from basic
-    if not basic:
-        yield from _row_problems(model, state, actions[:, 0], tolerance)
-    yield from _optional_problems(model, state, actions)
-    if not basic and supports(model, "fast_step"):
-        yield from _fast_step_problems(model, state, actions[:, 0], tolerance)
-    if not basic and supports(model, "rollout"):
-        yield from _rollout_problems(model, state, actions, tolerance)
+    particles = getattr(model, "num_particles", 1)
+    if not isinstance(particles, int) or particles < 1:
+        yield f"num_particles must be a whole number, at least 1, got {particles!r}"
+    problems, following = _tried(model, "step", (state, actions))
+    yield from problems
+    if problems:
+        following = None
+    # A step away the rows differ, even if all that were given are alike.
+    inputs = (state if following is None else following[0], actions)
+    for name in ("step", *_OPTIONAL):
+        if name == "step" and following is None or not supports(model, name):
+            continue
+        problems, answer = _tried(model, name, inputs)
+        yield from problems
+        if not problems:
+            yield from _row_problems(model, name, inputs, answer, tolerance)
+    if supports(model, "policy"):
+        yield from _sample_problems(model, inputs)
+    if following is not None:
+        first = tree_map(lambda leaf: leaf[torch.zeros(_ROWS, dtype=torch.long, device=leaf.device)], state)
+        yield from _disagreements(model, (first, actions), tolerance)
 
 
-def _state_problems(state: State, following: State) -> Iterator[str]:
+def _tried(model: Any, name: str, inputs: Inputs) -> tuple[list[str], Any]:
+    """What is wrong with a method's answer, and the answer; None where it cannot be gone on with."""
+    given = _ARGUMENTS[name](*inputs)
+    copies = tree_map(lambda leaf: leaf.clone() if isinstance(leaf, Tensor) else leaf, given)
+    try:
+        answer = getattr(model, name)(*copies)
+        problems = list(_answer_problems(name, answer, inputs))
+    except Exception as error:
+        return [f"{name}() raises {type(error).__name__}: {error}"], None
+    pairs = zip(tree_leaves(given), tree_leaves(copies), strict=True)
+    if any(isinstance(before, Tensor) and not torch.equal(before, after) for before, after in pairs):
+        problems.append(f"{name}() changes what it is given; it has to return new tensors")
+    return problems, answer
+
+
+def _answer_problems(name: str, answer: Any, inputs: Inputs) -> Iterator[str]:
+    state, actions = inputs
+    rows, horizon = actions.shape[:2]
+    if name in ("step", "fast_step", "rollout"):
+        shape, order = ((rows,), "(next_state, reward)") if name != "rollout" else ((rows, horizon), "(rewards, state)")
+        if not isinstance(answer, tuple) or len(answer) != 2:
+            yield f"{name}() must return {order}, got {type(answer).__name__}"
+            return
+        rewards, last = answer if name == "rollout" else answer[::-1]
+        yield from _vector_problems(f"{name}()'s reward" + "s" * (name == "rollout"), rewards, shape)
+        yield from _state_problems(name, state, last)
+    elif name == "particles":
+        if count_rows(answer) != _NUM * rows:
+            yield f"particles() must return {_NUM * rows} rows for {rows} states and {_NUM} particles"
+    else:
+        shapes = {"policy": actions[:, 0].shape, "propose": (_NUM * rows, *actions.shape[1:])}
+        title = "policy()'s mode" if name == "policy" else f"{name}()"
+        yield from _vector_problems(title, answer, tuple(shapes.get(name, (rows,))))
+
+
+def _state_problems(name: str, state: State, following: State) -> Iterator[str]:
     if tree_structure(following) != tree_structure(state):
-        yield "step() returns a state of another structure than it was given"
+        yield f"{name}() returns a state of another structure than it was given"
         return
     for before, after in zip(tree_leaves(state), tree_leaves(following), strict=True):
         if before.shape != after.shape or before.dtype != after.dtype:
-            yield (
-                f"step() turns a state of {tuple(before.shape)} {before.dtype} into {tuple(after.shape)} {after.dtype}"
-            )
+            is_, was = (f"{tuple(leaf.shape)} {leaf.dtype}" for leaf in (after, before))
+            yield f"{name}() turns a state of {was} into {is_}"
         elif not _is_finite(after):
-            yield "step() returns NaN or infinity in the state"
+            yield f"{name}() returns NaN or infinity in the state"
 
 
-def _optional_problems(model: Any, state: State, actions: Tensor) -> Iterator[str]:
-    for name in ("value", "continues"):
-        if supports(model, name):
-            yield from _vector_problems(f"{name}()", getattr(model, name)(state), (_ROWS,))
-    if supports(model, "uncertainty"):
-        yield from _vector_problems("uncertainty()", model.uncertainty(state, actions[:, 0]), (_ROWS,))
-    if supports(model, "policy"):
-        generator = torch.Generator(actions.device).manual_seed(0)
-        for name, argument in (("policy()'s mode", None), ("policy()'s sample", generator)):
-            yield from _vector_problems(name, model.policy(state, argument), tuple(actions[:, 0].shape))
-    if supports(model, "propose"):
-        generators = [torch.Generator(actions.device).manual_seed(row) for row in range(_ROWS)]
-        proposed = model.propose(state, 2, actions.shape[1], generators)
-        yield from _vector_problems("propose()", proposed, (2 * _ROWS, *actions.shape[1:]))
-    if supports(model, "particles") and count_rows(model.particles(state, 2)) != 2 * _ROWS:
-        yield f"particles() must return {2 * _ROWS} rows for {_ROWS} states and 2 particles"
+def _row_problems(model: Any, name: str, inputs: Inputs, together: Any, tolerance: float) -> Iterator[str]:
+    """Whether the first row gets something else when it comes alone."""
+    if not _agree(together, getattr(model, name)(*_ARGUMENTS[name](*inputs)), tolerance):
+        return  # a method that samples: which row gets which draw is the model's own business
+    state, actions = inputs
+    alone = getattr(model, name)(*_ARGUMENTS[name](tree_map(lambda leaf: leaf[:1], state), actions[:1]))
+    first = tree_map(lambda leaf: leaf[: _PER_ROW.get(name, 1)], together)
+    if not _agree(first, alone, tolerance if name == "step" else 10 * tolerance):
+        order = ", or rows are not batch-major" if name in _PER_ROW else ""
+        yield f"rows influence each other: {name}() gives a row something else when it comes alone{order}"
 
 
-def _row_problems(model: Any, state: State, action: Tensor, tolerance: float) -> Iterator[str]:
-    together = model.step(state, action)
-    if not _agree(together, model.step(state, action), tolerance):
-        return  # a step that samples: which row gets which draw is the model's own business
-    alone = model.step(tree_map(lambda leaf: leaf[:1], state), action[:1])
-    if not _agree(tree_map(lambda leaf: leaf[:1], together), alone, tolerance):
-        yield "rows influence each other: step() gives a row something else when it comes alone"
+def _sample_problems(model: Any, inputs: Inputs) -> Iterator[str]:
+    state, actions = inputs
+    try:
+        sample = model.policy(state, _generators(actions)[0])
+    except Exception as error:
+        yield f"policy() with a generator raises {type(error).__name__}: {error}"
+    else:
+        yield from _vector_problems("policy()'s sample", sample, tuple(actions[:, 0].shape))
 
 
-def _fast_step_problems(model: Any, state: State, action: Tensor, tolerance: float) -> Iterator[str]:
-    if not _agree(model.fast_step(state, action), model.step(state, action), 10 * tolerance):
-        yield "fast_step() does not agree with step()"
-
-
-def _rollout_problems(model: Any, state: State, actions: Tensor, tolerance: float) -> Iterator[str]:
-    rewards, last = model.rollout(state, actions)
-    yield from _vector_problems("rollout()'s rewards", rewards, tuple(actions.shape[:2]))
-    stepped = []
-    for action in actions.unbind(dim=1):
-        state, reward = model.step(state, action)
-        stepped.append(reward)
-    expected = torch.stack(stepped, dim=1)
-    if rewards.shape == expected.shape and not _agree((rewards, last), (expected, state), 10 * tolerance):
-        yield "rollout() does not agree with step() after step()"
+def _disagreements(model: Any, inputs: Inputs, tolerance: float) -> Iterator[str]:
+    """Where a faster way does not come to what steps come to."""
+    state, actions = inputs
+    if supports(model, "fast_step") and not _tried(model, "fast_step", inputs)[0]:
+        if not _agree(model.fast_step(state, actions[:, 0]), model.step(state, actions[:, 0]), 10 * tolerance):
+            yield "fast_step() does not agree with step()"
+    if supports(model, "rollout") and not _tried(model, "rollout", inputs)[0]:
+        answer, stepped = model.rollout(state, actions), []
+        for action in actions.unbind(dim=1):
+            state, reward = model.step(state, action)
+            stepped.append(reward)
+        if not _agree(answer, (torch.stack(stepped, dim=1), state), 10 * tolerance):
+            yield "rollout() does not agree with step() after step()"
 
 
 def _vector_problems(name: str, tensor: Any, shape: tuple[int, ...]) -> Iterator[str]:
@@ -129,6 +180,10 @@ def _vector_problems(name: str, tensor: Any, shape: tuple[int, ...]) -> Iterator
         yield f"{name} must be floating point, got {tensor.dtype}"
     elif not _is_finite(tensor):
         yield f"{name} is NaN or infinite"
+
+
+def _generators(actions: Tensor) -> list[torch.Generator]:
+    return [torch.Generator(actions.device).manual_seed(row) for row in range(len(actions))]
 
 
 def _is_finite(tensor: Tensor) -> bool:

@@ -84,20 +84,23 @@ class ModelPredictiveController:
             Actions of the environments in `where`, in order: (chosen, action).
 
         Raises:
-            ValueError: There is no environment in `where`.
+            ValueError: There is no environment in `where`, or the objective has goals for all of them, one each.
         """
         where = where.to("cpu", torch.bool)
         rows = where.nonzero().squeeze(1)
         if len(rows) == 0:
             raise ValueError("act_where() needs at least one environment; skip() lets others act everywhere")
+        before = self.plan, self._is_stale
         whole = None if self.plan is None or len(self.plan.is_warm) != len(where) else self.plan.aged()
         self.plan = None if whole is None or self.plan is None else self.plan.take(rows)
         stale = None if whole is None else self._is_stale
         self._is_stale = None if stale is None else stale[rows]
-        generator = self.generator
-        if not (generator is None or isinstance(generator, torch.Generator)):
-            generator = [generator[row] for row in rows.tolist()]
-        action = self._act(tree_map(lambda leaf: leaf[rows.to(leaf.device)], state), generator)
+        generator = _streams_of(self.generator, where) or self.generator
+        try:
+            action = self._act(tree_map(lambda leaf: leaf[rows.to(leaf.device)], state), generator)
+        except Exception:
+            self.plan, self._is_stale = before
+            raise
         assert self.plan is not None
         spread = self.plan.spread(where)
         is_alike = whole is not None and whole.mean.shape == spread.mean.shape  # else it was for another objective
@@ -132,7 +135,11 @@ class ModelPredictiveController:
             if bool(is_due.all()):
                 self.plan = self._search(state, self.plan, generator)
             elif bool(is_due.any()):
+                waiting = _streams_of(generator, ~is_due)  # whose plans go on: nothing is drawn for them
+                states = [stream.get_state() for stream in waiting]
                 self.plan = self.plan.updated(is_due, self._search(state, self.plan, generator))
+                for stream, kept in zip(waiting, states, strict=True):
+                    stream.set_state(kept)
         self._is_stale = None
         action = self.plan.actions[torch.arange(len(is_due)), self.plan.elapsed]
         self.plan = self.plan.executed(self.plan.elapsed + 1)
@@ -196,3 +203,10 @@ class ModelPredictiveController:
             generator=generator,
         )
         return plan.executed(torch.zeros_like(plan.elapsed))
+
+
+def _streams_of(generators: Generators, where: Tensor) -> list[torch.Generator]:
+    """The streams of some environments, where (batch,) bool; none where all share one."""
+    if generators is None or isinstance(generators, torch.Generator):
+        return []
+    return [generators[row] for row in where.nonzero().squeeze(1).tolist()]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import reduce
 from typing import NamedTuple
 
 import torch
@@ -86,8 +87,9 @@ def refit(
         New mean and variance, shaped like the old.
 
     Raises:
-        ValueError: Shapes do not belong together, or there are fewer candidates than elites.
+        ValueError: Shapes do not belong together, there are fewer candidates than elites, or a number is out of range.
     """
+    candidates, returns, mean, var = _alike(candidates, returns, mean, var)
     if candidates.ndim == 3:
         batched = (candidates[None], returns[None], mean[None], var[None])
         new_mean, new_var = refit(*batched, num_elites=num_elites, smoothing=smoothing, temperature=temperature)
@@ -100,6 +102,8 @@ def refit(
         )
     if not 1 <= num_elites <= num_samples:
         raise ValueError(f"num_elites ({num_elites}) must lie in 1 to the number of candidates ({num_samples})")
+    if not 0.0 < smoothing <= 1.0 or not (temperature is None or temperature > 0.0):
+        raise ValueError(f"smoothing must lie in (0, 1] and temperature above 0, got {smoothing} and {temperature}")
     elites = select_elites(candidates, Scores(returns), num_elites=num_elites, temperature=temperature)
     return move_towards(elites, mean, var, smoothing=smoothing)
 
@@ -156,6 +160,13 @@ def mean_return(elites: Elites) -> Tensor:
     """Weighted mean return of the elites, NaN where there are none, (batch,)."""
     total = (elites.weights * elites.scores.returns.masked_fill(elites.weights == 0, 0.0)).sum(dim=1)
     return total.masked_fill(elites.weights.sum(dim=1) == 0, float("nan"))
+
+
+def _alike(*tensors: Tensor) -> list[Tensor]:
+    """The tensors in one floating-point precision that holds them all."""
+    dtype = reduce(torch.promote_types, (tensor.dtype for tensor in tensors))
+    dtype = dtype if dtype.is_floating_point else torch.float32
+    return [tensor.to(dtype) for tensor in tensors]
 
 
 def _feasible_first(returns: Tensor, violations: Tensor) -> Tensor:

@@ -11,7 +11,17 @@ from torch import Tensor
 from torch.utils._pytree import tree_map
 
 from latentplan.planning.elites import Scores
-from latentplan.planning.model import Model, State, check_shape, repeat_rows, require, split_rows, supports, take_step
+from latentplan.planning.model import (
+    Model,
+    State,
+    check_shape,
+    count_rows,
+    repeat_rows,
+    require,
+    split_rows,
+    supports,
+    take_step,
+)
 from latentplan.planning.objectives import Constraint, Objective, Rollout, Term, as_objective, predicted_return
 
 
@@ -62,8 +72,8 @@ class Scorer:
 
     @property
     def num_particles(self) -> int:
-        """Rollouts of each candidate: as many as the objective asks for, else as many as the model."""
-        asked = self.objective.num_particles
+        """Rollouts of each candidate: as many as objective or constraints ask for, else as many as the model."""
+        asked = max(term.num_particles for term in (self.objective, *self.constraints))
         return asked if asked > 1 else getattr(self.model, "num_particles", 1)
 
     def start_rows(self, state: State, num: int) -> State:
@@ -124,6 +134,14 @@ class Scorer:
         self._step_through(repeat_rows(state, num), horizon, choose)
         rows = torch.stack(chosen, dim=1)
         return rearrange(rows, "(batch num) horizon action -> batch num horizon action", batch=batch)
+
+    def act(self, state: State, bounds: tuple[Tensor, Tensor]) -> Tensor:
+        """The mode of the model's policy, within the bounds, (batch, action); not finite where the policy is not."""
+        require(self.model, "policy", "num_policy_samples above 0")
+        action = self.model.policy(state, None)  # type: ignore[attr-defined]
+        low, high = bounds
+        check_shape("policy()", action, (count_rows(state), len(low)))
+        return torch.clamp(action.to(low.dtype), low, high)
 
     def continue_by_policy(
         self, state: State, actions: Tensor, is_tail: Tensor, bounds: tuple[Tensor, Tensor]

@@ -16,7 +16,7 @@ A model needs one method, `step`. What else it has is detected by name:
 
     shown_as(view) -> model                          itself in front of a view of what it wraps, see `conditioned`
 
-Every output must depend on its own row only.
+Every output must depend on its own row only, and nothing that a method is given may be changed by it.
 """
 
 from __future__ import annotations
@@ -108,7 +108,7 @@ def count_rows(state: State) -> int:
 
     Raises:
         TypeError: Something in the state is not a tensor.
-        ValueError: The state holds no tensor, or tensors whose rows differ.
+        ValueError: The state holds no tensor, tensors whose rows differ, or no row.
     """
     leaves = tree_leaves(state)
     for leaf in leaves:
@@ -117,6 +117,8 @@ def count_rows(state: State) -> int:
     shapes = [tuple(leaf.shape) for leaf in leaves]
     if not shapes or any(len(shape) == 0 or shape[0] != shapes[0][0] for shape in shapes):
         raise ValueError(f"every tensor of a state needs the same rows in dim 0, got shapes {shapes}")
+    if shapes[0][0] == 0:
+        raise ValueError(f"a state needs at least one row, got shapes {shapes}")
     return shapes[0][0]
 
 

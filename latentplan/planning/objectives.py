@@ -92,6 +92,12 @@ class Objective:
     def __sub__(self, other: Term | float) -> Objective:
         return _compose(operator.sub, self, other)
 
+    def __rsub__(self, other: Term | float) -> Objective:
+        return -self + other
+
+    def __truediv__(self, other: float) -> Objective:
+        return _compose(operator.truediv, self, other)
+
     def __mul__(self, other: Term | float) -> Objective:
         return _compose(operator.mul, self, other)
 
@@ -163,6 +169,8 @@ def uncertainty_penalty() -> Objective:
 
 def risk(objective: Term, *, measure: str = "cvar", num_particles: int = 8, worst_share: float = 0.25) -> Objective:
     """An objective over several rollouts of each candidate, judged by more than their mean.
+
+    A constraint needs none: it counts its largest violation over the rollouts.
 
     The rollouts differ where the model makes them differ: by `particles(state, num)`, which gives several versions of
     each state (members of an ensemble, samples of a belief), or by a step that samples.

@@ -155,7 +155,8 @@ def shift_plan(
     index = position.clamp_max(length - 1).to(device)[..., None]
 
     def move(sequence: Tensor) -> Tensor:
-        return torch.take_along_dim(sequence, index, dim=1)  # past its end this repeats the last action: `hold`
+        """In this search's precision; past its end this repeats the last action: `hold`."""
+        return torch.take_along_dim(sequence, index, dim=1).to(low.dtype)
 
     is_warm = previous.is_warm.to(device)[:, None, None]
     mean = move(previous.actions)
@@ -173,6 +174,6 @@ def shift_plan(
 
     elites = previous.elites
     if elites is not None:
-        elites = torch.take_along_dim(elites, index[:, None], dim=2)
+        elites = torch.take_along_dim(elites, index[:, None], dim=2).to(low.dtype)
         elites = torch.where(is_tail[:, None], mean[:, None], elites).clamp(low, high)
     return WarmStart(mean, var, elites, previous.is_warm)

@@ -121,6 +121,7 @@ class PlanScheduler:
         self._asked: tuple[int, int, State] | None = None  # tick of the request in work, the tick and state it is for
         self._nominals: dict[int, NominalTrajectory] = {}  # by the tick of the plan's first action
         self._last: tuple[int, Plan] | None = None
+        self._batch: int | None = None
 
     @property
     def latency_ticks(self) -> int:
@@ -135,11 +136,14 @@ class PlanScheduler:
         """The action of this tick, and a request for a later one.
 
         Args:
-            state: Where each environment is believed to be now, rows (batch,).
+            state: Where each environment is believed to be now, rows (batch,); other rows than before forget all plans.
 
         Raises:
             Exception: What the search in the executor raised; the next call goes on.
         """
+        if count_rows(state) != self._batch:  # what was planned is of other environments
+            self.reset()
+            self._batch = count_rows(state)
         self._collect()
         action, source, age = self.buffer.choose(self.tick)
         if age is None or source is None:

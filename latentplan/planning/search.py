@@ -99,7 +99,7 @@ class Search:
         if options.gradient_steps and not self.budget.allows("gradient"):
             stopped = "deadline"
         elif options.gradient_steps:
-            actions, expected, violation = ascend(
+            actions, refined, violation = ascend(
                 self.scorer,
                 self.state,
                 actions,
@@ -107,6 +107,7 @@ class Search:
                 step_size=options.gradient_step_size,
                 bounds=(self.low, self.high),
             )
+            expected = torch.where(torch.isfinite(refined), refined, expected)
             self.budget.lap("gradient")
         info = {**progress.describe(history, stopped), "is_policy": torch.zeros_like(progress.is_found)}
         if violation is not None:
@@ -123,15 +124,19 @@ class Search:
         self.budget.lap("propose")
         return proposals
 
-    def _fall_back(self, last: WarmStart) -> Plan:
-        """Where there is no time to search: the policy's mode if that fits, else the shifted last plan, or zeros.
+    def _hold_policy(self) -> Tensor:
+        """The policy's mode here and now, (batch, 1, action)."""
+        return self.scorer.act(self.state, (self.low, self.high))[:, None]
 
-        What is cold stays cold.
+    def _fall_back(self, last: WarmStart) -> Plan:
+        """Where there is no time to search: what the policy does; without one the shifted last plan, or zeros.
+
+        It is the policy's mode in imagination if that fits, else its action now, held. What is cold stays cold.
         """
         actions, is_policy = last.mean, torch.zeros(self.batch, dtype=torch.bool, device=self.device)
-        if self.may_follow_policy and self.budget.allows("propose"):
+        if self.may_follow_policy:
             self.budget.lap()
-            mode = self._propose()[:, 0]
+            mode = self._propose()[:, 0] if self.budget.allows("propose") else self._hold_policy().expand_as(actions)
             is_policy = torch.isfinite(mode).flatten(1).all(1)
             actions = torch.where(is_policy[:, None, None], mode, actions)
         progress, _, _ = self._begin(last, None, 1)
@@ -156,7 +161,7 @@ class Search:
                 stopped = "deadline"
                 break
             fresh = self._sample(centre, spread, num_fresh)
-            fresh[:, 0] = progress.mean if iteration else start.mean
+            fresh[:, 0] = progress.mean.clamp(self.low, self.high) if iteration else start.mean
             if iteration == 0:
                 self._place_elites(fresh, start)
                 fresh = fresh if proposals is None else torch.cat([fresh, proposals], dim=1)

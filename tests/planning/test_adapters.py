@@ -126,3 +126,31 @@ def test_equal_optimizers_give_equal_plans():
 def test_bad_settings_are_named():
     with pytest.raises(ValueError, match="num_elites"):
         CEMTrajectoryOptimizer(3, 1, num_candidates=5)
+
+
+def test_a_function_may_write_to_the_sequence_it_is_given():
+    def written(state, sequence):
+        sequence += state
+        return -float(((sequence - 1.5) ** 2).sum())
+
+    def copied(state, sequence):
+        return written(state, sequence.copy())
+
+    plans = [CEMTrajectoryOptimizer(3, 1).plan(np.ones(1), function)[0] for function in (written, copied)]
+    np.testing.assert_array_equal(*plans)
+
+
+def test_a_function_without_a_finite_return_is_told_of():
+    with pytest.warns(RuntimeWarning, match="no sequence had a finite return"):
+        mean, _ = CEMTrajectoryOptimizer(3, 1).plan(np.ones(1), lambda state, sequence: float("nan"))
+    assert (mean == 0.0).all()
+
+
+def test_returns_of_the_numerical_example_may_be_whole_numbers():
+    candidates, zeros = np.arange(6, dtype=np.float32).reshape(3, 2, 1), np.zeros((2, 1))
+    plans = [
+        CEMTrajectoryOptimizer(2, 1).step_numerical_example(candidates, returns, zeros, zeros + 1.0)
+        for returns in (np.array([3, 1, 4]), np.array([3.0, 1.0, 4.0]))
+    ]
+    for whole, real in zip(*plans, strict=True):
+        np.testing.assert_array_equal(whole, real)

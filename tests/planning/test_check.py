@@ -32,6 +32,17 @@ def test_a_good_model_passes_and_its_abilities_are_listed(point):
         ({"propose": lambda state, num, horizon, generators: state}, r"propose\(\) must have shape"),
         ({"rollout": lambda state, actions: (actions, state)}, r"rollout\(\)'s rewards must have shape"),
         ({"particles": lambda state, num: state}, r"particles\(\) must return 8 rows"),
+        ({"reward": lambda state, action: -(state - state.amin(0)).square().sum(1)}, r"influence each other: step"),
+        ({"dynamics": lambda state, action: state + state.mean(0)}, r"influence each other: step"),
+        ({"value": lambda state: state.softmax(0).sum(1)}, r"influence each other: value"),
+        ({"policy": lambda state, generator: (state - state.mean(0))[:, :2]}, r"influence each other: policy"),
+        ({"particles": lambda state, num: state.repeat(num, 1)}, r"particles\(\)[^$]*not batch-major"),
+        ({"dynamics": lambda state, action: state.add_(0.1)}, r"step\(\) changes what it is given"),
+        ({"value": lambda state: state.mul_(2.0)[:, 0]}, r"value\(\) changes what it is given"),
+        ({"dynamics": lambda state, action: state.reshape(7)}, r"step\(\) raises RuntimeError"),
+        ({"value": lambda state: state.nothing}, r"value\(\) raises AttributeError"),
+        ({"rollout": lambda state, actions: state}, r"rollout\(\) must return \(rewards, state\)"),
+        ({"num_particles": 0}, "num_particles must be a whole number"),
     ],
 )
 def test_what_is_wrong_is_named(point, change, complaint):
@@ -39,6 +50,13 @@ def test_what_is_wrong_is_named(point, change, complaint):
         setattr(point, name, function)
     with pytest.raises(ValueError, match=complaint):
         check_model(point, STATE, 2)
+
+
+@pytest.mark.parametrize("state", [torch.zeros(5, 4), torch.zeros(1, 4)])
+def test_rows_that_are_alike_do_not_hide_that_they_influence_each_other(point, state):
+    point.value = lambda state: -(state - state.mean(0)).square().sum(1)
+    with pytest.raises(ValueError, match=r"influence each other: value"):
+        check_model(point, state, 2)
 
 
 def test_all_problems_are_named_at_once(point):

@@ -196,3 +196,34 @@ def test_a_plan_of_another_length_is_no_plan_of_the_other_environments(states, m
 def test_no_more_is_executed_than_the_shorter_plan_holds(make_controller):
     with pytest.raises(ValueError, match="horizon \\(3\\)"):
         make_controller(replan_every=4, goal_horizon=3)
+
+
+def test_a_reset_elsewhere_leaves_the_random_stream_of_an_environment_alone(states, point, make_planner, seeded):
+    def actions(resets):
+        generators = [seeded(row) for row in range(5)]
+        controller = ModelPredictiveController(make_planner(), point, generator=generators, replan_every=3)
+        chosen = []
+        for step in range(6):
+            chosen.append(controller.act(states + 0.1 * step)[1])
+            if step == 1 and resets:
+                controller.reset(torch.tensor([True, False, False, False, False]))
+        return torch.stack(chosen)
+
+    torch.testing.assert_close(actions(resets=True), actions(resets=False))
+
+
+def test_what_cannot_be_decided_leaves_the_plans_as_they_are(states, point, make_planner):
+    goals = torch.randn(5, 4)
+    controller = ModelPredictiveController(make_planner(), point, objective=goal_term(goals))
+    controller.act(states)
+    plan = controller.plan
+    with pytest.raises(ValueError, match="the goal must have shape"):
+        controller.act_where(states, torch.tensor([True, False, True, False, False]))
+    assert controller.plan is plan
+
+
+def test_a_plan_goes_on_in_another_precision(states, make_controller):
+    controller = make_controller(keep_elite_fraction=0.5, warm_start_variance="keep")
+    assert controller.act(states.double()).dtype == torch.float64
+    assert controller.act(states).dtype == torch.float32
+    assert controller.act(states.double()).dtype == torch.float64

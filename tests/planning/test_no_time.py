@@ -1,5 +1,7 @@
 """What a planner does that has no time to plan."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 
@@ -85,8 +87,17 @@ def test_what_a_slower_model_takes_is_not_expected_of_this_one(planner, model, s
     assert planner.plan(model, state, last, deadline_ms=25).info["iterations"].tolist() == [2, 2]
 
 
-def test_else_the_last_plan_goes_on(planner, model, state, last):
-    shifted = planner.plan(model, state, last, deadline_ms=3)
+@pytest.mark.parametrize("previous", ["last", None])
+def test_else_the_policy_acts_once_however_little_time_there_is(planner, model, state, last, previous):
+    before = model.seconds
+    plan = planner.plan(model, state, last if previous else None, deadline_ms=0)
+    assert 1000 * (model.seconds - before) <= 1.001
+    assert plan.source == "actor" and plan.info["is_fallback"].all()
+    assert torch.allclose(plan.actions, (0.25 + 0.1 * state).clamp(-1.0, 1.0)[:, None].expand(-1, HORIZON, -1))
+
+
+def test_without_a_policy_the_last_plan_goes_on(planner, model, state, last):
+    shifted = replace(planner, num_policy_samples=0).plan(model, state, last, deadline_ms=0)
     assert shifted.source == "tail"
     assert torch.equal(shifted.actions[:, :-1], last.actions[:, 1:])
 

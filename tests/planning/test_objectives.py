@@ -261,3 +261,20 @@ def test_bad_choices_are_named():
         risk(learned_return(), measure="best")
     with pytest.raises(ValueError, match="goal"):
         goal_term(torch.zeros(2, 2, 2))
+
+
+def test_terms_are_subtracted_from_and_divided_by_numbers(walk, actions):
+    size = returns(walk, action_penalty(), torch.zeros(5, 2), actions)
+    torch.testing.assert_close(returns(walk, 1 - action_penalty(), torch.zeros(5, 2), actions), 1 - size)
+    torch.testing.assert_close(returns(walk, action_penalty() / 2, torch.zeros(5, 2), actions), size / 2)
+
+
+def test_a_constraint_may_ask_for_particles(make_planner, seeded):
+    seen = []
+
+    def watch(rollout):
+        seen.append(rollout.num_particles)
+        return torch.zeros(len(rollout.actions))
+
+    make_planner().plan(Gamble(), torch.zeros(1, 1), constraints=[risk(watch, num_particles=4)], generator=seeded())
+    assert set(seen) == {4}

@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from latentplan.planning import FunctionModel, icem_planner, learned_return, mppi_planner, refit
+from latentplan.planning import CEMPlanner, FunctionModel, icem_planner, learned_return, mppi_planner, refit
 from latentplan.planning.sampling import Streams
 
 CHANGES = [
@@ -265,3 +265,36 @@ def test_refits_of_a_plan_are_the_public_equation(seeded):
     returns = -(seen[0] - 0.3).square().sum(dim=1)
     mean, var = refit(candidates, returns, torch.zeros(1, 2), torch.ones(1, 2), num_elites=4, smoothing=0.7)
     torch.testing.assert_close((plan.mean[0], plan.var[0]), (mean, var))
+
+
+def test_nothing_leaves_the_bounds_not_even_by_rounding(seeded):
+    options = {"final": "best", "num_iterations": 6, "temperature": 1.0, "smoothing": 1.0}
+    planner = CEMPlanner(
+        action_dim=1, horizon=3, num_samples=100, num_elites=10, action_low=1.2, action_high=1.7, **options
+    )
+    model = FunctionModel(lambda state, action: state, lambda state, action: -action[:, 0])
+    for seed in range(5):
+        plan = planner.plan(model, torch.zeros(1, 1), generator=seeded(seed))
+        assert plan.actions.min() >= torch.tensor(1.2) and plan.actions.max() <= torch.tensor(1.7)
+
+
+def test_a_refinement_that_finds_nothing_leaves_what_was_found(seeded):
+    model = FunctionModel(
+        lambda state, action: state,
+        lambda state, action: torch.where((action[:, 0] > 0.5) | (action[:, 0] < -0.5), action[:, 0].abs(), torch.nan),
+    )
+    planner = CEMPlanner(action_dim=1, horizon=1, num_samples=64, num_elites=32, num_iterations=1, gradient_steps=2)
+    plan = planner.plan(model, torch.zeros(1, 1), generator=seeded(0))
+    assert not plan.failures().any() and torch.isfinite(plan.expected_return).all()
+
+
+@pytest.mark.parametrize("name", ["horizon", "num_samples", "action_dim"])
+def test_sizes_are_whole_numbers(name):
+    sizes = {"action_dim": 2, "horizon": 3, "num_samples": 16, "num_elites": 4}
+    with pytest.raises(ValueError, match=f"{name} must be a whole number"):
+        CEMPlanner(**sizes | {name: float(sizes[name])})
+
+
+def test_a_state_without_rows_is_refused(point, make_planner):
+    with pytest.raises(ValueError, match="at least one row"):
+        make_planner().plan(point, torch.zeros(0, 4))

@@ -126,3 +126,20 @@ def test_feasible_candidates_come_first_and_outweigh_the_others():
     assert (weighted.weights[0, 2:] == 0).all()
     none = select_elites(CANDIDATES[None], Scores(RETURNS[None], violations + 1), num_elites=4, temperature=1.0)
     torch.testing.assert_close(none.weights[0], torch.softmax(-torch.tensor([1.0, 1.0, 2.0, 3.0]).double(), dim=0))
+
+
+def test_returns_may_be_whole_numbers_and_precisions_differ():
+    candidates = torch.randn(6, 3, 2, generator=torch.Generator().manual_seed(0))
+    numbers, zeros = torch.tensor([3, 1, 4, 1, 5, 9]), torch.zeros(3, 2, dtype=torch.float64)
+    settings = {"num_elites": 2, "smoothing": 0.8}
+    mean, var = refit(candidates, numbers, zeros, zeros + 1.0, **settings)
+    expected = refit(candidates.double(), numbers.double(), zeros, zeros + 1.0, **settings)
+    assert mean.dtype == torch.float64
+    torch.testing.assert_close((mean, var), expected)
+
+
+@pytest.mark.parametrize("setting", [{"smoothing": 5.0}, {"smoothing": 0.0}, {"smoothing": 0.8, "temperature": -1.0}])
+def test_refit_refuses_numbers_out_of_range(setting):
+    numbers = torch.zeros(4, 1, 1)
+    with pytest.raises(ValueError, match=r"smoothing must lie in \(0, 1\] and temperature above 0"):
+        refit(numbers, numbers[:, 0, 0], numbers[0], numbers[0], num_elites=2, **setting)

@@ -256,3 +256,9 @@ def test_plans_for_an_objective_are_used_to_their_end(model):
     scheduler = PlanScheduler(planner, model, executor)
     decisions, _ = drive(scheduler, executor, 9)
     assert [decision.source for decision in decisions] == ["actor", "plan", "plan", *["tail"] * 4, "actor", "actor"]
+
+
+def test_another_number_of_environments_forgets_the_plans(model):
+    scheduler, executor = make(model, itertools.repeat(0.5))
+    drive(scheduler, executor, 6)
+    assert scheduler.decide(torch.ones(3, 1)).action.shape == (3, 1)
