@@ -7,8 +7,6 @@ row of an episode has no action. Alignment is drawn at the top of a batch: obser
 
 from __future__ import annotations
 
-import os
-import sys
 from dataclasses import dataclass
 from pathlib import Path
 from pickle import UnpicklingError
@@ -19,14 +17,13 @@ import torch
 from torch import Tensor
 
 from latentplan.config import UserError
+from latentplan.memory import check_memory
 
 FRAME_SHAPE = (64, 64, 3)
 FRAME_BYTES = 64 * 64 * 3
-MEMORY_SHARE = 0.9
 SAMPLING_ROUNDS = 1000
 COLUMNS = ("deter", "actions", "rewards", "continues", "labels", "plan")
 LOADED_AT_ONCE = 1024
-MEMORY_FACTS = Path("/proc/meminfo")
 
 
 @dataclass
@@ -60,7 +57,7 @@ class Rows:
 
 
 class Batch(NamedTuple):
-    """Sequences of `time` decisions and `time + 1` frames.
+    """Sequences of `time` decisions and `time + 1` frames; what follows a terminal state is of another episode.
 
     Attributes:
         frames: uint8 (batch, time + 1, 64, 64, 3).
@@ -81,6 +78,12 @@ class Batch(NamedTuple):
     labels: Tensor
     rows: Tensor
     plan: Tensor
+
+    @property
+    def within(self) -> Tensor:
+        """1 for each transition of the episode that its sequence begins in, 0 beyond its end, (batch, time)."""
+        before = torch.cat([torch.ones_like(self.continues[:, :1]), self.continues[:, :-1]], 1)
+        return before.cumprod(1)
 
 
 class Replay:
@@ -111,7 +114,7 @@ class Replay:
         self.num_lanes, self.device = num_lanes, device
         total = self.lane_size * num_lanes
         self.num_bytes = replay_bytes(total, action_dim, deter_dim, num_labels)
-        _check_memory(self.num_bytes, device)
+        check_memory(self.num_bytes, device)
         self.frames = torch.zeros(total, *FRAME_SHAPE, dtype=torch.uint8, device=device)
         self.deter = torch.zeros(total, deter_dim, dtype=torch.float16, device=device)
         self.actions = torch.zeros(total, action_dim, device=device)
@@ -120,6 +123,7 @@ class Replay:
         self.labels = torch.zeros(total, num_labels, device=device)
         self.plan = torch.zeros(total, 2 * action_dim, device=device)
         self.episode = np.full((num_lanes, self.lane_size), -1, dtype=np.int64)
+        self.is_end = np.zeros((num_lanes, self.lane_size), dtype=bool)  # whose action led to a terminal state
         self.written = np.zeros(num_lanes, dtype=np.int64)
         self._saved = np.zeros(num_lanes, dtype=np.int64)
 
@@ -134,6 +138,7 @@ class Replay:
         positions = (self.written[lane] + newest) % self.lane_size
         previous = self.episode[lane, (self.written[lane] - 1) % self.lane_size] if self.written[lane] else -1
         self.episode[lane, positions] = previous + np.cumsum(rows.is_first)[newest]
+        self.is_end[lane, positions] = rows.continues[newest] == 0.0
         index = torch.as_tensor(positions + lane * self.lane_size, device=self.device)
         for name in ("frames", *COLUMNS):
             store = getattr(self, name)
@@ -141,7 +146,10 @@ class Replay:
         self.written[lane] += count
 
     def draw(self, batch_size: int, sequence_length: int, rng: np.random.Generator) -> Tensor:
-        """Where uniformly drawn sequences live, each within one episode: rows (batch, time + 1).
+        """Where uniformly drawn sequences live: rows (batch, time + 1).
+
+        Each lies within one episode, or reaches beyond its end if that is a terminal state: else the ends, which are
+        all that there is to learn of ending, would be drawn once for the `sequence_length` times of other rows.
 
         Raises:
             UserError: No episode is long enough.
@@ -168,10 +176,10 @@ class Replay:
     def refresh(self, rows: Tensor, deter: Tensor, chosen: Tensor) -> None:
         """Replace the stored beliefs at rows (batch, time) with newer ones (batch, time, deter).
 
-        Only the sequences `chosen`, bool (batch,), are read. Where a row occurs in several, the last one counts.
+        Only those `chosen`, bool (batch, time), are read. Where a row occurs more than once, the last one counts.
         """
         index = rows.flatten().to(self.device)
-        is_chosen = chosen.to(self.device)[:, None].expand(rows.shape).flatten()
+        is_chosen = chosen.to(self.device).flatten()
         # Every occurrence writes the value of the last one chosen: parallel writes to one place have no order.
         in_order, order = (2 * index + is_chosen).sort(stable=True)
         last = order[torch.searchsorted(in_order, 2 * index + 1, right=True) - 1]
@@ -222,6 +230,7 @@ class Replay:
             self.written[lane] = written if saved_size == self.lane_size else held
             self._saved[lane] = self.written[lane] if np.array_equal(old, new) else 0
             self.episode[lane, new] = state["episode"].numpy()[lane, old]
+            self.is_end[lane, new] = state["continues"].numpy()[old + lane * saved_size] == 0.0
             index = torch.from_numpy(new + lane * self.lane_size).to(self.device)
             for name in COLUMNS:
                 store = getattr(self, name)
@@ -253,10 +262,12 @@ class Replay:
         for _ in range(SAMPLING_ROUNDS):
             lane = rng.choice(self.num_lanes, size=2 * count, p=held / held.sum())
             offset = rng.integers(0, held[lane])
-            fits = offset + length < held[lane]
-            start = oldest[lane] + offset
-            same = self.episode[lane, start % self.lane_size] == self.episode[lane, (start + length) % self.lane_size]
-            keep = fits & same
+            start, left = oldest[lane] + offset, held[lane] - offset
+            steps = (start[:, None] + np.arange(length + 1)) % self.lane_size
+            is_same = self.episode[lane[:, None], steps] == self.episode[lane[:, None], steps[:, :1]]
+            last = is_same.cumprod(1).sum(1) - 1  # steps until the last row of the episode, at most the length
+            ends = self.is_end[lane, steps[np.arange(len(last)), last - 1]] & (last > 0)
+            keep = (last < left) & ((last == length) | ends)
             lanes, starts = np.concatenate([lanes, lane[keep]]), np.concatenate([starts, start[keep]])
             if len(starts) >= count:
                 return lanes[:count], starts[:count]
@@ -277,24 +288,4 @@ def read_saved(path: Path, device: torch.device | str = "cpu") -> Any:
 
 def replay_bytes(num_rows: int, action_dim: int, deter_dim: int, num_labels: int = 0) -> int:
     """Memory that a replay of `num_rows` rows takes, in bytes."""
-    return num_rows * (FRAME_BYTES + 2 * deter_dim + 4 * (3 * action_dim + num_labels) + 4 + 4 + 8)
-
-
-def _check_memory(num_bytes: int, device: torch.device) -> None:
-    free = torch.cuda.mem_get_info(device)[0] if device.type == "cuda" else _free_memory()
-    if num_bytes > MEMORY_SHARE * free:
-        raise UserError(
-            f"the replay takes {num_bytes / 2**30:.1f} GiB but {device.type} has {free / 2**30:.1f} GiB free: "
-            "lower --replay.capacity or --frames"
-        )
-
-
-def _free_memory() -> int:
-    """Bytes of main memory that can be had; without /proc all there is, and no limit where even that is unknown."""
-    if MEMORY_FACTS.exists():
-        for line in MEMORY_FACTS.read_text().splitlines():
-            if line.startswith("MemAvailable:"):
-                return int(line.split()[1]) * 1024
-    if "SC_PHYS_PAGES" in getattr(os, "sysconf_names", {}):
-        return os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
-    return sys.maxsize
+    return num_rows * (FRAME_BYTES + 2 * deter_dim + 4 * (3 * action_dim + num_labels) + 4 + 4 + 8 + 1)

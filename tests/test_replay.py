@@ -6,66 +6,10 @@ import numpy as np
 import pytest
 import torch
 
-from latentplan import replay as replay_module
+from latentplan import memory
 from latentplan.config import UserError
-from latentplan.replay import Replay, Rows, replay_bytes
-
-CPU = torch.device("cpu")
-
-
-class Clock:
-    """Writes episodes of given lengths to one lane; everything about a row follows from its lane, episode and time.
-
-    The frame is filled with time, episode and lane; action[t] leads from t to t + 1, so it holds t + 0.5 (scaled to
-    stay within [-1, 1]), and the reward that arrives with frame t + 1 is t + 1.
-    """
-
-    def __init__(self, lane, lengths):
-        self.entries = [
-            (lane, episode, time, time == length)
-            for episode, length in enumerate(lengths)
-            for time in range(length + 1)
-        ]
-
-    def rows(self, start=0, stop=None):
-        entries = self.entries[start:stop]
-        frames = np.zeros((len(entries), 64, 64, 3), np.uint8)
-        for frame, (lane, episode, time, _) in zip(frames, entries, strict=True):
-            frame[:] = (time, episode, lane)
-        time = np.array([entry[2] for entry in entries], np.float32)
-        last = np.array([entry[3] for entry in entries], bool)
-        return Rows(
-            frames=frames,
-            deter=np.stack([time, time + 1000.0], -1),
-            actions=np.where(last, 0.0, (time + 0.5) / 256)[:, None].astype(np.float32),
-            rewards=np.where(last, 0.0, time + 1.0).astype(np.float32),
-            continues=np.ones(len(entries), np.float32),
-            is_first=time == 0.0,
-            labels=np.stack([time + 0.25, -time], -1),
-        )
-
-
-def make_replay(capacity=60, lanes=1):
-    return Replay(capacity, action_dim=1, deter_dim=2, num_lanes=lanes, device=CPU, num_labels=2)
-
-
-def filled(capacity=60, lanes=1, lengths=(7, 4, 9), chunk=5):
-    replay = make_replay(capacity, lanes)
-    for lane in range(lanes):
-        clock = Clock(lane, lengths)
-        for start in range(0, len(clock.entries), chunk):
-            replay.add(lane, clock.rows(start, start + chunk))
-    return replay
-
-
-def sample(replay, batch_size=64, length=3, seed=0):
-    return replay.gather(replay.draw(batch_size, length, np.random.default_rng(seed)))
-
-
-def told(batch):
-    """Time, episode and lane that each frame tells, (batch, time + 1) each."""
-    assert (batch.frames == batch.frames[:, :, :1, :1]).all()
-    return batch.frames[:, :, 0, 0].float().unbind(-1)
+from latentplan.replay import Replay, replay_bytes
+from tests.replay_clock import CPU, Clock, filled, make_replay, sample, told
 
 
 def assert_aligned(batch):
@@ -77,7 +21,6 @@ def assert_aligned(batch):
     assert torch.equal(batch.deter[:, 0], time[:, 0])
 
 
-EVERY = torch.ones(64, dtype=torch.bool)
 RINGS = [
     pytest.param({}, id="one lane"),
     pytest.param({"capacity": 120, "lanes": 3}, id="three lanes"),
@@ -145,7 +88,9 @@ def test_refreshed_beliefs_go_back_to_where_the_batch_came_from():
     replay = filled(capacity=40, lanes=2, lengths=(7, 4, 9, 6))
     batch = sample(replay)
     time, episode, lane = told(batch)
-    replay.refresh(batch.rows, torch.stack([time * 2.0, episode + 100.0 * lane], -1), EVERY[: len(batch.rows)])
+    replay.refresh(
+        batch.rows, torch.stack([time * 2.0, episode + 100.0 * lane], -1), torch.ones_like(batch.rows, dtype=torch.bool)
+    )
     again = sample(replay, seed=1)
     time, episode, lane = (part[:, 0] for part in told(again))
     refreshed = torch.isin(again.rows[:, 0], batch.rows)
@@ -158,18 +103,18 @@ def test_refreshed_beliefs_go_back_to_where_the_batch_came_from():
 def test_where_a_row_is_refreshed_twice_the_last_counts():
     replay = filled()
     deter = torch.arange(12.0).reshape(2, 3, 2)
-    replay.refresh(torch.tensor([[4, 5, 4], [6, 4, 5]]), deter, EVERY[:2])
+    replay.refresh(torch.tensor([[4, 5, 4], [6, 4, 5]]), deter, torch.ones(2, 3, dtype=torch.bool))
     assert replay.deter[4:7].tolist() == [[8.0, 9.0], [10.0, 11.0], [6.0, 7.0]]
 
 
-@pytest.mark.parametrize("chosen", [(True, False), (False, True), (False, False)])
+@pytest.mark.parametrize("chosen", [((1, 1, 1), (0, 0, 0)), ((0, 0, 0), (1, 1, 1)), ((0, 1, 0), (0, 0, 1))])
 def test_what_is_not_chosen_is_not_refreshed_even_where_it_comes_last(chosen):
     replay = filled()
     before = replay.deter.clone()
     rows, deter = torch.tensor([[4, 5, 6], [5, 6, 7]]), torch.arange(12.0).reshape(2, 3, 2)
-    replay.refresh(rows, deter, torch.tensor(chosen))
+    replay.refresh(rows, deter, torch.tensor(chosen) == 1)
     for row in range(len(before)):
-        written = [deter[s, t] for s in range(2) for t in range(3) if chosen[s] and rows[s, t] == row]
+        written = [deter[s, t] for s in range(2) for t in range(3) if chosen[s][t] and rows[s, t] == row]
         assert torch.equal(replay.deter[row].float(), written[-1] if written else before[row].float())
 
 
@@ -281,7 +226,7 @@ def test_an_episode_of_the_sequence_length_is_long_enough():
 
 
 def test_a_replay_beyond_the_free_memory_is_refused(monkeypatch):
-    monkeypatch.setattr(replay_module, "_free_memory", lambda: replay_bytes(100, 1, 2, 2))
+    monkeypatch.setattr(memory, "free_memory", lambda: replay_bytes(100, 1, 2, 2))
     make_replay(capacity=90)
     with pytest.raises(UserError, match=r"lower --replay\.capacity"):
         make_replay(capacity=91)
@@ -290,10 +235,10 @@ def test_a_replay_beyond_the_free_memory_is_refused(monkeypatch):
 def test_the_memory_a_replay_takes_is_what_its_arrays_hold():
     replay = make_replay(capacity=10, lanes=3)
     arrays = [replay.frames, replay.deter, replay.actions, replay.rewards, replay.continues, replay.labels, replay.plan]
-    held = sum(array.numel() * array.element_size() for array in arrays) + replay.episode.nbytes
+    held = sum(array.numel() * array.element_size() for array in arrays) + replay.episode.nbytes + replay.is_end.nbytes
     assert held == replay.num_bytes
 
 
 def test_free_memory_is_known_or_unlimited_without_proc(monkeypatch):
-    monkeypatch.setattr(replay_module, "MEMORY_FACTS", Path("/nowhere"))
-    assert replay_module._free_memory() > 2**28
+    monkeypatch.setattr(memory, "MEMORY_FACTS", Path("/nowhere"))
+    assert memory.free_memory() > 2**28

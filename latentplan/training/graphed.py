@@ -12,7 +12,7 @@ from torch import Tensor
 from latentplan.config import LearningConfig, derive_seed
 from latentplan.models import WorldModel
 from latentplan.replay import Batch, Replay
-from latentplan.training.module import Learner
+from latentplan.training.module import Learner, refreshed
 from latentplan.training.optimization import descend_if_finite
 
 if TYPE_CHECKING:
@@ -86,7 +86,7 @@ class GraphedLearner(Learner):
         batch = self.prepare(self.replay.gather(self._rows))
         learned, batch, unturned = self._learn_model(batch, generator)
         is_finite = torch.isfinite(learned.parts["model_grad_norm"])
-        self.replay.refresh(batch.rows, learned.states.deter, unturned & is_finite)
+        self.replay.refresh(batch.rows, learned.states.deter, refreshed(batch, unturned & is_finite))
         self.snapshot.refresh()
         parts = learned.parts | self._learn_behaviour(learned, batch, generator)
         self.skipped += ~(is_finite & torch.isfinite(parts["behaviour_grad_norm"]))

@@ -53,6 +53,8 @@ class Learned(NamedTuple):
 def world_model_loss(model: WorldModel, batch: Batch, config: LearningConfig, generator: torch.Generator) -> Learned:
     """Reconstruction, reward, continuation and balanced KL over a batch of sequences, and open-loop predictions.
 
+    What lies beyond a terminal state (see `Batch.within`) counts for nothing.
+
     With `random_shift` the encoder sees moved frames while the decoder paints them unmoved, so that the latent need not
     hold by how much.
     """
@@ -73,18 +75,20 @@ def world_model_loss(model: WorldModel, batch: Batch, config: LearningConfig, ge
         reward_logits = model.reward_head(features[:, 1:])
         open_loop_logits = model.reward_head(open_loop)
         continue_logits = model.continue_head(features[:, 1:]).squeeze(-1)
+    within = batch.within
+    ahead, seen = within[:, :reached], torch.cat([torch.ones_like(within[:, :1]), within], 1)
     probe = batch.rewards.new_zeros(())
     if model.labels:
-        probe = _probe_loss(model, features, batch.labels) + _probe_loss(
-            model, open_loop, batch.labels[:, 1 : reached + 1]
-        )
+        probe = mean_within(_probe_errors(model, features, batch.labels), seen)
+        probe = probe + mean_within(_probe_errors(model, open_loop, batch.labels[:, 1 : reached + 1]), ahead)
+    binary_loss = torch.nn.functional.binary_cross_entropy_with_logits
     parts = {
-        "reconstruction": model.decoder.loss(patches, batch.frames.flatten(0, 1)).mean(),
-        "reward": model.reward_head.loss(reward_logits, batch.rewards).mean(),
-        "open_loop_reward": model.reward_head.loss(open_loop_logits, batch.rewards[:, :reached]).mean(),
-        "continue": torch.nn.functional.binary_cross_entropy_with_logits(continue_logits, batch.continues),
-        "dynamics": _free_kl(_detached(posterior), prior, config.free_nats),
-        "representation": _free_kl(posterior, _detached(prior), config.free_nats),
+        "reconstruction": mean_within(model.decoder.loss(patches, batch.frames.flatten(0, 1)), seen.flatten()),
+        "reward": mean_within(model.reward_head.loss(reward_logits, batch.rewards), within),
+        "open_loop_reward": mean_within(model.reward_head.loss(open_loop_logits, batch.rewards[:, :reached]), ahead),
+        "continue": mean_within(binary_loss(continue_logits, batch.continues, reduction="none"), within),
+        "dynamics": mean_within(_free_kl(_detached(posterior), prior, config.free_nats), seen),
+        "representation": mean_within(_free_kl(posterior, _detached(prior), config.free_nats), seen),
         "overshooting": overshooting,
         "probe": probe,
     }
@@ -218,22 +222,27 @@ def _predict_open_loop(
         deters.append(deter)
     prior = Gaussian(*(torch.stack(part, 1) for part in zip(*priors, strict=True)))
     seen = Gaussian(*(windows(part[:, 1:].detach()) for part in posterior))
-    divergence = _free_kl(seen, prior, config.free_nats)
+    divergence = mean_within(_free_kl(seen, prior, config.free_nats), windows(batch.within))
     features = State(torch.stack(deters, 1), prior.mean).features
     return divergence, rearrange(
         features, "(batch window) time ... -> batch (window time) ...", batch=len(batch.actions)
     )
 
 
-def _probe_loss(model: WorldModel, features: Tensor, labels: Tensor) -> Tensor:
-    """Squared error of the quantities read off the latent, in typical sizes; the latent learns nothing from it."""
+def mean_within(values: Tensor, within: Tensor) -> Tensor:
+    """The mean of those values that count: within is 1 for these and 0 for others, of the same shape."""
+    return (values * within).sum() / within.sum().clamp_min(1.0)
+
+
+def _probe_errors(model: WorldModel, features: Tensor, labels: Tensor) -> Tensor:
+    """Squared errors of what is read off the latent, in typical sizes, (...); the latent learns nothing from them."""
     with model.trunk_precision(cache=False):
         predicted = model.probe(features.detach())
-    return ((predicted - labels) / model.label_scales).square().mean()
+    return ((predicted - labels) / model.label_scales).square().mean(-1)
 
 
 def _free_kl(left: Gaussian, right: Gaussian, free_nats: float) -> Tensor:
-    return kl_divergence(left, right).clamp_min(free_nats).mean()
+    return kl_divergence(left, right).clamp_min(free_nats)
 
 
 def _decayed(values: Tensor, share: float) -> Tensor:

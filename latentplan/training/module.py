@@ -15,7 +15,15 @@ from latentplan.models import State, WorldModel
 from latentplan.models.heads import ScalarHead
 from latentplan.replay import Batch, Replay
 from latentplan.training.augmentation import quarter_turns
-from latentplan.training.losses import Learned, imagine, imitation_loss, lambda_return, value_loss, world_model_loss
+from latentplan.training.losses import (
+    Learned,
+    imagine,
+    imitation_loss,
+    lambda_return,
+    mean_within,
+    value_loss,
+    world_model_loss,
+)
 from latentplan.training.optimization import average, descend, follow, keep_freed_memory, return_scale
 from latentplan.training.snapshot import Snapshot
 
@@ -74,7 +82,7 @@ class Learner(lightning.LightningModule):
             learned, batch, unturned = self._learn_model(batch, generator)
         finally:
             self._finish_behaviour(behaviour)
-        self.replay.refresh(batch.rows, learned.states.deter, unturned)
+        self.replay.refresh(batch.rows, learned.states.deter, refreshed(batch, unturned))
         self.snapshot.refresh()
         self._waiting = (learned, batch, generator)
         self.updates += 1
@@ -144,8 +152,10 @@ class Learner(lightning.LightningModule):
     ) -> tuple[Tensor, dict[str, Tensor]]:
         config, states = self.config, learned.states
         flat = State(states.deter.flatten(0, 1), states.stoch.flatten(0, 1))
-        order = torch.rand(len(flat.deter), generator=generator, device=self.device).argsort()
-        chosen = order[: config.imagination_starts]
+        goes_on = torch.cat([torch.ones_like(batch.continues[:, :1]), batch.within * batch.continues], 1).flatten()
+        order = torch.rand(len(flat.deter), generator=generator, device=self.device).masked_fill(goes_on == 0.0, 2.0)
+        first = torch.arange(min(config.imagination_starts, len(order)), device=self.device)
+        chosen = order.argsort()[first % goes_on.sum().long()]  # what has ended has no future to be imagined
         with self.model.trunk_precision(cache=False):
             dream = imagine(
                 self.snapshot.model,
@@ -181,7 +191,7 @@ class Learner(lightning.LightningModule):
         mean, std = batch.plan.chunk(2, -1)
         has_plan = (std > 0.0).all(-1)
         divergence = imitation_loss(self.model.actor, states.features[:, :-1], mean, std)
-        return (has_plan * divergence).sum() / has_plan.sum().clamp_min(1)
+        return mean_within(divergence, has_plan * batch.within)
 
     def _replayed_value_loss(self, learned: Learned, batch: Batch) -> Tensor:
         """The value against replayed rewards, at what was seen and at what had been predicted of it without looking.
@@ -196,10 +206,18 @@ class Learner(lightning.LightningModule):
             returns = lambda_return(batch.rewards.T, discounts, values, self.config.lambda_)
         seen = torch.cat([features[:-1], predicted])
         targets = torch.cat([returns, torch.cat([returns, values[-1:]])[1 : len(predicted) + 1]])
-        return value_loss(self.model.value_head, seen, targets, torch.ones_like(targets))
+        within = batch.within.T
+        reached = torch.cat([within, within[-1:] * batch.continues.T[-1:]])[1 : len(predicted) + 1]
+        weights = torch.cat([within, reached])
+        return value_loss(self.model.value_head, seen, targets, weights / weights.mean())
 
     def _descend(self, optimizer: torch.optim.Optimizer, loss: Tensor) -> Tensor:
         return descend(optimizer, loss, self.config.max_grad_norm, self.updates)
+
+
+def refreshed(batch: Batch, chosen: Tensor) -> Tensor:
+    """Whose beliefs are new, (batch, time + 1): the frames of chosen sequences (batch,), but for those past an end."""
+    return chosen[:, None] & torch.nn.functional.pad(batch.within, (1, 0), value=1.0).bool()
 
 
 def _halves(model: WorldModel) -> tuple[list[nn.Parameter], list[nn.Parameter]]:

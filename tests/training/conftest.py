@@ -19,8 +19,10 @@ from latentplan.config import (
     PlannerConfig,
     RunConfig,
 )
-from latentplan.replay import Batch
+from latentplan.models import WorldModel
+from latentplan.replay import Batch, Replay
 from latentplan.training import train
+from latentplan.training.module import Learner
 
 TINY = Config(
     env=EnvConfig(action_repeat=1),
@@ -118,3 +120,22 @@ def batch():
         rows=torch.arange(24).reshape(4, 6),
         plan=torch.zeros(4, 5, 2),
     )
+
+
+@pytest.fixture
+def model(tiny):
+    """A tiny world model whose heads say something from the first on."""
+    torch.manual_seed(0)
+    model = WorldModel(tiny("").model, action_dim=1)
+    with torch.no_grad():
+        for head in (model.reward_head, model.value_head):
+            head.mlp.output.weight.normal_(std=0.3)
+        model.continue_head.output.weight.normal_(std=0.3)
+    return model
+
+
+@pytest.fixture
+def learner(model, tiny):
+    """What teaches that model."""
+    replay = Replay(24, 1, 16, 1, torch.device("cpu"))
+    return Learner(model, tiny("").learning, 0.9, replay, seed=0)

@@ -4,27 +4,8 @@ import pytest
 import torch
 
 from latentplan.models import Gaussian, State, WorldModel, kl_divergence
-from latentplan.replay import Replay
 from latentplan.training.losses import imagine, imitation_loss, lambda_return, roll_out, world_model_loss
-from latentplan.training.module import Learner
 from latentplan.training.optimization import return_scale
-
-
-@pytest.fixture
-def model(tiny):
-    torch.manual_seed(0)
-    model = WorldModel(tiny("").model, action_dim=1)
-    with torch.no_grad():
-        for head in (model.reward_head, model.value_head):
-            head.mlp.output.weight.normal_(std=0.3)
-        model.continue_head.output.weight.normal_(std=0.3)
-    return model
-
-
-@pytest.fixture
-def learner(model, tiny):
-    replay = Replay(24, 1, 16, 1, torch.device("cpu"))
-    return Learner(model, tiny("").learning, 0.9, replay, seed=0)
 
 
 def stream():
