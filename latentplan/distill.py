@@ -85,7 +85,7 @@ def _planner(request: DistillRequest, info: dict[str, Any]) -> PlannerConfig:
     """The agent's search, with what was given in its place."""
     try:
         trained = to_dict(from_dict(info["config"]).planner)
-    except ValueError as error:
+    except (AttributeError, TypeError, ValueError) as error:
         raise UserError(f"{request.checkpoint} has settings of another version: {error}") from None
     return build_config({"planner": override_planner(trained, request.planner)}).planner
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import tempfile
 from argparse import SUPPRESS
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -12,7 +11,7 @@ from typing import TYPE_CHECKING
 
 from latentplan.cli import read_flags
 from latentplan.compose import field_names, raise_unknown
-from latentplan.config import DEVICES, PlannerConfig, UserError
+from latentplan.config import DEVICES, PlannerConfig, UserError, output_file
 
 if TYPE_CHECKING:
     from latentplan.latency import Latency
@@ -168,14 +167,4 @@ def _output_path(flags: dict[str, str], name: str) -> Path | None:
         from latentplan.reporting.video import check_video_path
 
         check_video_path(path)
-    if path.is_dir():
-        raise UserError(f"{name} {str(path)!r} is a folder; give a file in it")
-    folder = path.parent
-    if not folder.is_dir():
-        existing = next(parent for parent in folder.parents if parent.is_dir())
-        raise UserError(f"{name}: there is no folder {str(folder)!r}; the nearest that exists is {str(existing)!r}")
-    try:
-        tempfile.TemporaryFile(dir=folder).close()
-    except OSError as error:
-        raise UserError(f"{name}: cannot write in {str(folder)!r}: {error.strerror}; choose another folder") from None
-    return path
+    return output_file(path, name)

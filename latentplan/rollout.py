@@ -191,7 +191,7 @@ def confidence_interval(returns: Sequence[float]) -> tuple[float, float]:
     if len(returns) == 1:
         return math.nan, math.nan
     mean, std = float(np.mean(returns)), float(np.std(returns, ddof=1))
-    half = _t_quantile(len(returns) - 1) * std / math.sqrt(len(returns))
+    half = t_quantile(len(returns) - 1) * std / math.sqrt(len(returns))
     return mean - half, mean + half
 
 
@@ -201,7 +201,7 @@ def latency_percentiles(decision_ms: Floats) -> dict[str, float]:
     return {"p50": float(p50), "p95": float(p95), "p99": float(p99)}
 
 
-def _t_quantile(freedom: int) -> float:
+def t_quantile(freedom: int) -> float:
     """The 0.975 quantile of Student's t; above 10 degrees of freedom by its series (Abramowitz and Stegun 26.7.5)."""
     if freedom <= len(_T_QUANTILES):
         return _T_QUANTILES[freedom - 1]

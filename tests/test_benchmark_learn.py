@@ -6,6 +6,7 @@ import sys
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from latentplan.compose import dump_config
@@ -15,7 +16,9 @@ sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "scripts"))
 
 import benchmark  # noqa: E402
 from bench.anchors import METHODS, published  # noqa: E402
-from bench.learn import MARKERS, Curve, Point, check_same, compare, first_reaching, read_run, run_facts  # noqa: E402
+from bench.learn import check_same, compare, first_reaching, read_run, run_facts  # noqa: E402
+from bench.learn_plot import MARKERS, Curve, Point  # noqa: E402
+from bench.statistics import interquartile_estimate, mean_estimate  # noqa: E402
 
 
 def test_a_threshold_is_reached_at_the_first_evaluation_above_it():
@@ -75,3 +78,46 @@ def test_a_folder_of_other_settings_is_not_taken_for_these(tmp_path):
         check_same(replace(begun, planner=PlannerConfig(horizon=7)), tmp_path)
     with pytest.raises(UserError, match=r"--run\.seed"):
         check_same(replace(begun, run=replace(begun.run, seed=1)), tmp_path)
+    given = replace(begun, env=replace(begun.env, objective="upright"))
+    dump_config(given, tmp_path / "config.yaml")
+    with pytest.raises(UserError, match=r"--env\.objective upright, not None"):
+        check_same(begun, tmp_path)
+    check_same(replace(given, env=replace(given.env, task=None)), tmp_path)  # the domain's usual one
+
+
+@pytest.mark.parametrize(
+    ("flag", "own"), [("--run.seed", "--seeds"), ("--env.task", "--tasks"), ("--run.frames", "--frames")]
+)
+def test_what_tells_the_runs_apart_is_given_by_its_own_flag(tmp_path, capsys, flag, own):
+    assert benchmark.main(["learn", flag, "5", "--out", str(tmp_path / "out")]) == 2
+    assert f"{flag} is what {own} says here" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
+
+
+def test_the_median_of_two_runs_is_between_them():
+    curves = [Curve("walker-walk", seed, [Point(frames, 1.0, 700.0)]) for seed, frames in enumerate((20_000, 60_000))]
+    assert compare("walker-walk", curves, [600])["latentplan"]["frames_to"] == {"600": 40_000}
+    late = [curves[0], Curve("walker-walk", 1, [Point(60_000, 1.0, 0.0)])]
+    assert compare("walker-walk", late, [600])["latentplan"]["frames_to"] == {"600": None}
+
+
+@pytest.mark.parametrize(
+    ("name", "text"), [("final.json", "{"), ("final.json", "[]"), ("metrics.csv", ""), ("metrics.csv", None)]
+)
+def test_results_that_are_damaged_are_named(tmp_path, name, text):
+    (tmp_path / "metrics.csv").write_text("env_frames,minutes,planner_return,actor_return\n80,4.0,1,2\n")
+    (tmp_path / name).unlink(missing_ok=True)
+    if text is not None:
+        (tmp_path / name).write_text(text)
+    with pytest.raises(UserError, match="the results in"):
+        read_run("walker-walk", 0, tmp_path, "planner")
+
+
+def test_an_interval_of_few_runs_holds_the_truth_as_often_as_it_says():
+    rng, held = np.random.default_rng(0), 0
+    for _ in range(400):
+        low, high = interquartile_estimate([rng.normal(size=2), rng.normal(size=3)])[1:]
+        held += low <= 0.0 <= high
+    assert 0.92 < held / 400 < 1.0
+    assert interquartile_estimate([[1.0, 4.0]]) == pytest.approx(mean_estimate([1.0, 4.0]))
+    assert interquartile_estimate([[1.0]])[1:] == (None, None)

@@ -18,6 +18,7 @@ from latentplan.config.checks import (
     derive_seed,
     make_folder,
     one_of,
+    output_file,
     within,
 )
 from latentplan.config.distill import DistillConfig
@@ -42,6 +43,7 @@ __all__ = [
     "derive_seed",
     "from_dict",
     "make_folder",
+    "output_file",
     "to_dict",
 ]
 

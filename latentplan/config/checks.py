@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import tempfile
 from pathlib import Path
 from typing import Any
 
@@ -29,6 +30,25 @@ def make_folder(path: Path) -> None:
         path.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise UserError(f"cannot make the folder {path}: {error.strerror}; choose another") from None
+
+
+def output_file(path: Path, flag: str) -> Path:
+    """The path, tried before any work is spent on what goes there.
+
+    Raises:
+        UserError: It is a folder, its folder does not exist, or nothing can be written in that.
+    """
+    folder = path.parent
+    if path.is_dir():
+        raise UserError(f"{flag} {str(path)!r} is a folder; give a file in it")
+    if not folder.is_dir():
+        existing = next(parent for parent in folder.parents if parent.is_dir())
+        raise UserError(f"{flag}: there is no folder {str(folder)!r}; the nearest that exists is {str(existing)!r}")
+    try:
+        tempfile.TemporaryFile(dir=folder).close()
+    except OSError as error:
+        raise UserError(f"{flag}: cannot write in {str(folder)!r}: {error.strerror}; choose another folder") from None
+    return path
 
 
 def at_least(config: Any, **bounds: float) -> None:

@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 
 from latentplan.compose import build_config, field_names, raise_unknown
 from latentplan.config import PlannerConfig, UserError, to_dict
+from latentplan.config.planner import override_planner
 
 REFERENCE = "full"
 NAMES = (REFERENCE, "no_actor", "no_value", "cold", "horizon1", "actor", "random")
@@ -172,7 +173,7 @@ def _arm(name: str, settings: dict[str, str], base: PlannerConfig) -> Arm:
     }
     changes = known.get(name, settings)
     try:
-        planner = build_config({"planner": {**to_dict(base), **changes}}).planner
+        planner = build_config({"planner": override_planner(to_dict(base), changes)}).planner
     except UserError as error:
         raise UserError(f"arm {name!r}: {error}") from None
     return Arm(name, "planner", {field: getattr(planner, field) for field in changes})

@@ -11,17 +11,15 @@ import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any
 
-from bench.anchors import FRAMES, METHODS, published
+from bench.anchors import FRAMES, published
+from bench.learn_plot import Curve, Point, plot_runs
 from bench.options import Flags, choice, numbers, words
 from bench.report import format_table, interval, number, write_csv, write_json
 from latentplan.cli import parse_train
 from latentplan.compose import SECTIONS, read_config
-from latentplan.config import Config, RunConfig, UserError, to_dict
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
+from latentplan.config import Config, RunConfig, UserError, make_folder, to_dict
 
 FLAGS = {
     "--tasks": ("T,T", "domain-task each (cartpole-swingup,walker-walk)"),
@@ -36,28 +34,19 @@ FLAGS = {
     "--config": ("FILE", "as in train.py"),
 }
 SETTINGS = tuple(SECTIONS)
+OWN_FLAGS = {  # settings that these runs differ in, or are told by
+    "env.domain": "--tasks",
+    "env.task": "--tasks",
+    "run.seed": "--seeds",
+    "run.frames": "--frames",
+    "run.minutes": "--minutes",
+    "run.run_dir": "--out",
+}
 FORWARDED = ("--preset", "--device", "--config")
 FINISHED = "finished.json"
 MODES = ("planner", "actor")
 NEAR = 0.03  # of a number of frames: how far from it an evaluation may be that stands for it
 OWN = "latentplan"
-MARKERS = "sD^v<>PX*hp"  # of METHODS
-
-
-class Point(NamedTuple):
-    """One evaluation of a run."""
-
-    env_frames: float
-    minutes: float
-    total_return: float
-
-
-class Curve(NamedTuple):
-    """The evaluations of one run, in order."""
-
-    task: str
-    seed: int
-    points: list[Point]
 
 
 def run(flags: Flags) -> int:
@@ -67,11 +56,14 @@ def run(flags: Flags) -> int:
     mode = choice(flags, "--mode", "planner", MODES)
     budget = [word for name in ("--frames", "--minutes") if name in flags for word in (name, flags[name])]
     extra = [word for name, value in flags.items() if name in FORWARDED or "." in name for word in (name, value)]
+    for name, own in OWN_FLAGS.items():
+        if f"--{name}" in flags:
+            raise UserError(f"--{name} is what {own} says here; give that")
     out = Path(flags.get("--out", "runs/learn"))
     folders = {(task, seed): out / f"{task}-seed{seed}" for task in tasks for seed in seeds}
     for (task, seed), folder in folders.items():  # a mistake in any run stops before the first
         check_same(parse_train(_new_run(task, seed, folder, budget, extra)).config, folder)
-    out.mkdir(parents=True, exist_ok=True)
+    make_folder(out)
     for (task, seed), folder in folders.items():
         _train(task, seed, folder, budget, extra)
     curves = [read_run(task, seed, folder, mode) for (task, seed), folder in folders.items()]
@@ -93,18 +85,21 @@ def read_run(task: str, seed: int, folder: Path, mode: str) -> Curve:
     """The evaluations that a run recorded, and the one that ended it.
 
     Raises:
-        UserError: There are none.
+        UserError: There are none, or the files that hold them are damaged.
     """
     from latentplan.reporting.curves import read_curve
 
     column = f"{mode}_return"
-    frames, returns = read_curve(folder / "metrics.csv", "env_frames", column)
-    minutes, _ = read_curve(folder / "metrics.csv", "minutes", column)
-    points = [Point(*point) for point in zip(frames, minutes, returns, strict=True)]
-    if (folder / "final.json").exists():
-        final = json.loads((folder / "final.json").read_text())
-        points = [point for point in points if point.env_frames < final["env_frames"]]
-        points.append(Point(final["env_frames"], final["minutes"], final[mode]))
+    try:
+        frames, returns = read_curve(folder / "metrics.csv", "env_frames", column)
+        minutes, _ = read_curve(folder / "metrics.csv", "minutes", column)
+        points = [Point(*point) for point in zip(frames, minutes, returns, strict=True)]
+        if (folder / "final.json").exists():
+            final = json.loads((folder / "final.json").read_text())
+            points = [point for point in points if point.env_frames < final["env_frames"]]
+            points.append(Point(final["env_frames"], final["minutes"], final[mode]))
+    except (OSError, ValueError, TypeError, KeyError) as error:
+        raise UserError(f"the results in {folder} cannot be read: {error}") from None
     if not points:
         raise UserError(f"{folder} holds no evaluation; lower --evaluation.every_frames or train longer")
     return Curve(task, seed, points)
@@ -120,12 +115,15 @@ def check_same(config: Config, folder: Path) -> None:
         return
     asked, begun = (_settings(each) for each in (config, read_config(folder / "config.yaml")))
     for name, value in asked.items():
-        if value is not None and begun[name] != value:
+        if begun[name] != value:
             raise UserError(f"{folder} was begun with --{name} {begun[name]}, not {value}: choose another --out")
 
 
 def _settings(config: Config) -> dict[str, Any]:
-    sections = to_dict(replace(config, run=RunConfig(seed=config.run.seed)))
+    from latentplan.envs import default_task
+
+    env = replace(config.env, task=config.env.task or default_task(config.env.domain))
+    sections = to_dict(replace(config, env=env, run=RunConfig(seed=config.run.seed)))
     return {f"{section}.{name}": value for section, fields in sections.items() for name, value in fields.items()}
 
 
@@ -221,39 +219,6 @@ def anchor_table(task: str, rows: Mapping[str, Mapping[str, Any]], thresholds: S
     return format_table([task, *columns], table)
 
 
-def plot_runs(curves: Sequence[Curve], mode: str, png: Path) -> None:
-    """Evaluation return against frames: a panel per task, two in a row, and a line per seed."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-    from matplotlib.ticker import EngFormatter
-
-    tasks = list(dict.fromkeys(curve.task for curve in curves))
-    rows, columns = (len(tasks) + 1) // 2, min(2, len(tasks))
-    figure = Figure(figsize=(6.5 * columns, 4 * rows), layout="constrained")
-    FigureCanvasAgg(figure)
-    for place, task in enumerate(tasks, start=1):
-        axes = figure.add_subplot(rows, columns, place)
-        for curve in (curve for curve in curves if curve.task == task):
-            frames, _, returns = zip(*curve.points, strict=True)
-            axes.plot(frames, returns, marker="o", markersize=3, label=f"seed {curve.seed}")
-        _mark_published(axes, task, axes.get_xlim()[1])
-        axes.set(title=task, xlabel="environment frames", ylabel=f"evaluation return, {mode}")
-        axes.set_ylim(bottom=min(0.0, axes.get_ylim()[0]))
-        axes.xaxis.set_major_formatter(EngFormatter(sep=""))
-        axes.grid(alpha=0.25)
-        axes.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), frameon=False, fontsize="small")
-    figure.savefig(png, dpi=120, format="png")
-
-
-def _mark_published(axes: Axes, task: str, last: float) -> None:
-    """What methods are known to earn at the frames that a panel shows."""
-    for method, known in published(task).items():
-        marker = MARKERS[METHODS.index(method)]
-        shown = {frames: value for frames, value in known.items() if frames <= last}
-        if shown:
-            axes.plot(*zip(*shown.items(), strict=True), marker, color="0.45", markersize=5, label=method)
-
-
 def _nearest(curve: Curve, frames: int) -> Point | None:
     """The evaluation nearest to so many frames; None where all are too far off."""
     point = min(curve.points, key=lambda point: abs(point.env_frames - frames))
@@ -262,14 +227,14 @@ def _nearest(curve: Curve, frames: int) -> Point | None:
 
 def _median_frames(curves: Sequence[Curve], threshold: int) -> float | None:
     reached = [point.env_frames if (point := first_reaching(curve, threshold)) else math.inf for curve in curves]
-    middle = statistics.median_high(reached)
+    middle = statistics.median(reached)
     return None if math.isinf(middle) else middle
 
 
 def _train(task: str, seed: int, folder: Path, budget: list[str], extra: list[str]) -> None:
     """Run `train.py` in its own process, unless the folder holds the finished run already."""
     marker = folder / FINISHED
-    if marker.exists() and json.loads(marker.read_text())["budget"] == budget:
+    if _finished_with(marker) == budget:
         print(f"{folder} is finished and not repeated", flush=True)
         return
     is_begun = (folder / "config.yaml").exists()
@@ -287,6 +252,15 @@ def _train(task: str, seed: int, folder: Path, budget: list[str], extra: list[st
     if code != 0:
         raise UserError(f"training {task} with seed {seed} ended with exit code {code}; see above")
     write_json(marker, {"budget": budget})
+
+
+def _finished_with(marker: Path) -> list[str] | None:
+    """The budget of a finished run; None where there is none, or nothing that can be read of it."""
+    try:
+        budget: list[str] = json.loads(marker.read_text())["budget"]
+    except (OSError, ValueError, TypeError, KeyError):
+        return None
+    return budget
 
 
 def _new_run(task: str, seed: int, folder: Path, budget: list[str], extra: list[str]) -> list[str]:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 from latentplan.cli import use_device
 from latentplan.compose import PRESETS, Layer, compose, raise_unknown
-from latentplan.config import DEVICES, Config, UserError
+from latentplan.config import DEVICES, Config, UserError, output_file
 
 if TYPE_CHECKING:
     import torch
@@ -31,6 +31,9 @@ SEARCH_FLAGS = {
     "--horizon": ("H", "model steps of each candidate (20)"),
     "--iterations": ("I", "refits of each search (5)"),
 }
+
+
+OUTPUTS = ("--json", "--csv", "--plot", "--scaling")
 
 
 def whole_number(flags: Flags, name: str, default: int, least: int = 1) -> int:
@@ -105,18 +108,17 @@ def numbers(flags: Flags, name: str, default: str) -> list[int]:
 
 
 def output_path(flags: Flags, name: str) -> Path | None:
-    """The file that a flag names, or None.
+    """The file that a flag names, or None; tried before any work is spent on it.
 
     Raises:
-        UserError: It is a folder, or its folder does not exist.
+        UserError: It cannot be written, or another flag names it too.
     """
     if name not in flags:
         return None
-    path = Path(flags[name])
-    if path.is_dir():
-        raise UserError(f"{name} {str(path)!r} is a folder; give a file in it")
-    if not path.parent.is_dir():
-        raise UserError(f"{name}: there is no folder {str(path.parent)!r}; make it first")
+    path = output_file(Path(flags[name]), name)
+    for other in OUTPUTS:
+        if other != name and other in flags and Path(flags[other]).resolve() == path.resolve():
+            raise UserError(f"{name} and {other} name the same file; give two")
     return path
 
 

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import csv
+import io
 import json
 import math
 import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
+
+from latentplan.config import UserError
 
 
 def format_table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
@@ -42,12 +45,11 @@ def write_csv(path: Path | None, rows: Sequence[Mapping[str, Any]]) -> None:
     """Replace the file whole, its columns those of the first row; without a path, nothing happens."""
     if path is None:
         return
-    partial = path.with_name(f".{path.name}.{os.getpid()}")
-    with partial.open("w", newline="") as file:
-        writer = csv.DictWriter(file, list(rows[0]))
-        writer.writeheader()
-        writer.writerows(rows)
-    partial.replace(path)
+    text = io.StringIO(newline="")
+    writer = csv.DictWriter(text, list(rows[0]))
+    writer.writeheader()
+    writer.writerows(rows)
+    _replace(path, text.getvalue())
 
 
 def _aligned(line: Sequence[str], widths: Sequence[int]) -> str:
@@ -57,5 +59,8 @@ def _aligned(line: Sequence[str], widths: Sequence[int]) -> str:
 
 def _replace(path: Path, text: str) -> None:
     partial = path.with_name(f".{path.name}.{os.getpid()}")
-    partial.write_text(text)
-    partial.replace(path)
+    try:
+        partial.write_text(text, newline="")
+        partial.replace(path)
+    except OSError as error:
+        raise UserError(f"{path} could not be written: {error}") from error

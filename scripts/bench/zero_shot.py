@@ -20,6 +20,7 @@ from bench.options import (
 from bench.report import format_table, interval, number, write_json
 from latentplan.compose import build_config, raise_unknown
 from latentplan.config import EnvConfig, UserError, to_dict
+from latentplan.config.planner import override_planner
 
 if TYPE_CHECKING:
     from latentplan.envs import SuiteEnv
@@ -102,7 +103,7 @@ def run(flags: Flags) -> int:
         if domain != info["domain"]:
             raise UserError(f"--trained {trained_for!r} controls {domain}, --checkpoint {info['domain']}")
     typed = settings_layer(flags).get("planner", {})
-    planner = build_config({"planner": {**to_dict(trained), **typed}}).planner
+    planner = build_config({"planner": override_planner(to_dict(trained), typed)}).planner
     overrides = {name: getattr(planner, name) for name in typed}
     device = str(choose_device(flags))
     from latentplan.rollout import episode_seed

@@ -1,0 +1,63 @@
+"""Learning curves, and how they are drawn."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, NamedTuple
+
+from bench.anchors import METHODS, published
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+MARKERS = "sD^v<>PX*hp"  # of METHODS
+
+
+class Point(NamedTuple):
+    """One evaluation of a run."""
+
+    env_frames: float
+    minutes: float
+    total_return: float
+
+
+class Curve(NamedTuple):
+    """The evaluations of one run, in order."""
+
+    task: str
+    seed: int
+    points: list[Point]
+
+
+def plot_runs(curves: Sequence[Curve], mode: str, png: Path) -> None:
+    """Evaluation return against frames: a panel per task, two in a row, and a line per seed."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+    from matplotlib.ticker import EngFormatter
+
+    tasks = list(dict.fromkeys(curve.task for curve in curves))
+    rows, columns = (len(tasks) + 1) // 2, min(2, len(tasks))
+    figure = Figure(figsize=(6.5 * columns, 4 * rows), layout="constrained")
+    FigureCanvasAgg(figure)
+    for place, task in enumerate(tasks, start=1):
+        axes = figure.add_subplot(rows, columns, place)
+        for curve in (curve for curve in curves if curve.task == task):
+            frames, _, returns = zip(*curve.points, strict=True)
+            axes.plot(frames, returns, marker="o", markersize=3, label=f"seed {curve.seed}")
+        _mark_published(axes, task, axes.get_xlim()[1])
+        axes.set(title=task, xlabel="environment frames", ylabel=f"evaluation return, {mode}")
+        axes.set_ylim(bottom=min(0.0, axes.get_ylim()[0]))
+        axes.xaxis.set_major_formatter(EngFormatter(sep=""))
+        axes.grid(alpha=0.25)
+        axes.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), frameon=False, fontsize="small")
+    figure.savefig(png, dpi=120, format="png")
+
+
+def _mark_published(axes: Axes, task: str, last: float) -> None:
+    """What methods are known to earn at the frames that a panel shows."""
+    for method, known in published(task).items():
+        marker = MARKERS[METHODS.index(method)]
+        shown = {frames: value for frames, value in known.items() if frames <= last}
+        if shown:
+            axes.plot(*zip(*shown.items(), strict=True), marker, color="0.45", markersize=5, label=method)
