@@ -74,6 +74,8 @@ class ModelAgent:
             self.noise.reset()
         else:
             forget = torch.tensor(mask, dtype=torch.bool, device=self.model.device)
+            if len(forget) != len(self.state.deter):
+                raise ValueError(f"got a mask of {len(forget)} for {len(self.state.deter)} environments")
             self._forget = forget if self._forget is None else self._forget | forget
 
     @torch.no_grad()

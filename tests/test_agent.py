@@ -107,6 +107,15 @@ def test_a_masked_reset_forgets_only_there(make, model, film):
         assert not torch.allclose(ours[1], kepts[1], atol=1e-3)
 
 
+@pytest.mark.parametrize("make", AGENTS)
+def test_a_mask_of_other_environments_is_refused_and_changes_nothing(make, model, film):
+    agent = make(model)
+    agent.act(film[0])
+    with pytest.raises(ValueError, match="a mask of 2 for 3"):
+        agent.reset(np.array([True, False]))
+    agent.act(film[0])
+
+
 def test_a_masked_reset_forgets_the_plan_only_there(model, film):
     agent = make_planner(model)
     agent.act(film[0])

@@ -70,6 +70,8 @@ def ablated(tmp_path, checkpoint, arms, *flags):
         (["train", "--domain", "walkr"], "'walker'"),
         (["train", "--model.deter_dim", "x"], "model.deter_dim"),
         (["train", "--json", "no/such/folder/result.json"], "no/such/folder"),
+        (["render", "--json", "/proc/result.json"], "cannot write in '/proc'"),
+        (["ablate", "--checkpoint", ".", "--json", "one.file", "--csv", "./one.file"], "name the same file"),
         (["render", "--domains", ","], "--domains"),
         (["decide", "--checkpoint", ".", "--domain", "walker"], "--domain"),
         (["ablate"], "--checkpoint"),

@@ -54,7 +54,7 @@ def test_every_goal_is_measured_with_every_player(tmp_path, checkpoint, capsys):
     # Who does not know of the goal plays the same whatever is scored.
     for player in ("actor", "random"):
         assert by_player["objective", player]["returns"] == by_player["constraint", player]["returns"]
-    assert result["planner"]["horizon"] == 2
+    assert result["planner"]["horizon"] == 2 and result["planner"]["goal_horizon"] is None  # as played
     assert "cart < 0.01 (constraint)" in capsys.readouterr().out
 
 

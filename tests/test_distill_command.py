@@ -1,6 +1,8 @@
 """The command line of distillation: one line for every mistake, and an answer at once."""
 
 import dataclasses
+import json
+import shutil
 
 import numpy as np
 import pytest
@@ -40,6 +42,15 @@ def test_the_command_distils_and_resumes(checkpoint, tmp_path, capsys):
     assert read_info(out)["distilled"]["rounds"] == 2
     printed = capsys.readouterr().out
     assert "round  1" in printed and "round  2" in printed and "95 % interval" in printed
+
+
+@pytest.mark.parametrize("config", ["x", {"planner": {"horizons": 3}}])
+def test_settings_that_cannot_be_read_are_one_line(checkpoint, tmp_path, capsys, config):
+    folder = shutil.copytree(checkpoint, tmp_path / "agent")
+    info = json.loads((folder / "info.json").read_text())
+    (folder / "info.json").write_text(json.dumps({**info, "config": config}))
+    assert distill.main(["--checkpoint", str(folder), "--out", str(tmp_path / "out"), "--planner.horizon", "3"]) == 2
+    assert "has settings of another version" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

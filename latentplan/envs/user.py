@@ -62,6 +62,8 @@ class PixelEnv(gymnasium.Env[np.ndarray, np.ndarray]):
 
     def __init__(self, env: gymnasium.Env[Any, Any], action_repeat: int, seed: int | None = None) -> None:
         """Check the spaces; see `wrap_user_env`."""
+        if action_repeat < 1:
+            raise UserError(f"action_repeat must be at least 1, got {action_repeat}")
         _check_observations(env.observation_space)
         self._inner_actions = _checked_actions(env.action_space)
         self._env = env
@@ -93,9 +95,12 @@ class PixelEnv(gymnasium.Env[np.ndarray, np.ndarray]):
 
         Raises:
             ResetNeeded: The episode is over.
+            ValueError: The action has another shape, or is not finite.
         """
         if self._needs_reset:
             raise ResetNeeded("the episode is over; call reset() first")
+        if np.shape(action) != self.action_space.shape or not np.isfinite(action).all():
+            raise ValueError(f"the action must be {self.action_space.shape} finite numbers, got {action!r}")
         low, high = (bound.astype(np.float64) for bound in (self._inner_actions.low, self._inner_actions.high))
         scaled = low + (np.clip(action, -1.0, 1.0) + 1.0) * 0.5 * (high - low)
         scaled = scaled.clip(low, high).astype(self._inner_actions.dtype)

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import contextlib
+import json
 import math
+import shutil
 import signal
 import time
 from collections.abc import Callable, Iterator
@@ -26,6 +28,7 @@ from latentplan.training.state import INTERRUPTED
 
 GOALS_FILE = "goals.pt"
 SAVE_SECONDS = 300.0
+PLAYED = "played.json"  # beside a replay: by which agent, and how
 
 
 def learn_goals(
@@ -93,13 +96,16 @@ def load_replay(path: Path, model: WorldModel) -> Replay:
 
 
 def _begin(
-    agent: Path, folder: Path, model: WorldModel, config: Config, settings: GoalsConfig, line: StatusLine
+    agent: Path, sha256: str, folder: Path, model: WorldModel, config: Config, settings: GoalsConfig, line: StatusLine
 ) -> Replay:
-    """What the agent has seen: the replay of its run, or what it saw when it played."""
-    played = folder / "replay"
-    for path in (agent / "resume" / "replay", played):
-        if (path / "rows.pt").exists():
-            return load_replay(path, model)
+    """What the agent has seen: the replay of its run, or what it saw when it played, which a folder keeps."""
+    collected, played, note = agent / "resume" / "replay", folder / "replay", folder / "replay" / PLAYED
+    if (collected / "rows.pt").exists():
+        return load_replay(collected, model)
+    by_whom = {"sha256": sha256, "seed": settings.seed, "play_decisions": settings.play_decisions}
+    if (folder / GOALS_FILE).exists() or (note.exists() and note.read_text() == json.dumps(by_whom)):
+        line.print(f"what was played before is in {played}")
+        return load_replay(played, model)
     if config.env.domain == USER_DOMAIN:
         raise UserError(f"{agent} has no replay, and its environment is your own: give the folder of its run")
     line.print(f"no replay in {agent}: playing {settings.play_decisions:,} decisions to begin from")
@@ -108,7 +114,9 @@ def _begin(
         line.update(f"played {done:,} of {settings.play_decisions:,} decisions")
 
     replay = play(config, model, settings.play_decisions, settings.seed, report)
+    shutil.rmtree(played, ignore_errors=True)
     replay.save(played)
+    note.write_text(json.dumps(by_whom))
     return replay
 
 
@@ -120,7 +128,7 @@ def _learn(run: Path, folder: Path, settings: GoalsConfig, device: str, saved: d
     model.requires_grad_(False)
     line = StatusLine()
     try:
-        replay = _begin(run, folder, model, config, settings, line)
+        replay = _begin(run, info["sha256"], folder, model, config, settings, line)
     except KeyboardInterrupt:
         line.print("stopped before there was anything to learn from: nothing is kept")
         return Result(folder, INTERRUPTED, {})

@@ -98,6 +98,19 @@ def test_extreme_actions_lie_within_the_users_bounds():
         assert space.contains(clock.actions[0])
 
 
+@pytest.mark.parametrize("action", [np.zeros(1), np.zeros((1, 2)), np.array([0.0, np.nan]), 0.5])
+def test_actions_of_another_shape_or_without_numbers_are_refused(action):
+    env = wrap_user_env(Clock())
+    env.reset()
+    with pytest.raises(ValueError, match="finite numbers"):
+        env.step(action)
+
+
+def test_an_action_is_held_for_at_least_one_step():
+    with pytest.raises(UserError, match="action_repeat must be at least 1"):
+        wrap_user_env(Clock(), 0)
+
+
 def test_the_factory_builder_seeds_the_first_reset_only():
     build = make_from(Clock)
     starts = [build(EnvConfig(), 5).reset()[1]["start"] for _ in range(2)]

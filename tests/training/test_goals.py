@@ -227,6 +227,25 @@ def test_an_agent_without_a_replay_plays_first(tiny, tmp_path):
     assert read_info(resumed.run_dir)["goals"]["updates"] == 2
 
 
+def test_what_another_agent_played_is_not_learned_from(tiny, tmp_path, capsys):
+    config = tiny("", env={"domain": "cartpole", "task": "swingup", "action_repeat": 50, "render_quality": "fastest"})
+    labels = {quantity.name: quantity.scale for quantity in QUANTITIES["cartpole"]}
+    settings = GoalsConfig(**vars(SETTINGS) | {"updates": 1, "play_decisions": 300})
+
+    def begin(agent):
+        torch.manual_seed(agent)
+        place = tmp_path / f"agent{agent}"
+        save_checkpoint(place, WorldModel(config.model, 1, labels), config, INFO | {"domain": "cartpole"})
+        learn_goals(place, tmp_path / "out", settings)
+        for name in ("info.json", GOALS_FILE):  # as if the machine had gone away before the first save
+            (tmp_path / "out" / name).unlink()
+        return "playing 300 decisions" in capsys.readouterr().out, (tmp_path / "out" / "replay/rows.pt").read_bytes()
+
+    first, again, other = begin(0), begin(0), begin(1)
+    assert first[0] and not again[0] and other[0]
+    assert first[1] == again[1] != other[1]
+
+
 def test_a_box_is_asked_for_in_words():
     names, inf = ("height", "speed", "upright"), math.inf
     text = describe_box(names, (-inf, 1.0, 0.2), (inf, 1.0, 0.5))
