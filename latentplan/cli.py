@@ -107,6 +107,9 @@ def run_guarded(command: Callable[[Sequence[str]], int], argv: Sequence[str]) ->
     except UserError as error:
         print(f"error: {' '.join(str(error).split())}", file=sys.stderr)
         return 2
+    except FloatingPointError as error:
+        print(f"error: {error}: lower the learning rates, or go on from the last save", file=sys.stderr)
+        return 2
     except KeyboardInterrupt:
         return 130
     except BrokenPipeError:  # as in `train.py --help | head`: what read the output has seen enough

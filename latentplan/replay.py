@@ -7,6 +7,7 @@ row of an episode has no action. Alignment is drawn at the top of a batch: obser
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from pickle import UnpicklingError
@@ -216,7 +217,7 @@ class Replay:
         """
         if not (folder / "rows.pt").exists():
             raise UserError(f"no replay found in {folder}")
-        state = read_saved(folder / "rows.pt")
+        state = read_saved(folder / "rows.pt", keys=(*COLUMNS, "episode", "written"))
         columns = ("actions", "deter", "labels")
         saved = (len(state["episode"]), *(state[name].shape[1] for name in columns))
         own = (self.num_lanes, *(getattr(self, name).shape[1] for name in columns))
@@ -274,14 +275,22 @@ class Replay:
         raise UserError(f"{too_short}: lower --learning.sequence_length")
 
 
-def read_saved(path: Path, device: torch.device | str = "cpu") -> Any:
+def read_saved(path: Path, device: torch.device | str = "cpu", keys: Sequence[str] = ()) -> Any:
     """What `torch.save` wrote.
 
+    Args:
+        path: The file.
+        device: Where its tensors go.
+        keys: Of a dictionary, what it must hold.
+
     Raises:
-        UserError: The file is damaged.
+        UserError: The file is damaged, or holds something else.
     """
     try:
-        return torch.load(path, map_location=device, weights_only=True)
+        saved = torch.load(path, map_location=device, weights_only=True)
+        if keys and not (isinstance(saved, dict) and set(keys) <= set(saved)):
+            raise ValueError(f"it does not hold {', '.join(keys)}")
+        return saved
     except (OSError, RuntimeError, EOFError, KeyError, ValueError, UnpicklingError) as error:
         raise UserError(f"{path} is damaged: {str(error).splitlines()[0]}") from None
 

@@ -7,7 +7,7 @@ import pytest
 import yaml
 
 from latentplan import __version__, compose
-from latentplan.cli import OTHER_FLAGS, SHORT_FLAGS, main, parse_train, train_main
+from latentplan.cli import OTHER_FLAGS, SHORT_FLAGS, main, parse_train, run_guarded, train_main
 from latentplan.config import LATENT_DIM, Config, UserError
 
 SETTINGS = [f"--{section}.{name}" for section in compose.SECTIONS for name in compose.field_names(section)]
@@ -288,3 +288,12 @@ def assert_one_line(argv, expected, capsys):
 def test_dumped_yaml_is_plain(tmp_path):
     compose.dump_config(Config(), tmp_path / "config.yaml")
     assert list(yaml.safe_load((tmp_path / "config.yaml").read_text())) == list(compose.SECTIONS)
+
+
+def test_what_diverges_ends_in_one_line(capsys):
+    def diverge(argv):
+        raise FloatingPointError("the gradient is not finite at update 1 (loss inf)")
+
+    assert run_guarded(diverge, []) == 2
+    said = capsys.readouterr().err
+    assert said.startswith("error: the gradient is not finite at update 1") and said.count("\n") == 1

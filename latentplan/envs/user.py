@@ -17,6 +17,9 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
 
+LONGEST = 1000  # decisions of an episode without a time limit, as many as the suite's longest
+
+
 def make_from(
     factory: Callable[[], gymnasium.Env[Any, Any]],
 ) -> Callable[[EnvConfig, int | None], PixelEnv]:
@@ -54,7 +57,8 @@ class PixelEnv(gymnasium.Env[np.ndarray, np.ndarray]):
 
     Attributes:
         action_repeat: Steps of the inner environment per decision; rewards are summed over them.
-        decisions_per_episode: Decisions until the time limit of the environment's spec or `TimeLimit`, or None.
+        decisions_per_episode: Decisions until the time limit of the environment's spec or `TimeLimit`; None without
+            one: then an episode that does not end by itself is cut after `LONGEST` decisions.
     """
 
     metadata = {"render_modes": ["rgb_array"]}
@@ -70,6 +74,7 @@ class PixelEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         self._first_seed = seed
         self._picture = np.zeros((FRAME_SIZE, FRAME_SIZE, 3), dtype=np.uint8)
         self._needs_reset = True
+        self._decisions = 0
         self.action_repeat = action_repeat
         limit = env.spec.max_episode_steps if env.spec is not None else None
         if limit is None and env.has_wrapper_attr("_max_episode_steps"):  # of a `TimeLimit` around what has no spec
@@ -87,7 +92,7 @@ class PixelEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         seed, self._first_seed = self._first_seed if seed is None else seed, None
         super().reset(seed=seed)
         picture, info = self._env.reset(seed=seed, options=options)
-        self._needs_reset = False
+        self._needs_reset, self._decisions = False, 0
         return self._frame(picture), {**info, "env_frames": 0}
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
@@ -109,6 +114,8 @@ class PixelEnv(gymnasium.Env[np.ndarray, np.ndarray]):
             picture, reward, terminated, truncated, info = self._env.step(scaled)
             total += float(reward)
             env_frames += 1
+        self._decisions += 1
+        truncated = truncated or (self.decisions_per_episode is None and self._decisions == LONGEST)
         self._needs_reset = bool(terminated or truncated)
         return self._frame(picture), total, bool(terminated), bool(truncated), {**info, "env_frames": env_frames}
 

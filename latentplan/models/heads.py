@@ -6,13 +6,16 @@ value of 500 one bfloat16 step is larger than the differences a planner has to t
 
 from __future__ import annotations
 
+import math
+
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
 MIN_ACTION_STD = 0.1
 MAX_ACTION_STD = 1.0
-SYMLOG_LIMIT = 9.0  # scalars beyond about 8,100 saturate
+SYMLOG_LIMIT = 9.0
+LARGEST_SCALAR = math.exp(SYMLOG_LIMIT) - 1.0  # about 8,100; what is beyond saturates
 
 
 class NormedLinear(nn.Module):

@@ -51,21 +51,21 @@ class Experience(lightning.Callback):
             if state.interrupted:
                 trainer.should_stop = True
                 return
+        weights = weights_of(learner.averaged)
+        if not self._asked_round and state.rounds == state.learned_rounds:  # a run that goes on has nothing to learn
+            self._ask_round(weights)
         self.take()
         if state.interrupted:
             return
-        weights = weights_of(learner.averaged)
-        behaviour, noisy, goal = turn(settings, state.rounds, state.env_frames)
-        decisions = min(settings.round_decisions, self._decisions_left())
-        if decisions > 0:
-            self.worker.submit("collect", weights, behaviour, decisions, state.rounds, noisy, goal)
-            self._asked_round = True
+        self._ask_round(weights)
         if self._asked_round and state.env_frames >= state.next_evaluation:
             self._ask_evaluation(learner.updates, weights)
 
     def on_train_epoch_end(self, trainer: lightning.Trainer, learner: Learner) -> None:  # type: ignore[override]
         """Bring the behaviour up to date before anything else looks at the learner."""
         learner.catch_up()
+        if not self.state.interrupted:
+            self.state.learned_rounds = self.state.rounds
 
     def take(self) -> None:
         """Wait for what was asked for, if anything was.
@@ -92,6 +92,15 @@ class Experience(lightning.Callback):
             every = self.config.evaluation.every_frames
             self.state.next_evaluation = (entry["env_frames"] // every + 1) * every
             self._asked_evaluation = None
+
+    def _ask_round(self, weights: dict[str, np.ndarray]) -> None:
+        """Ask for the next round, if the budget has one."""
+        settings, state = self.config.collection, self.state
+        decisions = min(settings.round_decisions, self._decisions_left())
+        if decisions > 0:
+            behaviour, noisy, goal = turn(settings, state.rounds, state.env_frames)
+            self.worker.submit("collect", weights, behaviour, decisions, state.rounds, noisy, goal)
+            self._asked_round = True
 
     def _decisions_left(self) -> int:
         frames = self.config.run.frames

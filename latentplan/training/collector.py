@@ -14,13 +14,14 @@ import numpy as np
 import torch
 
 from latentplan.agent import ActorAgent, ModelAgent, PlanningAgent, RandomAgent
-from latentplan.config import Config, UserError, derive_seed
+from latentplan.config import Config, derive_seed
 from latentplan.envs import make_env, make_from, make_vector_env, render_info
 from latentplan.models import WorldModel
 from latentplan.models.symmetry import unturned
 from latentplan.replay import Rows
 from latentplan.reporting.film import filming
 from latentplan.rollout import episode_seed, run_episodes
+from latentplan.training.rewards import RewardCheck
 
 TIMED_FRAMES = 5
 FILMED_FRAMES = 250
@@ -111,6 +112,7 @@ class Collector:
         self._labels = np.zeros((config.env.num_envs, len(self.labels)), np.float32)
         self._ended = np.ones(config.env.num_envs, dtype=bool)
         self._returns = np.zeros(config.env.num_envs)
+        self._check = RewardCheck(config.env.num_envs, discount)
         self._acting: object = None
 
     def describe(self) -> Description:
@@ -219,8 +221,7 @@ class Collector:
         if isinstance(agent, PlanningAgent) and agent.controller.objective is None:
             plan = agent.planned_action()
         self._frames, rewards, terminated, truncated, info = self.envs.step(actions)
-        if not np.isfinite(rewards).all():
-            raise UserError(f"the environment gave rewards that are not finite: {rewards.tolist()}")
+        self._check(rewards, first)
         self._ended = terminated | truncated
         self._returns += rewards
         if self.labels:

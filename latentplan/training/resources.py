@@ -51,5 +51,6 @@ def replay_capacity(config: Config, saved: Path) -> int:
         return max(UNKNOWN_LENGTH_CAPACITY, held)
     # Two rounds may run past the budget, and every episode ends with one frame without an action.
     decisions = config.run.frames / config.env.action_repeat
-    rows = int(1.05 * decisions) + 2 * config.collection.round_decisions + config.collection.prefill_decisions
-    return max(rows, held)
+    per_episode = min(config.collection.episode_decisions or 20, 20)
+    collected = 2 * config.collection.round_decisions + config.collection.prefill_decisions
+    return max(int((1.0 + 1.0 / per_episode) * decisions) + collected, held)

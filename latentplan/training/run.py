@@ -76,7 +76,7 @@ def train(config: Config, make_env: EnvFactory | None = None) -> Result:
     config = replace(config, env=replace(config.env, domain=domain, task=task or default_task(domain)))
     if config.run.run_dir is None:
         stamp = datetime.now().strftime("%Y%m%d-%H%M%S")
-        name = f"{_task_name(config)}-seed{config.run.seed}-{stamp}"
+        name = f"{config.env.domain}-{config.env.task}-seed{config.run.seed}-{stamp}"
         config = replace(config, run=replace(config.run, run_dir=str(Path("runs") / name)))
     folder = Path(str(config.run.run_dir))
     if (folder / "config.yaml").exists():
@@ -109,6 +109,8 @@ def resume(
     if not (folder / "config.yaml").exists():
         raise UserError(f"nothing to resume in {folder}: config.yaml is missing")
     config = read_config(folder / "config.yaml")
+    if config.env.task is None:  # a run has written down which
+        raise UserError(f"{folder / 'config.yaml'} is damaged: it does not say what the task is")
     if config.env.domain == USER_DOMAIN and make_env is None:
         raise UserError("this run learns in an environment of your own: resume it from Python, with make_env")
     run = config.run
@@ -197,7 +199,10 @@ class _Run:
                 save.keep_best(self.learner)
             save.save(trainer, self.learner)
         if self.state.interrupted:
-            self.console.console.print(f"stopped; to go on: python scripts/train.py --resume {self.folder}")
+            command = f"python scripts/train.py --resume {self.folder}"
+            if config.env.domain == USER_DOMAIN:
+                command = f'latentplan.training.resume("{self.folder}", make_env=...)'
+            self.console.console.print(f"stopped; to go on: {command}", soft_wrap=True)
             return Result(self.folder, INTERRUPTED, {})
         return Result(self.folder, 0, self._finish(trainer, save, videos / "final.webm"))
 
@@ -235,6 +240,7 @@ class _Run:
         if summary["planner"] >= best:
             save.save_agent("best", self.learner.averaged, info)
         self.state.best_return = max(best, summary["planner"])
+        self.state.stand(clocks["minutes"])
         save.save_run(trainer, self.learner)
         self.console.console.print(f"run folder: {self.folder}")
         return summary
@@ -251,21 +257,25 @@ class _Run:
         folder = self.folder / "checkpoints" / "best"
         if not (folder / "info.json").exists():
             return float("-inf")
-        model, _, info = load_model(folder, str(self.device))
+        try:
+            model, _, info = load_model(folder, str(self.device))
+        except UserError as error:
+            self.console.console.print(f"warning: the best agent so far is lost: {error}", soft_wrap=True)
+            return float("-inf")
         self.console.console.print(f"the same starts for the best agent so far, of {info['env_frames']:,} frames")
         earned = float(np.mean(self._judge(model, actor=False)["planner"]))
         self.console.console.print(f"its planner earned {earned:.1f}; checkpoints/best is the better of the two")
         return earned
 
     def _announce(self) -> None:
-        config, description, run = self.config, self.description, self.config.run
+        config, description, run, env = self.config, self.description, self.config.run, self.config.env
         parameters = sum(parameter.numel() for parameter in self.learner.model.parameters())
         budget = [f"{run.frames:,} frames"] if run.frames else []
         budget += [f"{run.minutes:g} minutes"] if run.minutes else []
         renderer = ", ".join(f"{name} {value}" for name, value in description.renderer.items())
         rows = self.replay.lane_size * self.replay.num_lanes
         lines = {
-            "task": f"{_task_name(config)}, action repeat {config.env.action_repeat}{self.curriculum.note}",
+            "task": f"{env.domain}-{env.task}, action repeat {env.action_repeat}{self.curriculum.note}",
             **({} if config.env.objective is None else {"objective": config.env.objective}),
             "device": f"{self.device}, {torch.get_num_threads()} threads",
             "renderer": f"{renderer}; {description.render_ms:.1f} ms per frame, quality {config.env.render_quality}",
@@ -288,7 +298,3 @@ class _Run:
             "discount": self.description.discount,
             "renderer": self.description.renderer,
         }
-
-
-def _task_name(config: Config) -> str:
-    return f"{config.env.domain}-{config.env.task}"

@@ -27,6 +27,7 @@ class RunState:
         env_frames: Simulator control steps so far.
         decisions: Decisions so far.
         rounds: Collections so far.
+        learned_rounds: How many of them there were when an epoch last ended; -1 before the first.
         earlier_minutes: Wall clock spent before this process took over.
         next_evaluation: Value of `env_frames` at which the next evaluation is due.
         best_return: Best mean return of the planner so far.
@@ -38,6 +39,7 @@ class RunState:
     env_frames: int = 0
     decisions: int = 0
     rounds: int = 0
+    learned_rounds: int = -1
     earlier_minutes: float = 0.0
     next_evaluation: int = 0
     best_return: float = float("-inf")
@@ -50,6 +52,10 @@ class RunState:
     def minutes(self) -> float:
         """Wall clock of the run, over all its processes."""
         return self.earlier_minutes + (time.monotonic() - self.started) / 60.0
+
+    def stand(self, minutes: float) -> None:
+        """Set the wall clock: what was done since is not part of the run."""
+        self.earlier_minutes, self.started = minutes, time.monotonic()
 
     def to_dict(self) -> dict[str, Any]:
         """What is saved: everything but this process's own clock and interruption."""
@@ -73,8 +79,11 @@ def load_state(folder: Path, device: torch.device) -> tuple[RunState, dict[str, 
     """
     if not (folder / STATE_FILE).exists():
         raise UserError(f"nothing to resume in {folder.parent}: {folder / STATE_FILE} is missing")
-    saved = read_saved(folder / STATE_FILE, device)
-    return RunState(**saved["run"]), saved["learner"], saved["optimizers"]
+    saved = read_saved(folder / STATE_FILE, device, ("run", "learner", "optimizers"))
+    try:
+        return RunState(**saved["run"]), saved["learner"], saved["optimizers"]
+    except TypeError as error:
+        raise UserError(f"{folder / STATE_FILE} is damaged: {error}") from None
 
 
 def restore(learner: Learner, saved: dict[str, Any], folder: Path) -> None:

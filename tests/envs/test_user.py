@@ -7,7 +7,7 @@ from gymnasium.spaces import Box, Dict, Discrete
 from gymnasium.wrappers import TimeLimit
 
 from latentplan.config import USER_DOMAIN, EnvConfig, UserError
-from latentplan.envs import make_env, make_from, wrap_user_env
+from latentplan.envs import make_env, make_from, user, wrap_user_env
 
 IMAGE = Box(0, 255, (48, 96, 3), np.uint8)
 ACTIONS = Box(np.array([0.0, -4.0], np.float32), np.array([2.0, 4.0], np.float32))
@@ -79,6 +79,18 @@ def test_a_time_limit_gives_the_decisions_per_episode():
 
 def test_a_time_limit_around_an_environment_without_a_spec_counts_too():
     assert wrap_user_env(TimeLimit(Clock(), 10), action_repeat=4).decisions_per_episode == 3
+
+
+def test_without_a_limit_an_episode_is_cut(monkeypatch):
+    monkeypatch.setattr(user, "LONGEST", 5)
+    env = wrap_user_env(Clock())
+    for _ in range(2):
+        env.reset()
+        ends = [env.step(np.zeros(2))[2:4] for _ in range(5)]
+        assert ends == [(False, False)] * 4 + [(False, True)]
+    limited = wrap_user_env(TimeLimit(Clock(), 6))
+    limited.reset()
+    assert [limited.step(np.zeros(2))[3] for _ in range(6)] == [False] * 5 + [True]
 
 
 def test_films_keep_the_pace_of_the_environment():

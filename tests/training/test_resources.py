@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import pytest
 
-from latentplan.config import Config, ReplayConfig, RunConfig
+from latentplan.config import CollectionConfig, Config, EnvConfig, ReplayConfig, RunConfig
 from latentplan.replay import FRAME_BYTES
 from latentplan.training.resources import replay_capacity
 
@@ -18,3 +18,9 @@ def test_what_is_saved_of_a_replay_stays_whatever_the_budget_is_now(budget, tmp_
             file.truncate(rows * FRAME_BYTES)  # sparse: takes no room
     assert fresh < replay_capacity(config, tmp_path) == 600_000
     assert replay_capacity(replace(config, replay=ReplayConfig(capacity=5)), tmp_path) == 5
+
+
+def test_short_episodes_fit_whole_into_replay(tmp_path):
+    collection = CollectionConfig(episode_decisions=16)
+    config = Config(run=RunConfig(frames=100_000), env=EnvConfig(action_repeat=1), collection=collection)
+    assert replay_capacity(config, tmp_path) >= 100_000 * 17 / 16

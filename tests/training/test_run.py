@@ -4,6 +4,7 @@ import shutil
 
 import numpy as np
 import pytest
+import torch
 
 from latentplan.checkpoint import load_agent, read_info
 from latentplan.config import UserError
@@ -103,6 +104,9 @@ def test_an_empty_folder_cannot_be_resumed(tmp_path):
         ("resume/state.pt", "state.pt is damaged"),
         ("resume/replay/rows.pt", "rows.pt is damaged"),
         ("latent_dim", "does not fit the settings in its config.yaml"),
+        ("foreign resume/state.pt", "state.pt is damaged"),
+        ("foreign resume/replay/rows.pt", "rows.pt is damaged"),
+        ("empty", "does not say what the task is"),
     ],
 )
 def test_what_is_damaged_is_said_in_one_line(damage, said, finished, dot, tmp_path):
@@ -110,6 +114,10 @@ def test_what_is_damaged_is_said_in_one_line(damage, said, finished, dot, tmp_pa
     if damage == "latent_dim":
         text = (folder / "config.yaml").read_text()
         (folder / "config.yaml").write_text(text.replace("latent_dim: 32", "latent_dim: 16"))
+    elif damage == "empty":
+        (folder / "config.yaml").write_text("")
+    elif damage.startswith("foreign"):
+        torch.save({"run": {}}, folder / damage.split()[1])
     else:
         (folder / damage).write_bytes((folder / damage).read_bytes()[:-200])
     with pytest.raises(UserError, match=said) as caught:
