@@ -108,7 +108,7 @@ def run_guarded(command: Callable[[Sequence[str]], int], argv: Sequence[str]) ->
         print(f"error: {' '.join(str(error).split())}", file=sys.stderr)
         return 2
     except FloatingPointError as error:
-        print(f"error: {error}: lower the learning rates, or go on from the last save", file=sys.stderr)
+        print(f"error: {' '.join(str(error).split())}", file=sys.stderr)
         return 2
     except KeyboardInterrupt:
         return 130

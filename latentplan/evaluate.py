@@ -178,8 +178,9 @@ def _report(request: EvaluationRequest, result: dict[str, Any]) -> None:
     print(f"decision ms  {latency}", flush=True)
     failed = result["action_source"]["tail"] + result["action_source"]["actor"]
     if failed and request.mode == "planner":
-        has_deadline = result["planner"]["deadline_ms"] is not None
-        why = "there was no time for a search" if has_deadline else "the search found nothing finite"
+        why = "the search found nothing finite"
+        if result["planner"]["deadline_ms"] is not None:
+            why = f"there was no time for a search, or {why}"
         print(f"warning: at {failed} decisions {why}", file=sys.stderr, flush=True)
     if result["control_hz"] is not None:
         sources = "   ".join(f"{name} {count}" for name, count in result["action_source"].items())

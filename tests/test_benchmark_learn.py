@@ -120,4 +120,4 @@ def test_an_interval_of_few_runs_holds_the_truth_as_often_as_it_says():
         held += low <= 0.0 <= high
     assert 0.92 < held / 400 < 1.0
     assert interquartile_estimate([[1.0, 4.0]]) == pytest.approx(mean_estimate([1.0, 4.0]))
-    assert interquartile_estimate([[1.0]])[1:] == (None, None)
+    assert interquartile_estimate([[1.0]])[1:] == interquartile_estimate([[1.0, 2.0], [3.0]])[1:] == (None, None)

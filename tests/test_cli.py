@@ -292,7 +292,7 @@ def test_dumped_yaml_is_plain(tmp_path):
 
 def test_what_diverges_ends_in_one_line(capsys):
     def diverge(argv):
-        raise FloatingPointError("the gradient is not finite at update 1 (loss inf)")
+        raise FloatingPointError("the gradient is not finite\nat update 1 (loss inf)")
 
     assert run_guarded(diverge, []) == 2
     said = capsys.readouterr().err

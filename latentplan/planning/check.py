@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from numbers import Integral
 from typing import Any
 
 import torch
@@ -65,7 +66,7 @@ def _problems(model: Any, state: State, actions: Tensor, tolerance: float) -> It
         yield "it has no step(state, action)"
         return
     particles = getattr(model, "num_particles", 1)
-    if not isinstance(particles, int) or particles < 1:
+    if isinstance(particles, bool) or not isinstance(particles, Integral) or particles < 1:
         yield f"num_particles must be a whole number, at least 1, got {particles!r}"
     problems, following = _tried(model, "step", (state, actions))
     yield from problems
@@ -90,14 +91,20 @@ def _problems(model: Any, state: State, actions: Tensor, tolerance: float) -> It
 def _tried(model: Any, name: str, inputs: Inputs) -> tuple[list[str], Any]:
     """What is wrong with a method's answer, and the answer; None where it cannot be gone on with."""
     given = _ARGUMENTS[name](*inputs)
+    return _called(model, name, given, lambda answer: _answer_problems(name, answer, inputs))
+
+
+def _called(
+    model: Any, name: str, given: tuple[Any, ...], judge: Callable[[Any], Iterator[str]]
+) -> tuple[list[str], Any]:
     copies = tree_map(lambda leaf: leaf.clone() if isinstance(leaf, Tensor) else leaf, given)
     try:
         answer = getattr(model, name)(*copies)
-        problems = list(_answer_problems(name, answer, inputs))
+        problems = list(judge(answer))
     except Exception as error:
         return [f"{name}() raises {type(error).__name__}: {error}"], None
     pairs = zip(tree_leaves(given), tree_leaves(copies), strict=True)
-    if any(isinstance(before, Tensor) and not torch.equal(before, after) for before, after in pairs):
+    if any(isinstance(before, Tensor) and not _is_same(before, after) for before, after in pairs):
         problems.append(f"{name}() changes what it is given; it has to return new tensors")
     return problems, answer
 
@@ -114,8 +121,12 @@ def _answer_problems(name: str, answer: Any, inputs: Inputs) -> Iterator[str]:
         yield from _vector_problems(f"{name}()'s reward" + "s" * (name == "rollout"), rewards, shape)
         yield from _state_problems(name, state, last)
     elif name == "particles":
-        if count_rows(answer) != _NUM * rows:
+        if tree_structure(answer) != tree_structure(state):
+            yield "particles() returns a state of another structure than it was given"
+        elif count_rows(answer) != _NUM * rows:
             yield f"particles() must return {_NUM * rows} rows for {rows} states and {_NUM} particles"
+        elif not all(_is_finite(leaf) for leaf in tree_leaves(answer)):
+            yield "particles() returns NaN or infinity"
     else:
         shapes = {"policy": actions[:, 0].shape, "propose": (_NUM * rows, *actions.shape[1:])}
         title = "policy()'s mode" if name == "policy" else f"{name}()"
@@ -139,7 +150,10 @@ def _row_problems(model: Any, name: str, inputs: Inputs, together: Any, toleranc
     if not _agree(together, getattr(model, name)(*_ARGUMENTS[name](*inputs)), tolerance):
         return  # a method that samples: which row gets which draw is the model's own business
     state, actions = inputs
-    alone = getattr(model, name)(*_ARGUMENTS[name](tree_map(lambda leaf: leaf[:1], state), actions[:1]))
+    problems, alone = _tried(model, name, (tree_map(lambda leaf: leaf[:1], state), actions[:1]))
+    if problems:
+        yield from (f"of one row alone, {problem}" for problem in problems)
+        return
     first = tree_map(lambda leaf: leaf[: _PER_ROW.get(name, 1)], together)
     if not _agree(first, alone, tolerance if name == "step" else 10 * tolerance):
         order = ", or rows are not batch-major" if name in _PER_ROW else ""
@@ -148,12 +162,10 @@ def _row_problems(model: Any, name: str, inputs: Inputs, together: Any, toleranc
 
 def _sample_problems(model: Any, inputs: Inputs) -> Iterator[str]:
     state, actions = inputs
-    try:
-        sample = model.policy(state, _generators(actions)[0])
-    except Exception as error:
-        yield f"policy() with a generator raises {type(error).__name__}: {error}"
-    else:
-        yield from _vector_problems("policy()'s sample", sample, tuple(actions[:, 0].shape))
+    shape = tuple(actions[:, 0].shape)
+    given = (state, _generators(actions)[0])
+    problems, _ = _called(model, "policy", given, lambda sample: _vector_problems("policy()'s sample", sample, shape))
+    yield from problems
 
 
 def _disagreements(model: Any, inputs: Inputs, tolerance: float) -> Iterator[str]:
@@ -184,6 +196,11 @@ def _vector_problems(name: str, tensor: Any, shape: tuple[int, ...]) -> Iterator
 
 def _generators(actions: Tensor) -> list[torch.Generator]:
     return [torch.Generator(actions.device).manual_seed(row) for row in range(len(actions))]
+
+
+def _is_same(before: Tensor, after: Tensor) -> bool:
+    """Whether nothing was changed; NaN stays NaN."""
+    return before.shape == after.shape and bool(((before == after) | ((before != before) & (after != after))).all())
 
 
 def _is_finite(tensor: Tensor) -> bool:

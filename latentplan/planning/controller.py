@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import time
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import torch
@@ -98,7 +99,7 @@ class ModelPredictiveController:
         generator = _streams_of(self.generator, where) or self.generator
         try:
             action = self._act(tree_map(lambda leaf: leaf[rows.to(leaf.device)], state), generator)
-        except Exception:
+        except BaseException:
             self.plan, self._is_stale = before
             raise
         assert self.plan is not None
@@ -135,11 +136,8 @@ class ModelPredictiveController:
             if bool(is_due.all()):
                 self.plan = self._search(state, self.plan, generator)
             elif bool(is_due.any()):
-                waiting = _streams_of(generator, ~is_due)  # whose plans go on: nothing is drawn for them
-                states = [stream.get_state() for stream in waiting]
-                self.plan = self.plan.updated(is_due, self._search(state, self.plan, generator))
-                for stream, kept in zip(waiting, states, strict=True):
-                    stream.set_state(kept)
+                with _kept(_streams_of(generator, ~is_due), _streams_of(generator, is_due)):
+                    self.plan = self.plan.updated(is_due, self._search(state, self.plan, generator))
         self._is_stale = None
         action = self.plan.actions[torch.arange(len(is_due)), self.plan.elapsed]
         self.plan = self.plan.executed(self.plan.elapsed + 1)
@@ -203,6 +201,17 @@ class ModelPredictiveController:
             generator=generator,
         )
         return plan.executed(torch.zeros_like(plan.elapsed))
+
+
+@contextlib.contextmanager
+def _kept(waiting: list[torch.Generator], due: list[torch.Generator]) -> Iterator[None]:
+    """Leaves the streams of environments whose plans go on where they were, but for those that due ones share."""
+    states = [(stream, stream.get_state()) for stream in waiting if all(stream is not other for other in due)]
+    try:
+        yield
+    finally:
+        for stream, state in states:
+            stream.set_state(state)
 
 
 def _streams_of(generators: Generators, where: Tensor) -> list[torch.Generator]:

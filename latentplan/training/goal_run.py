@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import json
 import math
-import shutil
 import signal
 import time
 from collections.abc import Callable, Iterator
@@ -74,7 +73,7 @@ def resume_goals(
     if not path.exists():
         raise UserError(f"nothing to resume in {folder}: {path} is missing")
     with claim(Path(folder)):
-        saved = read_saved(path)
+        saved = read_saved(path, keys=("run", "source", "sha256", "settings", "minutes", "learner"))
         if read_info(saved["source"])["sha256"] != saved["sha256"]:
             raise UserError(f"{saved['source']} is not the agent that {folder} began with")
         settings = GoalsConfig(**saved["settings"])
@@ -88,7 +87,7 @@ def load_replay(path: Path, model: WorldModel) -> Replay:
     Raises:
         UserError: It is damaged, or of another kind of agent.
     """
-    num_lanes, lane_size = read_saved(path / "rows.pt")["episode"].shape
+    num_lanes, lane_size = read_saved(path / "rows.pt", keys=("episode",))["episode"].shape
     sizes = (model.action_dim, model.config.deter_dim, num_lanes, torch.device("cpu"), len(model.labels))
     replay = Replay(num_lanes * lane_size, *sizes)
     replay.load(path)
@@ -108,13 +107,15 @@ def _begin(
         return load_replay(played, model)
     if config.env.domain == USER_DOMAIN:
         raise UserError(f"{agent} has no replay, and its environment is your own: give the folder of its run")
+    if (played / "rows.pt").exists() and not note.exists():
+        raise UserError(f"{played} holds a replay of something else: choose another --out")
     line.print(f"no replay in {agent}: playing {settings.play_decisions:,} decisions to begin from")
 
     def report(done: int) -> None:
         line.update(f"played {done:,} of {settings.play_decisions:,} decisions")
 
     replay = play(config, model, settings.play_decisions, settings.seed, report)
-    shutil.rmtree(played, ignore_errors=True)
+    note.unlink(missing_ok=True)
     replay.save(played)
     note.write_text(json.dumps(by_whom))
     return replay

@@ -24,7 +24,8 @@ def descend(optimizer: torch.optim.Optimizer, loss: Tensor, max_norm: float, upd
     """
     norm = _clipped_gradient(optimizer, loss, max_norm)
     if not torch.isfinite(norm):
-        raise FloatingPointError(f"the gradient is not finite at update {update} (loss {loss.item()})")
+        told = f"the gradient is not finite at update {update} (loss {loss.item()})"
+        raise FloatingPointError(f"{told}: lower the learning rate, or go on from the last save")
     optimizer.step()
     return norm
 

@@ -166,7 +166,7 @@ def run_table(curves: Sequence[Curve], thresholds: Sequence[int]) -> str:
 
 
 def final_estimates(curves: Sequence[Curve]) -> dict[str, dict[str, Any]]:
-    """Interquartile mean of the final returns with its bootstrap interval, by task and, of several, over all."""
+    """Interquartile mean of the final returns with its interval, by task and, of several, over all."""
     from bench.statistics import interquartile_estimate
 
     groups: dict[str, list[float]] = {}

@@ -63,4 +63,5 @@ def _replace(path: Path, text: str) -> None:
         partial.write_text(text, newline="")
         partial.replace(path)
     except OSError as error:
+        partial.unlink(missing_ok=True)
         raise UserError(f"{path} could not be written: {error}") from error

@@ -51,15 +51,14 @@ def interquartile_estimate(groups: Sequence[Sequence[float]], seed: int = 0) -> 
     truth half of the time. Theirs is as wide as Student's interval of the mean with a standard deviation per group.
 
     Args:
-        groups: Returns by task, one per seed; each resample draws anew within every group. One return says nothing of
-            how much others would differ: such groups add nothing to the width.
+        groups: Returns by task, one per seed; each resample draws anew within every group.
         seed: Of the resampling.
     """
     mean = interquartile_mean(np.concatenate([np.asarray(group, float) for group in groups]).tolist())
-    if all(len(group) == 1 for group in groups):
+    if any(len(group) == 1 for group in groups):  # which says nothing of how much others would differ
         return Estimate(mean, None, None)
     if min(len(group) for group in groups) < LEAST_RESAMPLED:
-        half = _student_half([group for group in groups if len(group) > 1], sum(map(len, groups)))
+        half = _student_half(groups)
         return Estimate(mean, mean - half, mean + half)
     rng = np.random.default_rng(seed)
     resampled = [
@@ -70,8 +69,8 @@ def interquartile_estimate(groups: Sequence[Sequence[float]], seed: int = 0) -> 
     return Estimate(mean, float(low), float(high))
 
 
-def _student_half(groups: Sequence[Sequence[float]], num: int) -> float:
-    """Half of Student's 95 % interval for the mean of `num` returns that fall into groups of their own spread."""
+def _student_half(groups: Sequence[Sequence[float]]) -> float:
+    """Half of Student's 95 % interval for the mean of returns that fall into groups of their own spread."""
     squared = sum(len(group) * float(np.var(group, ddof=1)) for group in groups)  # of the sum
     freedom = sum(len(group) - 1 for group in groups)
-    return t_quantile(freedom) * math.sqrt(squared) / num
+    return t_quantile(freedom) * math.sqrt(squared) / sum(map(len, groups))

@@ -1,5 +1,6 @@
 """`check_model` names what is wrong before the first plan does."""
 
+import numpy as np
 import pytest
 import torch
 
@@ -43,6 +44,19 @@ def test_a_good_model_passes_and_its_abilities_are_listed(point):
         ({"value": lambda state: state.nothing}, r"value\(\) raises AttributeError"),
         ({"rollout": lambda state, actions: state}, r"rollout\(\) must return \(rewards, state\)"),
         ({"num_particles": 0}, "num_particles must be a whole number"),
+        ({"num_particles": True}, "num_particles must be a whole number"),
+        ({"value": lambda state: state[:, :1].squeeze()}, r"of one row alone, value\(\) must have shape \(1,\)"),
+        (
+            {"policy": lambda state, generator: torch.zeros(4, 2)},
+            r"of one row alone, policy\(\)'s mode must have shape",
+        ),
+        ({"value": lambda state: state[:, 0] + 0 * state[1, 0]}, r"of one row alone, value\(\) raises IndexError"),
+        ({"particles": lambda state, num: state.repeat_interleave(num, 0) * torch.nan}, r"particles\(\) returns NaN"),
+        ({"particles": lambda state, num: (state.repeat_interleave(num, 0),)}, r"particles\(\) returns a state of ano"),
+        (
+            {"policy": lambda state, generator: (state if generator is None else state.mul_(2))[:, :2]},
+            "policy.* changes",
+        ),
     ],
 )
 def test_what_is_wrong_is_named(point, change, complaint):
@@ -50,6 +64,11 @@ def test_what_is_wrong_is_named(point, change, complaint):
         setattr(point, name, function)
     with pytest.raises(ValueError, match=complaint):
         check_model(point, STATE, 2)
+
+
+def test_any_whole_number_of_particles_is_one(point):
+    point.num_particles = np.int64(2)
+    check_model(point, STATE, 2)
 
 
 @pytest.mark.parametrize("state", [torch.zeros(5, 4), torch.zeros(1, 4)])

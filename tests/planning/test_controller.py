@@ -1,5 +1,7 @@
 """Receding-horizon control: what is kept between steps, and what forgets it."""
 
+import itertools
+
 import pytest
 import torch
 
@@ -210,6 +212,30 @@ def test_a_reset_elsewhere_leaves_the_random_stream_of_an_environment_alone(stat
         return torch.stack(chosen)
 
     torch.testing.assert_close(actions(resets=True), actions(resets=False))
+
+
+def test_environments_that_share_a_stream_draw_on(point, states, make_planner, seeded):
+    generator = seeded()
+    controller = ModelPredictiveController(make_planner(), point, generator=[generator] * 5, replan_every=2)
+    controller.act(states)
+    controller.reset(torch.tensor([True, False, False, False, False]))
+    drawn = []
+    for _ in range(6):
+        controller.act(states)
+        drawn.append(generator.get_state())
+    assert not any(torch.equal(before, after) for before, after in itertools.pairwise(drawn))
+
+
+def test_a_search_that_fails_draws_nothing_for_those_who_wait(point, states, make_planner, seeded):
+    generators = [seeded(row) for row in range(5)]
+    controller = ModelPredictiveController(make_planner(), point, generator=generators, replan_every=3)
+    controller.act(states)
+    controller.reset(torch.tensor([True, False, False, False, False]))
+    before = [generator.get_state() for generator in generators]
+    point.step = lambda state, action: 1 / 0
+    with pytest.raises(ZeroDivisionError):
+        controller.act(states)
+    assert all(torch.equal(kept, now.get_state()) for kept, now in zip(before[1:], generators[1:], strict=True))
 
 
 def test_what_cannot_be_decided_leaves_the_plans_as_they_are(states, point, make_planner):

@@ -242,6 +242,9 @@ def test_what_another_agent_played_is_not_learned_from(tiny, tmp_path, capsys):
         return "playing 300 decisions" in capsys.readouterr().out, (tmp_path / "out" / "replay/rows.pt").read_bytes()
 
     first, again, other = begin(0), begin(0), begin(1)
+    (tmp_path / "out" / "replay" / "played.json").unlink()  # so that it may be anything
+    with pytest.raises(UserError, match="holds a replay of something else"):
+        begin(1)
     assert first[0] and not again[0] and other[0]
     assert first[1] == again[1] != other[1]
 
