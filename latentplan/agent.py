@@ -29,8 +29,8 @@ class ModelAgent:
     Attributes:
         state: The belief, `deter` (batch, deter) and `stoch` (batch, latent); (batch, 4, ...) where it is of all turns.
         imagined: The world model as planners see it, whose states are these beliefs.
-        last_source: What the most recent action came from, "plan", "tail" (of an older plan) or "actor"; a list of
-            these where environments of a batch can differ.
+        last_source: Of the latest action, "plan", "tail" (of an older plan) or "actor"; a list where these can differ.
+        steps_ahead: Model steps from the belief to what `imagine` pictured last.
 
     Args:
         model: The world model; put into evaluation mode and never changed.
@@ -41,6 +41,7 @@ class ModelAgent:
     """
 
     last_source: str | list[str] = "actor"
+    steps_ahead: int = 0
 
     def __init__(
         self,
@@ -100,8 +101,7 @@ class ModelAgent:
     def encode(self, frame: np.ndarray) -> np.ndarray:
         """The latent of one frame seen without a past, float32 (32,), or (batch, 32) for several."""
         single = frame.ndim == 3
-        frames = self._check(frame[None] if single else frame)
-        latent = self._glance(frames).cpu().numpy()
+        latent = self._glance(self._check(frame[None] if single else frame)).cpu().numpy()
         return latent[0] if single else latent
 
     def imagine(self) -> np.ndarray | None:
@@ -114,6 +114,7 @@ class ModelAgent:
     def _picture(self, state: State, actions: Tensor) -> np.ndarray:
         """The decoded end of a plan (batch, horizon, action), uint8 (32, 32, 3), of the first environment."""
         first = State(*(part[:1] for part in unturned(state)))
+        self.steps_ahead = actions.shape[1]
         _, last = self.model.rollout(first, actions[:1].to(first.deter.dtype))
         return self.model.decoder.picture(last.features.float())[0].cpu().numpy()
 

@@ -77,7 +77,6 @@ def _evaluate(argv: Sequence[str]) -> int:
         overrides["planning_budget"] = request.planning_budget
     device = use_device(request.device, request.threads or (1 if request.mode in ON_ONE_THREAD else None))
     from latentplan.envs import make_env
-    from latentplan.goals.objective import learned_box
     from latentplan.scoring import goal_env, read_goals, score_env
 
     goals = read_goals(request.objective, request.constraint, config.env.domain)
@@ -92,13 +91,8 @@ def _evaluate(argv: Sequence[str]) -> int:
             flush=True,
         )
         played = env if goals is None else score_env(env, goals, agent if request.mode in PLANNING_MODES else None)
-        is_foreign = goals is not None and any(
-            not phase.objective.is_return and learned_box(phase.objective, getattr(agent, "model", None)) is None
-            for phase in goals.phases
-        )
-        horizon = planner.goal_horizon if is_foreign else None
         try:
-            return _play_and_report(request, played, agent, about, horizon or planner.horizon, clock)
+            return _play_and_report(request, played, agent, about, clock)
         except OSError as error:
             raise UserError(f"an output could not be written: {error}") from error
     finally:
@@ -110,7 +104,6 @@ def _play_and_report(
     env: SuiteEnv | ScoredEnv,
     agent: Any,
     about: dict[str, Any],
-    horizon: int,
     clock: VirtualClock,
 ) -> int:
     """Plays, prints, writes; an interrupt reports the episodes that were finished."""
@@ -128,7 +121,7 @@ def _play_and_report(
             from latentplan.reporting.film import filming
 
             planner = agent if request.mode in PLANNING_MODES else None
-            on_step = stack.enter_context(filming(request.video, env, planner, horizon, judge=scored))
+            on_step = stack.enter_context(filming(request.video, env, planner, judge=scored))
         try:
             for episode in iterate_timed_episodes(env, agent, seeds, clock, on_step=on_step):
                 episodes.append(episode)

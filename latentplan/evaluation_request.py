@@ -16,6 +16,7 @@ from latentplan.config import DEVICES, PlannerConfig, UserError, output_file
 if TYPE_CHECKING:
     from latentplan.latency import Latency
 
+MOST_DIGITS = 18
 PLANNING_MODES = ("planner", "gated", "background")  # who pursues an objective; the others are scored on it
 MODES = (*PLANNING_MODES, "actor", "random")
 FLAGS = {
@@ -135,7 +136,7 @@ def help_text() -> str:
 
 def _whole_number(flags: dict[str, str], name: str, default: int, least: int) -> int:
     text = flags.get(name, str(default))
-    if not text.isascii() or not text.isdigit() or int(text) < least:
+    if not text.isascii() or not text.isdigit() or len(text) > MOST_DIGITS or int(text) < least:
         raise UserError(f"{name} must be a whole number of at least {least}, got {text!r}")
     return int(text)
 

@@ -14,6 +14,7 @@ row's result.
 from __future__ import annotations
 
 import importlib.util
+import io
 import json
 from pathlib import Path
 from typing import Any
@@ -129,8 +130,9 @@ def _example(model: WorldModel) -> tuple[Tensor, ...]:
 
 def _write(program: ExportedProgram, model: WorldModel, path: Path, format: str) -> None:
     if format == "pt2":
-        with path.open("wb") as file:
-            torch.export.save(program, file, extra_files={SIZES: json.dumps(sizes(model))})
+        whole = io.BytesIO()  # a disk that is full ends the interpreter while torch writes to it
+        torch.export.save(program, whole, extra_files={SIZES: json.dumps(sizes(model))})
+        path.write_bytes(whole.getvalue())
         return
     options: dict[str, Any] = {"dynamo": True, "external_data": False, "verbose": False}
     torch.onnx.export(program, (), str(path), input_names=INPUTS, output_names=OUTPUTS, **options)

@@ -30,7 +30,8 @@ class Latency:
     Attributes:
         name: `measured`, or the file that the durations came from.
         decision_ms: Of decisions, (duration,); None charges what was measured.
-        plan_ms: Of plans that are made beside the decisions, (duration,); None charges what was measured.
+        plan_ms: Of plans that are made beside the decisions, (duration,), each counted from the frame it begins with
+            (measured ones from when the decision asks for them); None charges what was measured.
     """
 
     name: str = MEASURED
@@ -83,7 +84,7 @@ def read_latency(text: str) -> Latency:
         content = _parsed(Path(text).read_text())
     except OSError as error:
         raise UserError(f"--latency {text}: {error.strerror}; give {MEASURED!r} or a file of milliseconds") from None
-    except ValueError:
+    except (ValueError, RecursionError):
         raise UserError(f"--latency {text}: not a file of milliseconds; write {_FORMATS}") from None
     durations = content if isinstance(content, dict) else {"decision_ms": content}
     unknown = [name for name in durations if name not in ("decision_ms", "plan_ms")]

@@ -18,6 +18,7 @@ from latentplan.planning.plan import Plan
 from latentplan.rollout import Agent
 
 Result = TypeVar("Result")
+ROUNDING_MS = 1e-6  # a plan that takes whole periods is there at their end
 
 
 class VirtualClock:
@@ -132,7 +133,7 @@ class VirtualExecutor:
     def poll(self) -> tuple[int, Plan] | None:
         """The finished plan and the tick it was requested for, once; None while there is none."""
         self._follow_episode()
-        if self._pending is None or self.clock.now_ms < self._pending[2]:
+        if self._pending is None or self.clock.now_ms < self._pending[2] - ROUNDING_MS:
             return None
         (tick, plan, _), self._pending = self._pending, None
         return tick, plan

@@ -129,6 +129,22 @@ def test_boundaries_that_pass_while_an_agent_is_busy_are_missed():
     assert min(tally.decision_ms) >= 25.0
 
 
+def test_a_block_that_is_interrupted_counts_what_was_due():
+    class Interrupted:
+        count = 0
+
+        def act(self, frame):
+            self.count += 1
+            if self.count == 3:
+                raise KeyboardInterrupt
+            time.sleep(0.025)
+
+    tally = Tally()
+    with pytest.raises(KeyboardInterrupt):
+        play_block(Interrupted(), FRAMES, 100.0, 50, tally)
+    assert tally.due == 2 + tally.misses
+
+
 def test_agents_take_turns_block_by_block():
     turns = []
 

@@ -16,7 +16,7 @@ from latentplan.models import WorldModel
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "scripts"))
 
 import benchmark  # noqa: E402
-from bench.zero_shot import CONSTRAINT_PLAYERS, OBJECTIVE_PLAYERS, list_jobs  # noqa: E402
+from bench.zero_shot import CONSTRAINT_PLAYERS, OBJECTIVE_PLAYERS, PURSUERS, list_jobs  # noqa: E402
 
 ENV = EnvConfig(domain="cartpole", task="swingup", action_repeat=200, render_quality="fastest")
 MODEL = ModelConfig(deter_dim=8, hidden_dim=8, encoder_channels=(4, 4), decoder_channels=2, num_bins=5)
@@ -137,3 +137,11 @@ def test_bad_goals_are_one_line(capsys, checkpoint, flags, reason):
     assert benchmark.main(["zero-shot", "--checkpoint", str(checkpoint), *flags]) == 2
     error = capsys.readouterr().err
     assert error.startswith("error: ") and error.count("\n") == 1 and reason in error
+
+
+def test_all_who_pursue_a_goal_search_alike(checkpoint):
+    from bench.players import make_player
+
+    changes = {"horizon": 2}
+    searches = [make_player(player, str(checkpoint), "cpu", changes).controller.planner for player in PURSUERS]
+    assert {(search.horizon, search.goal_horizon) for search in searches} == {(2, None)}

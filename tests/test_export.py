@@ -1,6 +1,7 @@
 """The exported actor: the agent's own actions, from a file alone."""
 
 import json
+import sys
 
 import numpy as np
 import pytest
@@ -169,3 +170,16 @@ def test_help_needs_no_torch(run_python):
     )
     result = run_python("-c", code)
     assert result.stdout.endswith("0 False False\n") and "--checkpoint" in result.stdout, result.stderr
+
+
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="limits the size of files")
+def test_a_disk_that_is_full_is_one_line(checkpoint, run_python, tmp_path):
+    code = (
+        "import resource, sys\n"
+        "from latentplan.cli import main\n"
+        "resource.setrlimit(resource.RLIMIT_FSIZE, (1000, 1000))\n"
+        f"sys.exit(main(['export', '--checkpoint', {str(checkpoint)!r}, '--out', {str(tmp_path / 'a.pt2')!r}]))\n"
+    )
+    finished = run_python("-c", code)
+    assert finished.returncode == 2 and "error: cannot write" in finished.stderr
+    assert list(tmp_path.iterdir()) == []

@@ -66,6 +66,7 @@ def test_plans_do_not_disturb_the_draws_of_decisions(tmp_path):
         ('["5"]', "got '5'"),
         ("[true]", "got True"),
         ("five", "one number per line"),
+        ("[" * 100_000, "one number per line"),
         ('{"p50": 3}', "decision_ms"),
         ('{"decision_ms": {"p50": 3}}', "must be a list"),
         ('{"decision_ms": [1], "plan_ms": []}', "plan_ms must be a list"),

@@ -54,6 +54,17 @@ def test_a_plan_is_there_when_its_duration_has_passed():
     assert executor.is_idle and executor.poll() is None
 
 
+@pytest.mark.parametrize("control_hz", [30.0, 60.0, 70.0, 90.0, 144.0])
+def test_a_plan_of_whole_periods_is_there_at_their_end(control_hz):
+    clock = VirtualClock(control_hz, constant(0, 1000.0 / control_hz))
+    executor = executor_on(clock)
+    for tick in range(1000):
+        clock.advance(tick)
+        executor.request(STATE, tick=tick)
+        clock.advance(tick + 1)
+        assert executor.poll() is not None
+
+
 def test_a_plan_that_takes_no_time_is_there_at_once():
     for clock in (VirtualClock(50.0, constant(0, 0)), VirtualClock(None, Latency())):
         executor = executor_on(clock)

@@ -18,10 +18,13 @@ def read_goal(path: str, size: int = 64) -> NDArray[np.uint8]:
     """
     import cv2  # when there is a picture to read: agents act without it
 
-    if not Path(path).is_file():
-        reason = "is a folder" if Path(path).is_dir() else "does not exist"
-        raise UserError(f"goal image {path!r} {reason}; give a square picture such as a frame of the camera")
-    picture = cv2.imread(path, cv2.IMREAD_COLOR)
+    try:
+        if not Path(path).is_file():
+            reason = "is a folder" if Path(path).is_dir() else "does not exist"
+            raise UserError(f"goal image {path!r} {reason}; give a square picture such as a frame of the camera")
+        picture = cv2.imread(path, cv2.IMREAD_COLOR)
+    except (OSError, cv2.error) as error:  # a name or a picture beyond what can be
+        raise UserError(f"goal image {path!r} cannot be read: {' '.join(str(error).split())}") from None
     if picture is None:
         raise UserError(f"goal image {path!r} is no picture that can be read; give a .png")
     if picture.shape[0] != picture.shape[1]:

@@ -33,11 +33,11 @@ from latentplan.goals.expression import (
     combine,
     walk,
 )
-from latentplan.goals.tokens import Token, fail, tokenize
+from latentplan.goals.tokens import Token, fail, split_outside_quotes, tokenize
 
 _RELATIONS = ("<", ">", "->")
 _MAX_DEPTH = 50
-_SWITCH = re.compile(r"\s*(?P<start>[0-9]+)\s*:(?P<text>.*)", re.DOTALL)
+_SWITCH = re.compile(r"\s*(?P<start>[0-9]{1,15})\s*:(?P<text>.*)", re.DOTALL)
 
 
 def parse_schedule(text: str, scales: Mapping[str, float]) -> tuple[Phase, ...]:
@@ -51,7 +51,7 @@ def parse_schedule(text: str, scales: Mapping[str, float]) -> tuple[Phase, ...]:
         UserError: The text is no such thing; names the position and the nearest name.
     """
     phases: list[Phase] = []
-    for part in text.split(";"):
+    for part in split_outside_quotes(text, ";"):
         match = _SWITCH.fullmatch(part)
         if phases and match is None:
             raise UserError(f"{part.strip()!r} needs the env frame from which it holds, as in '; 500: speed -> 1.0'")
@@ -114,6 +114,8 @@ class _Parser:
                 factor = weight if sign == "+" else -weight
                 return self.split_sum(left, weight) + self.split_sum(right, factor)
             case Arithmetic("*", Number(value), other) | Arithmetic("*", other, Number(value)):
+                if not math.isfinite(weight * value):
+                    self._fail_at(node, "a weight beyond every number")
                 return self.split_sum(other, weight * value)
         if not isinstance(node, LearnedReturn | GoalImage):
             self._forbid_whole_terms(node)

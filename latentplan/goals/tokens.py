@@ -60,3 +60,8 @@ def fail(text: str, position: int, reason: str) -> NoReturn:
     """
     shown = text if len(text) <= 100 else text[:97] + "..."
     raise UserError(f"expression {shown!r}, position {position + 1}: {reason}")
+
+
+def split_outside_quotes(text: str, separator: str) -> list[str]:
+    """The parts of a text between separators, a single character; one within double quotes separates nothing."""
+    return re.split(rf'{re.escape(separator)}(?=(?:[^"]*"[^"]*")*[^"]*$)', text)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import threading
 import weakref
 from collections.abc import Sequence
@@ -179,7 +180,7 @@ class BackgroundPlanner:
         self._thread = threading.Thread(target=target, args=arguments, name="latentplan-plan", daemon=True)
         self._thread.start()
         # The thread holds no reference to this object: one that is dropped, or alive at exit, is closed all the same.
-        self._close = weakref.finalize(self, end, self._requests, self._thread, self.process)
+        self._close = weakref.finalize(self, end, os.getpid(), self._requests, self._thread, self.process)
 
     @property
     def is_idle(self) -> bool:

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import contextlib
 import ctypes
 import gc
 import multiprocessing
+import os
 import pickle
 import signal
 import sys
 import threading
 import traceback
+from collections.abc import Iterator
 from multiprocessing.connection import Connection
 from multiprocessing.context import SpawnProcess
 from queue import SimpleQueue
@@ -61,7 +64,8 @@ def start_process() -> tuple[SpawnProcess, Connection]:
     context = multiprocessing.get_context("spawn")
     ours, theirs = context.Pipe()
     process = context.Process(target=_serve, args=(theirs,), name="latentplan-plan", daemon=True)
-    process.start()
+    with _interrupts_held():  # a process that starts inherits that, and lets them go once it ignores them
+        process.start()
     theirs.close()
     return process, ours
 
@@ -111,11 +115,21 @@ def drive_search(
     ready.set()
     search = _Search(problem)
     while (request := requests.get()) is not None:
-        answers.put(search(request))
+        try:
+            answers.put(search(request))
+        except BaseException as error:  # such as SystemExit, which would end the thread without a word
+            answers.put(("error", _portable(RuntimeError(f"{type(error).__name__}: {error}"))))
 
 
-def end(requests: SimpleQueue[Request | None], thread: threading.Thread, process: SpawnProcess | None) -> None:
-    """End a worker, whatever it is doing; only a thread that hangs is left behind, as a daemon."""
+def end(
+    owner: int, requests: SimpleQueue[Request | None], thread: threading.Thread, process: SpawnProcess | None
+) -> None:
+    """End a worker, whatever it is doing; only a thread that hangs is left behind, as a daemon.
+
+    A fork of the loop's process has no worker to end.
+    """
+    if os.getpid() != owner:
+        return
     requests.put(None)
     if process is not None:
         process.terminate()  # it holds nothing that would have to be put away
@@ -133,13 +147,31 @@ def _exchange(connection: Connection, request: Request) -> Answer:
     except Exception as error:
         return "error", _portable(error)
     connection.send_bytes(message)
-    answer: Answer = pickle.loads(connection.recv_bytes())
+    received = connection.recv_bytes()
+    try:
+        answer: Answer = pickle.loads(received)
+    except Exception as error:
+        return "error", _portable(error)
     return answer
+
+
+@contextlib.contextmanager
+def _interrupts_held() -> Iterator[None]:
+    if not hasattr(signal, "pthread_sigmask"):
+        yield
+        return
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 def _serve(connection: Connection) -> None:
     """Searches in a process of its own, until the other end of the pipe is gone."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches the whole group; the loop decides what follows
+    if hasattr(signal, "pthread_sigmask"):
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
     torch.set_num_threads(1)
     try:
         try:

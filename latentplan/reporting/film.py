@@ -41,7 +41,13 @@ class Moment(Protocol):
 
 
 class Imagining(Protocol):
-    """An agent that can show where its present plan ends."""
+    """An agent that can show where its present plan ends.
+
+    Attributes:
+        steps_ahead: Model steps from now to what it showed last.
+    """
+
+    steps_ahead: int
 
     def imagine(self) -> Frame | None:
         """The decoded last state of the plan, uint8 (height, width, 3); None without a plan."""
@@ -53,7 +59,6 @@ def filming(
     path: str | os.PathLike[str],
     env: gymnasium.Env[Any, Any],
     planner: Imagining | None,
-    horizon: int | None = None,
     *,
     every: int = 1,
     judge: Judge | None = None,
@@ -64,8 +69,7 @@ def filming(
         path: Where the film goes, `.mp4` or `.webm`; it appears when the block ends well.
         env: The environment that is played; `render_large` gives the picture where it has that.
         planner: The agent, where it plans; None leaves the plan's side empty.
-        horizon: Model steps that its plans look ahead.
-        every: Decisions per picture; the film keeps the time of the episode.
+        every: Decisions per picture (the last moment has one whatever that is); the film keeps the time of the episode.
         judge: Who scores an objective or constraints; the film then shows how they are met.
 
     Yields:
@@ -75,9 +79,9 @@ def filming(
         films: list[VideoWriter] = []
 
         def film(moment: Moment) -> None:
-            if moment.episode > 0 or moment.decision % every:
+            if moment.episode > 0 or (moment.decision % every and moment.action is not None):
                 return
-            picture = _compose(moment, env, planner, horizon, judge)
+            picture = _compose(moment, env, planner, judge)
             if not films:
                 fps = float(env.unwrapped.metadata.get("render_fps") or DEFAULT_FPS)
                 films.append(stack.enter_context(VideoWriter(path, fps / every, (picture.shape[1], picture.shape[0]))))
@@ -86,16 +90,15 @@ def filming(
         yield film
 
 
-def _compose(
-    moment: Moment, env: gymnasium.Env[Any, Any], planner: Imagining | None, horizon: int | None, judge: Judge | None
-) -> Frame:
+def _compose(moment: Moment, env: gymnasium.Env[Any, Any], planner: Imagining | None, judge: Judge | None) -> Frame:
     over = moment.action is None
     render = getattr(env.unwrapped, "render_large", None)
+    imagined = None if planner is None or over else planner.imagine()
     return compose_frame(
         moment.frame if render is None else render(PANEL_SIZE),
-        None if planner is None or over else planner.imagine(),
+        imagined,
         [f"return {moment.total_return:.1f}    step {moment.decision}"],
-        horizon=horizon,
+        horizon=None if planner is None else planner.steps_ahead,
         absence="episode over" if over else "no plan",
         strip=None if judge is None else draw_goal(2 * PANEL_SIZE + GAP, judge.worth, judge.clauses),
     )

@@ -184,8 +184,8 @@ class Collector:
         with contextlib.ExitStack() as stack:
             on_step = None
             if film is not None:
-                horizon, every = self.config.planner.horizon, -(-(self._decisions or 0) // FILMED_FRAMES) or 1
-                on_step = stack.enter_context(filming(film, self._eval_env, planner, horizon, every=every))
+                every = -(-(self._decisions or 0) // FILMED_FRAMES) or 1
+                on_step = stack.enter_context(filming(film, self._eval_env, planner, every=every))
             played = {"planner": run_episodes(self._eval_env, planner, seeds, on_step=on_step)}
         if actor:
             played["actor"] = run_episodes(self._eval_env, self._judged["actor"], seeds)

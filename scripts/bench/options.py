@@ -14,6 +14,7 @@ from latentplan.config import DEVICES, Config, UserError, output_file
 if TYPE_CHECKING:
     import torch
 
+MOST_DIGITS = 18
 Flags = Mapping[str, str]
 
 DEVICE_FLAGS = {
@@ -43,7 +44,7 @@ def whole_number(flags: Flags, name: str, default: int, least: int = 1) -> int:
         UserError: It is none, or below `least`.
     """
     text = flags.get(name, str(default))
-    if not text.isascii() or not text.isdigit() or int(text) < least:
+    if not text.isascii() or not text.isdigit() or len(text) > MOST_DIGITS or int(text) < least:
         raise UserError(f"{name} must be a whole number of at least {least}, got {text!r}")
     return int(text)
 

@@ -6,6 +6,7 @@ from typing import Any
 
 from latentplan.checkpoint import load_agent, load_model
 from latentplan.config import PlannerConfig, to_dict
+from latentplan.config.planner import override_planner
 from latentplan.gate import GatedAgent
 
 
@@ -27,7 +28,7 @@ def make_player(player: str, checkpoint: str, device: str, planner: dict[str, An
     """
     if player == "random gate":
         model, config, info = load_model(checkpoint, device)
-        search = PlannerConfig(**(to_dict(config.planner) | planner))
+        search = PlannerConfig(**override_planner(to_dict(config.planner), planner))
         return PlainGate(model, config, info["discount"], signal="random", planner=search)
     if player in ("actor", "random"):
         return load_agent(checkpoint, mode=player, device=device)

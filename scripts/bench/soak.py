@@ -147,8 +147,8 @@ def play_block(
         tally.misses += following - boundary - 1
         tally.wake_ms.append(1000.0 * (woken - began - boundary * period))
         tally.decision_ms.append(1000.0 * (finished - woken))
+        tally.due += following - boundary
         boundary = following
-    tally.due += due
 
 
 def soak_rows(tallies: Mapping[str, Tally]) -> dict[str, dict[str, Any]]:

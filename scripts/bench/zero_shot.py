@@ -21,6 +21,7 @@ from bench.report import format_table, interval, number, write_json
 from latentplan.compose import build_config, raise_unknown
 from latentplan.config import EnvConfig, UserError, to_dict
 from latentplan.config.planner import override_planner
+from latentplan.goals.tokens import split_outside_quotes
 
 if TYPE_CHECKING:
     from latentplan.envs import SuiteEnv
@@ -237,7 +238,7 @@ def summary_table(rows: Sequence[dict[str, Any]]) -> str:
 
 
 def _parts(text: str) -> list[str]:
-    return list(dict.fromkeys(part.strip() for part in text.split("|") if part.strip()))
+    return list(dict.fromkeys(part.strip() for part in split_outside_quotes(text, "|") if part.strip()))
 
 
 def _check_goals(jobs: Sequence[Job], domain: str) -> None:

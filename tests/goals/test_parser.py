@@ -90,6 +90,7 @@ def test_the_margin_is_the_scale_of_what_is_compared(text, margin):
         ("height = 1", 8, "'=' means nothing here"),
         ("__import__('os')", 12, "means nothing here"),
         ("speed > 1e999", 9, "no finite number"),
+        ("10 * speed * 1e308", 1, "a weight beyond every number"),
         ("return > 5", 1, "return can only be weighted and added"),
         ("speed * return", 9, "return can only be weighted and added"),
         ("abs(goal:a.png)", 5, "a goal image can only be weighted and added"),
@@ -124,10 +125,17 @@ def test_objectives_follow_each_other_at_env_frames():
         (500, "speed -> 1.0"),
         (750, "goal:end.png"),
     ]
+    named = parse_schedule('goal:"im/a;b.png"; 500: speed', WALKER)
+    assert [phase.start for phase in named] == [0, 500] and named[0].objective.terms[0][1].path == "im/a;b.png"
     assert parse_schedule("0: speed", WALKER) == parse_schedule("speed", WALKER)
 
 
-@pytest.mark.parametrize("text", ["10: speed", "speed; 5: height; 5: speed", "speed; height", "speed; 0: height"])
+LONG = f"speed; {'9' * 5000}: height"
+
+
+@pytest.mark.parametrize(
+    "text", ["10: speed", "speed; 5: height; 5: speed", "speed; height", "speed; 0: height", LONG], ids=range(5)
+)
 def test_a_schedule_out_of_order_is_refused(text):
     with pytest.raises(UserError, match="env frame"):
         parse_schedule(text, WALKER)

@@ -197,6 +197,39 @@ def test_a_planner_that_is_dropped_ends_its_process():
     assert not process.is_alive()
 
 
+def test_an_interrupt_while_it_starts_is_left_to_the_loop():
+    with BackgroundPlanner(CEM, MODEL) as background:
+        os.kill(background.process.pid, signal.SIGINT)
+        assert background.wait_until_ready(STARTING_SECONDS) and background.process.is_alive()
+        background.request(STATE, 0)
+        assert wait_for_plan(background)[0] == 0
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="forks")
+def test_a_fork_leaves_the_worker_to_its_parent():
+    with start(CEM) as background:
+        child = os.fork()
+        if child == 0:
+            background.close()
+            os._exit(0)
+        os.waitpid(child, 0)
+        background.request(STATE, 0)
+        assert wait_for_plan(background)[0] == 0
+
+
+class Leaves:
+    def plan(self, *_, **__):
+        sys.exit(3)
+
+
+def test_a_search_that_leaves_its_thread_is_told_of():
+    with start(Leaves(), "thread") as background:
+        for _ in range(2):
+            background.request(STATE, 0)
+            with pytest.raises(RuntimeError, match="SystemExit: 3"):
+                wait_for_plan(background)
+
+
 def test_the_program_ends_though_nobody_closed_and_leaves_no_process(run_python, tmp_path):
     (tmp_path / "program.py").write_text(
         "import torch\n"

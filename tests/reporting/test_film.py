@@ -17,6 +17,8 @@ class SharpEnv(gymnasium.Env):
 
 
 class BlueDreamer:
+    steps_ahead = 6
+
     def imagine(self):
         return np.full((64, 64, 3), (0, 0, 200), np.uint8)
 
@@ -26,8 +28,8 @@ def moment(decision, episode=0, action=(0.0,)):
     return SimpleNamespace(episode=episode, decision=decision, total_return=1.5 * decision, frame=frame, action=action)
 
 
-def film_of(path, env, planner, moments):
-    with filming(path, env, planner, horizon=6) as film:
+def film_of(path, env, planner, moments, every=1):
+    with filming(path, env, planner, every=every) as film:
         for each in moments:
             film(each)
     capture = cv2.VideoCapture(str(path))
@@ -69,3 +71,10 @@ def test_what_the_plan_imagines_is_filmed_until_the_episode_is_over(tmp_path):
     _, frames = film_of(tmp_path / "film.mp4", SharpEnv(), BlueDreamer(), moments)
     shown = [share(frame, (0, 0, 200)) > 0.35 for frame in frames]
     assert shown == [True, True, False]
+
+
+def test_the_last_moment_is_filmed_however_few_are(tmp_path):
+    moments = [*(moment(decision) for decision in range(9)), moment(9, action=None)]
+    _, frames = film_of(tmp_path / "film.mp4", SharpEnv(), BlueDreamer(), moments, every=4)
+    shown = [share(frame, (0, 0, 200)) > 0.35 for frame in frames]
+    assert shown == [True, True, True, False]  # 0, 4, 8, and that it is over
