@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import tempfile
 from pathlib import Path
 from typing import Any
 
@@ -38,6 +37,8 @@ def output_file(path: Path, flag: str) -> Path:
     Raises:
         UserError: It is a folder, its folder does not exist, or nothing can be written in that.
     """
+    import tempfile  # when there is a file to be written: every command imports this module
+
     folder = path.parent
     if path.is_dir():
         raise UserError(f"{flag} {str(path)!r} is a folder; give a file in it")

@@ -97,6 +97,7 @@ def _tried(model: Any, name: str, inputs: Inputs) -> tuple[list[str], Any]:
 def _called(
     model: Any, name: str, given: tuple[Any, ...], judge: Callable[[Any], Iterator[str]]
 ) -> tuple[list[str], Any]:
+    """The same for any arguments: what is raised, what `judge` finds, and inputs that are changed."""
     copies = tree_map(lambda leaf: leaf.clone() if isinstance(leaf, Tensor) else leaf, given)
     try:
         answer = getattr(model, name)(*copies)

@@ -152,8 +152,7 @@ class Scorer:
         for step in range(actions.shape[1]):
             action = actions[:, step]
             if bool(is_tail[:, step].any()):
-                mode = self.model.policy(state, None)  # type: ignore[attr-defined]
-                mode = torch.clamp(mode.to(action.dtype), *bounds)
+                mode = self.act(state, bounds)
                 action = torch.where(is_tail[:, step] & torch.isfinite(mode), mode, action)
             filled.append(action)
             state, _ = take_step(self.model, state, action)
