@@ -107,7 +107,7 @@ class CollectionConfig:
         prefill_decisions: Random decisions before learning starts.
         round_decisions: Decisions per epoch: this many are collected, then learned from.
         updates_per_decision: Updates per collected decision (the replay ratio, in updates).
-        overlap: Whether the next round is collected in another process while this one is learned from; never on a GPU.
+        overlap: Whether the next round is collected in another process, on the CPU, while this one is learned from.
     """
 
     behaviour: str = "both"

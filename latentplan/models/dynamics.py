@@ -11,6 +11,7 @@ from torch.nn import functional
 from latentplan.models.heads import NormedLinear
 
 MIN_STD = 0.1
+UPDATE_SHIFT = 1.0  # below which the update gate starts: states last
 
 
 class State(NamedTuple):
@@ -59,7 +60,7 @@ class Rssm(nn.Module):
         reset, candidate, update = gates.chunk(3, -1)
         candidate = torch.tanh(torch.sigmoid(reset) * candidate)
         dtype = state.deter.dtype
-        return torch.lerp(state.deter, candidate.to(dtype), torch.sigmoid(update - 1.0).to(dtype))
+        return torch.lerp(state.deter, candidate.to(dtype), torch.sigmoid(update - UPDATE_SHIFT).to(dtype))
 
     def prior(self, deter: Tensor) -> Gaussian:
         """What the latent will be, judged from the past alone, for deter (..., deter)."""
@@ -85,12 +86,13 @@ class Rssm(nn.Module):
         deters: list[Tensor] = []
         stochs: list[Tensor] = []
         posteriors: list[Gaussian] = []
-        for time in range(embeddings.shape[1]):
+        # Unbound at once: the gradient of each slice by itself would be a whole tensor of zeros.
+        for time, (embedding, draws) in enumerate(zip(embeddings.unbind(1), noise.unbind(1), strict=True)):
             if time > 0:
                 deter = self.advance(State(deter, stochs[-1]), actions[:, time - 1])
-            posterior = self.posterior(deter, embeddings[:, time])
+            posterior = self.posterior(deter, embedding)
             deters.append(deter)
-            stochs.append(posterior.mean + posterior.std * noise[:, time])
+            stochs.append(posterior.mean + posterior.std * draws)
             posteriors.append(posterior)
         means, stds = (torch.stack(part, 1) for part in zip(*posteriors, strict=True))
         return State(torch.stack(deters, 1), torch.stack(stochs, 1)), Gaussian(means, stds)
@@ -105,4 +107,9 @@ def kl_divergence(left: Gaussian, right: Gaussian) -> Tensor:
 
 def _gaussian(raw: Tensor) -> Gaussian:
     mean, raw_std = raw.float().chunk(2, -1)
-    return Gaussian(mean, 2.0 * torch.sigmoid(raw_std / 2.0) + MIN_STD)
+    return Gaussian(mean, latent_std(raw_std))
+
+
+def latent_std(raw: Tensor) -> Tensor:
+    """Standard deviation of the latent, above `MIN_STD`, for what a layer returned (..., latent)."""
+    return 2.0 * torch.sigmoid(raw / 2.0) + MIN_STD

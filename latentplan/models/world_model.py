@@ -63,13 +63,19 @@ class WorldModel(nn.Module):
             self.add_goal_heads(goal_dim)
 
     def trunk_precision(self, *, cache: bool = True) -> AbstractContextManager[None]:
-        """Autocast to bfloat16 for the products in the trunk; heads leave it by themselves.
+        """Autocast to `trunk_dtype` for the products in the trunk; heads leave it by themselves.
 
         Args:
             cache: Whether converted weights are kept while it lasts. All threads share one store, which each empties
                 when it leaves: what learns in two threads must not use it, or rounding would depend on timing.
         """
-        return torch.autocast(self.device.type, dtype=torch.bfloat16, cache_enabled=cache)
+        dtype = self.trunk_dtype
+        return torch.autocast(self.device.type, dtype, enabled=dtype != torch.float32, cache_enabled=cache)
+
+    @property
+    def trunk_dtype(self) -> torch.dtype:
+        """bfloat16 on a CPU; float32 on a GPU, where converting operands takes longer than such small products save."""
+        return torch.bfloat16 if self.device.type == "cpu" else torch.float32
 
     @property
     def device(self) -> torch.device:

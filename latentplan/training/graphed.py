@@ -58,6 +58,7 @@ class GraphedLearner(Learner):
         self._generator: torch.Generator | None = None
         self._graph: torch.cuda.CUDAGraph | None = None
         self._outputs: dict[str, Tensor] = {}
+        self._written = [*self.model.parameters(), *self.averaged.parameters()]
         self._run_before, self._since_told = 0, 0
 
     def training_step(self, rows: Tensor, batch_index: int) -> None:  # type: ignore[override]
@@ -72,7 +73,7 @@ class GraphedLearner(Learner):
         if self._graph is not None:
             self._graph.replay()
             # What keeps copies of weights until they change sees it by this count, which a graph leaves alone.
-            torch.autograd.graph.increment_version([*self.model.parameters(), *self.averaged.parameters()])
+            torch.autograd.graph.increment_version(self._written)
         elif self.device.type == "cuda":
             self._run_aside()
         else:

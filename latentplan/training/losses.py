@@ -2,18 +2,22 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import torch
 from einops import rearrange
 from torch import Tensor
 
 from latentplan.config import LearningConfig
-from latentplan.models import Gaussian, State, WorldModel, kl_divergence
+from latentplan.models import Gaussian, State, WorldModel, kl_divergence, pointwise, unroll
 from latentplan.models.heads import MAX_ACTION_STD, MIN_ACTION_STD, Actor, ScalarHead, sample_action
 from latentplan.replay import Batch
 from latentplan.training.augmentation import random_shift
+
+if TYPE_CHECKING:
+    from latentplan.models.dynamics import Rssm
 
 HALF_LOG_2_PI_E = 1.4189385  # entropy of a Gaussian is log std + this, in nats
 
@@ -65,7 +69,8 @@ def world_model_loss(model: WorldModel, batch: Batch, config: LearningConfig, ge
     noise = torch.randn(
         size, frames_per_sequence, model.config.latent_dim, generator=generator, device=batch.frames.device
     )
-    states, posterior = model.dynamics.observe(embeddings, batch.actions, batch.deter, noise)
+    observe = functools.partial(unroll.observe, model.dynamics) if unroll.pays(noise) else model.dynamics.observe
+    states, posterior = observe(embeddings, batch.actions, batch.deter, noise)
     features = states.features
     overshooting, open_loop = _predict_open_loop(model, batch, states, posterior, config)
     reached = open_loop.shape[1]
@@ -111,7 +116,12 @@ def imagine(
     model: WorldModel, start: State, horizon: int, generator: torch.Generator, decay: float = 1.0
 ) -> Imagination:
     """Roll the actor out in the model for `horizon` steps from rows of states; gradients and decay as in `roll_out`."""
-    stacked, entropies = roll_out(model, model.actor, start, horizon, generator, decay)
+    if unroll.pays(start.deter):
+        action_noise, noise = _draws(model, horizon, len(start.deter), generator)
+        stacked, std = unroll.dream(model.dynamics, model.actor, start, action_noise, noise, decay)
+        entropies = _entropy(std)
+    else:
+        stacked, entropies = roll_out(model, model.actor, start, horizon, generator, decay)
     rewards = model.reward_head.mean(model.reward_head(stacked[1:]))
     continues = torch.sigmoid(model.continue_head(stacked[1:])).squeeze(-1)
     return Imagination(stacked, rewards, continues, entropies)
@@ -143,9 +153,7 @@ def roll_out(
         Features, the start first, (horizon + 1, rows, feature); entropies of the actions, in nats, (horizon, rows).
     """
     state, features, stds = start, [start.features], []
-    rows, device = len(start.deter), start.deter.device
-    draws = torch.randn(horizon, rows, model.action_dim + model.config.latent_dim, generator=generator, device=device)
-    action_noise, noise = draws.split([model.action_dim, model.config.latent_dim], -1)
+    action_noise, noise = _draws(model, horizon, len(start.deter), generator)
     for step in range(horizon):
         mean, std = policy(features[-1].detach())
         action = sample_action(mean, std, action_noise[step])
@@ -154,7 +162,20 @@ def roll_out(
         prior = model.dynamics.prior(deter)
         state = State(deter, torch.addcmul(prior.mean, prior.std, noise[step]))
         features.append(state.features)
-    return torch.stack(features), (torch.stack(stds).log() + HALF_LOG_2_PI_E).sum(-1)
+    return torch.stack(features), _entropy(torch.stack(stds))
+
+
+def _draws(model: WorldModel, horizon: int, rows: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:
+    """Standard normal, for actions and latents, (horizon, rows, ...) each."""
+    sizes = [model.action_dim, model.config.latent_dim]
+    draws = torch.randn(horizon, rows, sum(sizes), generator=generator, device=model.device)
+    action_noise, noise = draws.split(sizes, -1)
+    return action_noise, noise
+
+
+def _entropy(std: Tensor) -> Tensor:
+    """Of Gaussian actions with a std (..., action), in nats, (...)."""
+    return (std.log() + HALF_LOG_2_PI_E).sum(-1)
 
 
 def lambda_return(rewards: Tensor, discounts: Tensor, values: Tensor, lambda_: float) -> Tensor:
@@ -169,12 +190,8 @@ def lambda_return(rewards: Tensor, discounts: Tensor, values: Tensor, lambda_: f
     Returns:
         The return from state t on, (time, ...).
     """
-    following, returns = values[-1], []
-    for time in reversed(range(len(rewards))):
-        mixed = (1.0 - lambda_) * values[time] + lambda_ * following
-        following = rewards[time] + discounts[time] * mixed
-        returns.append(following)
-    return torch.stack(returns[::-1])
+    returns: Tensor = pointwise.run(pointwise.lambda_return, rewards, discounts, values, lambda_)
+    return returns
 
 
 def value_loss(head: ScalarHead, features: Tensor, returns: Tensor, weights: Tensor) -> Tensor:
@@ -214,19 +231,24 @@ def _predict_open_loop(
         return sequence.unfold(1, horizon, horizon).movedim(-1, 2).flatten(0, 1)
 
     starts = [part[:, :-1].detach()[:, ::horizon][:, : length // horizon].flatten(0, 1) for part in states]
-    state, deters, priors = State(*starts), [], []
-    for action in windows(batch.actions).unbind(1):
-        deter = model.dynamics.advance(state, action)
-        priors.append(model.dynamics.prior(deter))
-        state = State(deter, priors[-1].mean)
-        deters.append(deter)
-    prior = Gaussian(*(torch.stack(part, 1) for part in zip(*priors, strict=True)))
+    predict = unroll.follow if unroll.pays(batch.actions) else _follow
+    deter, prior = predict(model.dynamics, State(*starts), windows(batch.actions))
     seen = Gaussian(*(windows(part[:, 1:].detach()) for part in posterior))
     divergence = mean_within(_free_kl(seen, prior, config.free_nats), windows(batch.within))
-    features = State(torch.stack(deters, 1), prior.mean).features
+    features = State(deter, prior.mean).features
     return divergence, rearrange(
         features, "(batch window) time ... -> batch (window time) ...", batch=len(batch.actions)
     )
+
+
+def _follow(dynamics: Rssm, state: State, actions: Tensor) -> tuple[Tensor, Gaussian]:
+    """What `unroll.follow` does, with autograd's gradient."""
+    deters, priors = [], []
+    for action in actions.unbind(1):
+        deters.append(dynamics.advance(state, action))
+        priors.append(dynamics.prior(deters[-1]))
+        state = State(deters[-1], priors[-1].mean)
+    return torch.stack(deters, 1), Gaussian(*(torch.stack(part, 1) for part in zip(*priors, strict=True)))
 
 
 def mean_within(values: Tensor, within: Tensor) -> Tensor:

@@ -63,8 +63,20 @@ def take_up(optimizer: torch.optim.Optimizer, saved: dict[str, Any]) -> None:
 @torch.no_grad()
 def follow(slow: Iterable[Tensor], fast: Iterable[Tensor], rate: float | Tensor) -> None:
     """Move the parameters of a slow copy towards those that learn, by a share in [0, 1] of what is between them."""
-    for behind, ahead in zip(slow, fast, strict=True):
-        behind.lerp_(ahead, rate)
+    behind, ahead = list(slow), list(fast)
+    if behind[0].is_cuda:
+        follow_together(behind, ahead, rate)
+        return
+    for one, other in zip(behind, ahead, strict=True):
+        one.lerp_(other, rate)
+
+
+@torch.no_grad()
+def follow_together(slow: list[Tensor], fast: list[Tensor], rate: float | Tensor) -> None:
+    """`follow` in a few kernels for all parameters, up to rounding."""
+    steps = torch._foreach_sub(fast, slow)
+    torch._foreach_mul_(steps, rate)
+    torch._foreach_add_(slow, steps)
 
 
 @torch.no_grad()

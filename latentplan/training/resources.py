@@ -36,6 +36,13 @@ def choose_threads(overlap: bool) -> int:
     return max(1, (cores - overlap) // 2)
 
 
+def set_up_torch(threads: int, device: torch.device) -> None:
+    """Have torch compute with so many threads and, on a GPU, on its tensor cores."""
+    torch.set_num_threads(threads)
+    if device.type == "cuda":
+        torch.set_float32_matmul_precision("high")  # TF32, which rounds less than the bfloat16 of a CPU's run
+
+
 def replay_capacity(config: Config, saved: Path) -> int:
     """Rows that hold everything a run collects, unless the settings say how many.
 

@@ -29,7 +29,7 @@ from latentplan.training.data import ReplayBatches, ReplayData
 from latentplan.training.graphed import make_learner
 from latentplan.training.progress import Progress
 from latentplan.training.record import Record
-from latentplan.training.resources import choose_device, choose_threads, replay_capacity
+from latentplan.training.resources import choose_device, choose_threads, replay_capacity, set_up_torch
 from latentplan.training.state import INTERRUPTED, RunState, load_state, restore
 from latentplan.training.worker import LocalWorker, RemoteWorker, Worker
 
@@ -135,8 +135,8 @@ class _Run:
         self.config, self.folder = config, folder
         self.device = choose_device(config.run)
         self.console = Progress(config.run)
-        overlap = config.collection.overlap and self.device.type == "cpu"
-        torch.set_num_threads(config.run.threads or choose_threads(overlap))
+        overlap = config.collection.overlap
+        set_up_torch(config.run.threads or choose_threads(overlap), self.device)
         self.worker: Worker = (
             RemoteWorker(config, make_env) if overlap else LocalWorker(config, make_env, str(self.device))
         )

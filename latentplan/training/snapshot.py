@@ -14,8 +14,8 @@ from latentplan.models.heads import Mlp
 class Snapshot:
     """The world model as it was after some update, with the actor and the value that go on learning in it.
 
-    The weights of the trunk's products are kept in bfloat16, which is what autocast would make of them at every use;
-    norms and the last layers of heads stay in float32.
+    The weights of the trunk's products are kept in the model's `trunk_dtype`, which is what autocast would make of them
+    at every use; norms and the last layers of heads stay in float32.
 
     Args:
         model: What is copied; the snapshot shares its actor and its value head.
@@ -31,7 +31,7 @@ class Snapshot:
             outputs = {id(part.output) for part in frozen.modules() if isinstance(part, Mlp)}
             for part in frozen.modules():
                 if isinstance(part, nn.Linear) and id(part) not in outputs:
-                    part.to(torch.bfloat16)
+                    part.to(model.trunk_dtype)
             setattr(self.model, name, frozen)
             self._pairs += zip(frozen.parameters(), original.parameters(), strict=True)
 

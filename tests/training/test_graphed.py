@@ -121,6 +121,8 @@ class NothingRead(TorchDispatchMode):
     def __torch_dispatch__(self, func, types, args=(), kwargs=None):
         if func is torch.ops.aten.index.Tensor:
             refused = any(index is not None and index.dtype == torch.bool for index in args[1])
+        elif func is torch.ops.aten.equal.default and args[0].ndim == 0:
+            refused = False  # on a CPU some torches' quantile looks at its own argument like this
         else:
             refused = {torch.Tag.data_dependent_output, torch.Tag.dynamic_output_shape} & set(func.tags)
         if refused:

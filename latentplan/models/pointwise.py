@@ -1,0 +1,169 @@
+"""What lies between the matrix products of a step, forwards and backwards: each function is one kernel on a GPU.
+
+All are of plain tensors, without autograd. Names ending in `_back` take gradients of what the others return.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.nn import functional
+
+from latentplan.models.dynamics import UPDATE_SHIFT, latent_std
+from latentplan.models.heads import action_distribution
+
+NORM_EPS = 1e-5
+
+
+def run(function: Callable[..., Any], *arguments: Any) -> Any:
+    """Call one of the functions here, compiled where its tensors are on a GPU."""
+    return (_compiled(function) if arguments[0].is_cuda else function)(*arguments)
+
+
+@functools.cache
+def _compiled(function: Callable[..., Any]) -> Callable[..., Any]:
+    return torch.compile(function, dynamic=False)
+
+
+def norm_silu(product: Tensor, scale: Tensor, shift: Tensor) -> Tensor:
+    """SiLU of the layer norm of rows (rows, size)."""
+    return functional.silu(functional.layer_norm(product, product.shape[-1:], scale, shift, NORM_EPS))
+
+
+def norm_silu_beside(product: Tensor, scale: Tensor, shift: Tensor, deter: Tensor) -> Tensor:
+    """The same with deter beside it, (rows, size + deter)."""
+    return torch.cat([norm_silu(product, scale, shift), deter], -1)
+
+
+def norm_silu_back(gradient: Tensor, product: Tensor, scale: Tensor, shift: Tensor) -> tuple[Tensor, Tensor]:
+    """Gradients of the product, and of its norm scaled and shifted, for that of the first `size` columns."""
+    centred, rstd = _centred(product)
+    normed = centred * rstd
+    scaled = normed * scale + shift
+    gate = torch.sigmoid(scaled)
+    of_scaled = gradient[:, : product.shape[-1]] * gate * (1.0 + scaled * (1.0 - gate))
+    return _norm_input_back(of_scaled * scale, normed, rstd), of_scaled
+
+
+def gated(product: Tensor, scale: Tensor, shift: Tensor, deter: Tensor) -> Tensor:
+    """The next deter (rows, deter) from reset, candidate and update gates side by side, as in `Rssm.advance`."""
+    normed = functional.layer_norm(product, product.shape[-1:], scale, shift, NORM_EPS)
+    reset, candidate, update = normed.chunk(3, -1)
+    candidate = torch.tanh(torch.sigmoid(reset) * candidate)
+    return torch.lerp(deter, candidate, torch.sigmoid(update - UPDATE_SHIFT))
+
+
+def gated_back(
+    by_latent: Tensor,
+    by_others: Tensor | None,
+    directly: Tensor | None,
+    beside: Tensor | None,
+    decay: float,
+    product: Tensor,
+    scale: Tensor,
+    shift: Tensor,
+    deter: Tensor,
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Gradients of the product, of its norm scaled and shifted, and of the deter before, past the product.
+
+    Args:
+        by_latent: The first of four gradients of the deter after: the step's own latent's.
+        by_others: Of whatever else reads it.
+        directly: Of the next step, past its product.
+        beside: Of the next step, in the last columns of what its product is of.
+        decay: Share of the last two that counts.
+        product: Of the gates, as `gated` takes it.
+        scale: Of its norm.
+        shift: Of its norm.
+        deter: The deter before.
+    """
+    gradient = by_latent if by_others is None else by_latent + by_others
+    if directly is not None and beside is not None:
+        gradient = gradient + decay * (directly + beside[:, -deter.shape[-1] :])
+    centred, rstd = _centred(product)
+    normed = centred * rstd
+    reset, candidate, update = (normed * scale + shift).chunk(3, -1)
+    reset_gate, update_gate = torch.sigmoid(reset), torch.sigmoid(update - UPDATE_SHIFT)
+    candidate_value = torch.tanh(reset_gate * candidate)
+    inner = gradient * update_gate * (1.0 - candidate_value * candidate_value)
+    of_reset = inner * candidate * reset_gate * (1.0 - reset_gate)
+    of_update = gradient * (candidate_value - deter) * update_gate * (1.0 - update_gate)
+    of_scaled = torch.cat([of_reset, inner * reset_gate, of_update], -1)
+    return _norm_input_back(of_scaled * scale, normed, rstd), of_scaled, gradient * (1.0 - update_gate)
+
+
+def drawn(raw: Tensor, noise: Tensor | None, action: Tensor | None) -> tuple[Tensor, Tensor, Tensor, Tensor | None]:
+    """A latent, or without noise its mean; mean and std, (rows, latent) each; the latent beside the next action."""
+    mean, std = _gaussian(raw)
+    stoch = mean if noise is None else mean + std * noise
+    return stoch, mean, std, None if action is None else torch.cat([stoch, action], -1)
+
+
+def drawn_back(
+    raw: Tensor,
+    noise: Tensor | None,
+    stoch: Tensor | None,
+    mean: Tensor | None,
+    std: Tensor | None,
+    joined: Tensor | None,
+    decay: float,
+) -> Tensor:
+    """Gradient of raw, for those of stoch, mean and std, and of stoch by the next step, first columns of `joined`."""
+    latent = raw.shape[-1] // 2
+    gate = torch.sigmoid(raw[:, latent:] / 2.0)
+    of_stoch = torch.zeros_like(gate) if stoch is None else stoch
+    if joined is not None:
+        of_stoch = of_stoch + decay * joined[:, :latent]
+    of_mean = of_stoch if mean is None else of_stoch + mean
+    of_std = torch.zeros_like(gate) if noise is None else of_stoch * noise
+    of_std = of_std if std is None else of_std + std
+    return torch.cat([of_mean, of_std * gate * (1.0 - gate)], -1)
+
+
+def felt(raw: Tensor, noise: Tensor, deter: Tensor) -> tuple[Tensor, Tensor]:
+    """A latent (rows, latent), and the features that it makes with deter."""
+    mean, std = _gaussian(raw)
+    stoch = mean + std * noise
+    return stoch, torch.cat([deter, stoch], -1)
+
+
+def acted(raw: Tensor, noise: Tensor, stoch: Tensor) -> Tensor:
+    """The latent beside an actor's sample, for what the actor's last layer returned (rows, 2 action)."""
+    mean, std = action_distribution(raw)
+    return torch.cat([stoch, (mean + std * noise).clamp(-1.0, 1.0)], -1)
+
+
+def norm_back(of_scaled: Tensor, product: Tensor) -> tuple[Tensor, Tensor]:
+    """Gradients of a layer norm's scale and shift, (size,) each, over rows (rows, size)."""
+    centred, rstd = _centred(product)
+    return (of_scaled * centred * rstd).sum(0), of_scaled.sum(0)
+
+
+def lambda_return(rewards: Tensor, discounts: Tensor, values: Tensor, lambda_: float) -> Tensor:
+    """The recursion of `training.losses.lambda_return`, over the first dim; autograd follows it."""
+    following, returns = values[-1], []
+    steps = zip(rewards.unbind(), discounts.unbind(), values.unbind(), strict=True)
+    for reward, discount, value in reversed(list(steps)):
+        mixed = (1.0 - lambda_) * value + lambda_ * following
+        following = reward + discount * mixed
+        returns.append(following)
+    return torch.stack(returns[::-1])
+
+
+def _gaussian(raw: Tensor) -> tuple[Tensor, Tensor]:
+    mean, raw_std = raw.chunk(2, -1)
+    return mean, latent_std(raw_std)
+
+
+def _centred(product: Tensor) -> tuple[Tensor, Tensor]:
+    centred = product - product.mean(-1, keepdim=True)
+    return centred, torch.rsqrt(centred.square().mean(-1, keepdim=True) + NORM_EPS)
+
+
+def _norm_input_back(of_normed: Tensor, normed: Tensor, rstd: Tensor) -> Tensor:
+    along = (of_normed * normed).mean(-1, keepdim=True)
+    return rstd * (of_normed - of_normed.mean(-1, keepdim=True) - normed * along)

@@ -1,0 +1,108 @@
+"""The recurrence with its gradient written out gives what autograd's gives."""
+
+from types import SimpleNamespace
+
+import pytest
+import torch
+
+from latentplan.models import State, WorldModel, unroll
+from latentplan.models.dynamics import Rssm
+from latentplan.models.heads import Actor
+from latentplan.training import losses
+from tests.training.test_graphed import draws, graphed
+
+ROWS, TIME = 4, 6
+SIZES = {"latent_dim": 5, "deter_dim": 12, "hidden_dim": 10, "action_dim": 3}
+
+
+@pytest.fixture
+def dynamics():
+    torch.manual_seed(0)
+    made = Rssm(**SIZES, embedding_dim=7)
+    for parameter in made.parameters():
+        torch.nn.init.normal_(parameter, std=0.4)
+    return made
+
+
+def states():
+    return State(torch.randn(ROWS, 12), torch.randn(ROWS, 5))
+
+
+def weighed(outputs, generator_seed=1):
+    """A scalar to which every number of the outputs counts differently."""
+    generator = torch.Generator().manual_seed(generator_seed)
+    return sum((part * torch.randn(part.shape, generator=generator)).sum() for part in outputs)
+
+
+def assert_same_gradients(ways, parameters, reached):
+    """The same outputs, and gradients, of which those of `reached` parameters are of something."""
+    outcomes = []
+    for way in ways:
+        outputs = way()
+        outcomes.append((outputs, torch.autograd.grad(weighed(outputs), parameters, allow_unused=True)))
+    (expected, gradients), (given, own) = outcomes
+    for one, other in zip(expected, given, strict=True):
+        torch.testing.assert_close(other, one, rtol=1e-5, atol=1e-5)
+    assert sum(gradient is not None and bool(gradient.any()) for gradient in own) == reached
+    for one, other in zip(gradients, own, strict=True):
+        torch.testing.assert_close(other, one, rtol=1e-4, atol=1e-4)
+
+
+def test_what_is_observed_is_the_same(dynamics):
+    embeddings = torch.randn(ROWS, TIME + 1, 7, requires_grad=True)
+    actions, noise = torch.rand(ROWS, TIME, 3) * 2 - 1, torch.randn(ROWS, TIME + 1, 5)
+    deter = torch.randn(ROWS, 12)
+
+    def outputs(observe):
+        state, posterior = observe(embeddings, actions, deter, noise)
+        return (*state, *posterior)
+
+    ways = [lambda: outputs(dynamics.observe), lambda: outputs(lambda *given: unroll.observe(dynamics, *given))]
+    assert_same_gradients(ways, [embeddings, *dynamics.parameters()], 12)
+
+
+def test_what_is_followed_is_the_same(dynamics):
+    start, actions = states(), torch.rand(ROWS, TIME, 3) * 2 - 1
+
+    def outputs(follow):
+        deter, prior = follow(dynamics, start, actions)
+        return (deter, *prior)
+
+    ways = [lambda: outputs(losses._follow), lambda: outputs(unroll.follow)]
+    assert_same_gradients(ways, list(dynamics.parameters()), 11)
+
+
+@pytest.mark.parametrize("decay", [1.0, 0.7])
+def test_what_is_dreamt_is_the_same(dynamics, decay):
+    actor, start = Actor(17, 10, 3), states()
+    for parameter in actor.parameters():
+        torch.nn.init.normal_(parameter, std=0.4)
+    model = SimpleNamespace(
+        dynamics=dynamics, action_dim=3, config=SimpleNamespace(**SIZES), device=torch.device("cpu")
+    )
+
+    def ways(with_unroll):
+        generator = torch.Generator().manual_seed(3)
+        if not with_unroll:
+            return losses.roll_out(model, actor, start, TIME, generator, decay)
+        features, std = unroll.dream(dynamics, actor, start, *losses._draws(model, TIME, ROWS, generator), decay)
+        return features, losses._entropy(std)
+
+    assert_same_gradients([lambda: ways(False), lambda: ways(True)], list(actor.parameters()), 8)
+
+
+def test_an_update_is_the_same(tiny, monkeypatch):
+    """Both losses of a whole update, and what became of the weights."""
+    learners = []
+    for pays in (False, True):
+        monkeypatch.setattr(unroll, "pays", lambda tensor, pays=pays: pays)
+        monkeypatch.setattr(WorldModel, "trunk_dtype", torch.float32)
+        learner = graphed(tiny)
+        for rows in draws(learner.replay, 2):
+            learner.training_step(rows, 0)
+        learners.append(learner)
+    (expected, parts), (given, own) = ((learner.state_dict(), learner.metrics) for learner in learners)
+    for name, value in parts.items():
+        torch.testing.assert_close(own[name], value, rtol=1e-4, atol=1e-5, msg=name)
+    for name, value in expected.items():
+        torch.testing.assert_close(given[name], value, rtol=1e-2, atol=1e-4, msg=name)
