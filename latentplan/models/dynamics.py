@@ -97,6 +97,24 @@ class Rssm(nn.Module):
         means, stds = (torch.stack(part, 1) for part in zip(*posteriors, strict=True))
         return State(torch.stack(deters, 1), torch.stack(stochs, 1)), Gaussian(means, stds)
 
+    def follow(self, start: State, actions: Tensor) -> tuple[Tensor, Gaussian]:
+        """Predict without looking: each step goes on from the mean of the prior.
+
+        Args:
+            start: States, (rows, ...) each.
+            actions: In [-1, 1], (rows, time, action).
+
+        Returns:
+            Deterministic states and priors after each action, (rows, time, ...) each.
+        """
+        state, deters, priors = start, [], []
+        for action in actions.unbind(1):
+            deters.append(self.advance(state, action))
+            priors.append(self.prior(deters[-1]))
+            state = State(deters[-1], priors[-1].mean)
+        means, stds = (torch.stack(part, 1) for part in zip(*priors, strict=True))
+        return torch.stack(deters, 1), Gaussian(means, stds)
+
 
 def kl_divergence(left: Gaussian, right: Gaussian) -> Tensor:
     """KL(left || right) in nats, summed over the latent: (...)."""

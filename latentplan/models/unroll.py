@@ -49,22 +49,17 @@ def pays(tensor: Tensor) -> bool:
 def observe(
     dynamics: Rssm, embeddings: Tensor, actions: Tensor, deter: Tensor, noise: Tensor
 ) -> tuple[State, Gaussian]:
-    """What `Rssm.observe` does; gradients reach the weights and the embeddings."""
+    """`Rssm.observe`, as it pays; gradients reach the weights and the embeddings."""
+    if not pays(noise):
+        return dynamics.observe(embeddings, actions, deter, noise)
     deter, *latent = _Unrolled.apply(embeddings, actions, deter, None, noise, *_weights(dynamics, prior=False))
     return State(deter, latent[0]), Gaussian(*latent[1:])
 
 
 def follow(dynamics: Rssm, start: State, actions: Tensor) -> tuple[Tensor, Gaussian]:
-    """Predictions without looking: each step goes on from the mean of the prior; gradients reach the weights alone.
-
-    Args:
-        dynamics: What predicts.
-        start: States, (rows, ...) each.
-        actions: In [-1, 1], (rows, time, action).
-
-    Returns:
-        Deterministic states and priors after each action, (rows, time, ...) each.
-    """
+    """`Rssm.follow`, as it pays; here gradients reach the weights alone."""
+    if not pays(actions):
+        return dynamics.follow(start, actions)
     deter, _, *prior = _Unrolled.apply(None, actions, start.deter, start.stoch, None, *_weights(dynamics, prior=True))
     return deter, Gaussian(*prior)
 

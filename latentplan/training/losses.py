@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import functools
 from collections.abc import Callable
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import torch
 from einops import rearrange
@@ -15,9 +14,6 @@ from latentplan.models import Gaussian, State, WorldModel, kl_divergence, pointw
 from latentplan.models.heads import MAX_ACTION_STD, MIN_ACTION_STD, Actor, ScalarHead, sample_action
 from latentplan.replay import Batch
 from latentplan.training.augmentation import random_shift
-
-if TYPE_CHECKING:
-    from latentplan.models.dynamics import Rssm
 
 HALF_LOG_2_PI_E = 1.4189385  # entropy of a Gaussian is log std + this, in nats
 
@@ -69,8 +65,7 @@ def world_model_loss(model: WorldModel, batch: Batch, config: LearningConfig, ge
     noise = torch.randn(
         size, frames_per_sequence, model.config.latent_dim, generator=generator, device=batch.frames.device
     )
-    observe = functools.partial(unroll.observe, model.dynamics) if unroll.pays(noise) else model.dynamics.observe
-    states, posterior = observe(embeddings, batch.actions, batch.deter, noise)
+    states, posterior = unroll.observe(model.dynamics, embeddings, batch.actions, batch.deter, noise)
     features = states.features
     overshooting, open_loop = _predict_open_loop(model, batch, states, posterior, config)
     reached = open_loop.shape[1]
@@ -231,24 +226,13 @@ def _predict_open_loop(
         return sequence.unfold(1, horizon, horizon).movedim(-1, 2).flatten(0, 1)
 
     starts = [part[:, :-1].detach()[:, ::horizon][:, : length // horizon].flatten(0, 1) for part in states]
-    predict = unroll.follow if unroll.pays(batch.actions) else _follow
-    deter, prior = predict(model.dynamics, State(*starts), windows(batch.actions))
+    deter, prior = unroll.follow(model.dynamics, State(*starts), windows(batch.actions))
     seen = Gaussian(*(windows(part[:, 1:].detach()) for part in posterior))
     divergence = mean_within(_free_kl(seen, prior, config.free_nats), windows(batch.within))
     features = State(deter, prior.mean).features
     return divergence, rearrange(
         features, "(batch window) time ... -> batch (window time) ...", batch=len(batch.actions)
     )
-
-
-def _follow(dynamics: Rssm, state: State, actions: Tensor) -> tuple[Tensor, Gaussian]:
-    """What `unroll.follow` does, with autograd's gradient."""
-    deters, priors = [], []
-    for action in actions.unbind(1):
-        deters.append(dynamics.advance(state, action))
-        priors.append(dynamics.prior(deters[-1]))
-        state = State(deters[-1], priors[-1].mean)
-    return torch.stack(deters, 1), Gaussian(*(torch.stack(part, 1) for part in zip(*priors, strict=True)))
 
 
 def mean_within(values: Tensor, within: Tensor) -> Tensor:

@@ -15,7 +15,7 @@ from torch.utils.flop_counter import FlopCounterMode
 
 from bench.machine import now
 from latentplan.config import Config
-from latentplan.models import WorldModel
+from latentplan.models import WorldModel, unroll
 from latentplan.replay import Batch, Replay, Rows
 from latentplan.training.graphed import WARM_UP_UPDATES as GRAPH_WARM_UP_UPDATES
 from latentplan.training.graphed import GraphedLearner
@@ -229,7 +229,7 @@ def _parts_alone(model: WorldModel, batch: Batch) -> Parts:
             return model.encoder(frames)
 
     def recur() -> Any:
-        return model.dynamics.observe(embeddings.requires_grad_(), batch.actions, batch.deter, noise)
+        return unroll.observe(model.dynamics, embeddings.requires_grad_(), batch.actions, batch.deter, noise)
 
     def decode() -> Tensor:
         with model.trunk_precision():

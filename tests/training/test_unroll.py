@@ -34,11 +34,11 @@ def weighed(outputs, generator_seed=1):
     return sum((part * torch.randn(part.shape, generator=generator)).sum() for part in outputs)
 
 
-def assert_same_gradients(ways, parameters, reached):
-    """The same outputs, and gradients, of which those of `reached` parameters are of something."""
+def assert_same_gradients(outputs_of, parameters, reached):
+    """The same outputs both ways, and gradients, of which those of `reached` parameters are of something."""
     outcomes = []
-    for way in ways:
-        outputs = way()
+    for pays in (False, True):
+        outputs = outputs_of(pays)
         outcomes.append((outputs, torch.autograd.grad(weighed(outputs), parameters, allow_unused=True)))
     (expected, gradients), (given, own) = outcomes
     for one, other in zip(expected, given, strict=True):
@@ -48,28 +48,28 @@ def assert_same_gradients(ways, parameters, reached):
         torch.testing.assert_close(other, one, rtol=1e-4, atol=1e-4)
 
 
-def test_what_is_observed_is_the_same(dynamics):
+def test_what_is_observed_is_the_same(dynamics, monkeypatch):
     embeddings = torch.randn(ROWS, TIME + 1, 7, requires_grad=True)
     actions, noise = torch.rand(ROWS, TIME, 3) * 2 - 1, torch.randn(ROWS, TIME + 1, 5)
     deter = torch.randn(ROWS, 12)
 
-    def outputs(observe):
-        state, posterior = observe(embeddings, actions, deter, noise)
+    def outputs(pays):
+        monkeypatch.setattr(unroll, "pays", lambda tensor: pays)
+        state, posterior = unroll.observe(dynamics, embeddings, actions, deter, noise)
         return (*state, *posterior)
 
-    ways = [lambda: outputs(dynamics.observe), lambda: outputs(lambda *given: unroll.observe(dynamics, *given))]
-    assert_same_gradients(ways, [embeddings, *dynamics.parameters()], 12)
+    assert_same_gradients(outputs, [embeddings, *dynamics.parameters()], 12)
 
 
-def test_what_is_followed_is_the_same(dynamics):
+def test_what_is_followed_is_the_same(dynamics, monkeypatch):
     start, actions = states(), torch.rand(ROWS, TIME, 3) * 2 - 1
 
-    def outputs(follow):
-        deter, prior = follow(dynamics, start, actions)
+    def outputs(pays):
+        monkeypatch.setattr(unroll, "pays", lambda tensor: pays)
+        deter, prior = unroll.follow(dynamics, start, actions)
         return (deter, *prior)
 
-    ways = [lambda: outputs(losses._follow), lambda: outputs(unroll.follow)]
-    assert_same_gradients(ways, list(dynamics.parameters()), 11)
+    assert_same_gradients(outputs, list(dynamics.parameters()), 11)
 
 
 @pytest.mark.parametrize("decay", [1.0, 0.7])
@@ -81,14 +81,14 @@ def test_what_is_dreamt_is_the_same(dynamics, decay):
         dynamics=dynamics, action_dim=3, config=SimpleNamespace(**SIZES), device=torch.device("cpu")
     )
 
-    def ways(with_unroll):
+    def outputs(pays):
         generator = torch.Generator().manual_seed(3)
-        if not with_unroll:
+        if not pays:
             return losses.roll_out(model, actor, start, TIME, generator, decay)
         features, std = unroll.dream(dynamics, actor, start, *losses._draws(model, TIME, ROWS, generator), decay)
         return features, losses._entropy(std)
 
-    assert_same_gradients([lambda: ways(False), lambda: ways(True)], list(actor.parameters()), 8)
+    assert_same_gradients(outputs, list(actor.parameters()), 8)
 
 
 def test_an_update_is_the_same(tiny, monkeypatch):
