@@ -11,6 +11,7 @@ from latentplan.config import Config, RunConfig, UserError
 from latentplan.replay import FRAME_BYTES
 
 UNKNOWN_LENGTH_CAPACITY = 200_000
+COLLECTOR_THREADS = 4  # at most: runs often share a machine
 
 
 def choose_device(run: RunConfig) -> torch.device:
@@ -32,8 +33,12 @@ def choose_threads(overlap: bool) -> int:
     Model and behaviour each take this many, and one core is left to the process that collects, if there is one: threads
     that wait for each other on a shared core crawl.
     """
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    return max(1, (cores - overlap) // 2)
+    return max(1, (_count_cores() - overlap) // 2)
+
+
+def collector_threads(device: torch.device) -> int:
+    """Threads of a process that collects beside a learner on a device: one where the learner wants the cores itself."""
+    return 1 if device.type == "cpu" else min(max(1, _count_cores() // 4), COLLECTOR_THREADS)
 
 
 def set_up_torch(threads: int, device: torch.device) -> None:
@@ -61,3 +66,7 @@ def replay_capacity(config: Config, saved: Path) -> int:
     per_episode = min(config.collection.episode_decisions or 20, 20)
     collected = 2 * config.collection.round_decisions + config.collection.prefill_decisions
     return max(int((1.0 + 1.0 / per_episode) * decisions) + collected, held)
+
+
+def _count_cores() -> int:
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

@@ -31,7 +31,7 @@ from latentplan.training.progress import Progress
 from latentplan.training.record import Record
 from latentplan.training.resources import choose_device, choose_threads, replay_capacity, set_up_torch
 from latentplan.training.state import INTERRUPTED, RunState, load_state, restore
-from latentplan.training.worker import LocalWorker, RemoteWorker, Worker
+from latentplan.training.worker import Worker, make_worker
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -135,11 +135,8 @@ class _Run:
         self.config, self.folder = config, folder
         self.device = choose_device(config.run)
         self.console = Progress(config.run)
-        overlap = config.collection.overlap
-        set_up_torch(config.run.threads or choose_threads(overlap), self.device)
-        self.worker: Worker = (
-            RemoteWorker(config, make_env) if overlap else LocalWorker(config, make_env, str(self.device))
-        )
+        set_up_torch(config.run.threads or choose_threads(config.collection.overlap), self.device)
+        self.worker: Worker = make_worker(config, make_env, self.device)
         try:
             self.worker.submit("describe")
             self.description: Description = self.worker.result()

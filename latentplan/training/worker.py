@@ -16,6 +16,7 @@ from gymnasium.vector.utils import CloudpickleWrapper
 from latentplan.config import Config, UserError
 from latentplan.envs import single_threaded_children
 from latentplan.training.collector import CLOSING_SECONDS, Collector, EnvFactory
+from latentplan.training.resources import collector_threads
 
 
 class LocalWorker:
@@ -39,12 +40,12 @@ class LocalWorker:
 
 
 class RemoteWorker:
-    """Calls methods of a `Collector` in a spawned process, on one core, while the caller goes on."""
+    """Calls methods of a `Collector` in a spawned process, on the CPU, while the caller goes on."""
 
-    def __init__(self, config: Config, make_user_env: EnvFactory | None) -> None:
+    def __init__(self, config: Config, make_user_env: EnvFactory | None, threads: int = 1) -> None:
         context = multiprocessing.get_context("spawn")
         self._connection, theirs = context.Pipe()
-        arguments = (theirs, make_user_env and CloudpickleWrapper(make_user_env), config)
+        arguments = (theirs, make_user_env and CloudpickleWrapper(make_user_env), config, threads)
         self._process = context.Process(target=_serve, args=arguments, daemon=config.env.num_envs == 1)
         with single_threaded_children():
             self._process.start()
@@ -96,12 +97,19 @@ class RemoteWorker:
 Worker = LocalWorker | RemoteWorker
 
 
-def _serve(connection: Connection, factory: EnvFactory | None, config: Config) -> None:
+def make_worker(config: Config, make_user_env: EnvFactory | None, device: torch.device) -> Worker:
+    """The worker that `collection.overlap` asks for, of a learner on a device."""
+    if config.collection.overlap:
+        return RemoteWorker(config, make_user_env, collector_threads(device))
+    return LocalWorker(config, make_user_env, str(device))
+
+
+def _serve(connection: Connection, factory: EnvFactory | None, config: Config, threads: int) -> None:
     import signal
 
     signal.signal(signal.SIGTERM, lambda *_: sys.exit())  # as an exit, so that the environments' processes end too
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches the whole group; the learner decides what follows
-    torch.set_num_threads(1)
+    torch.set_num_threads(threads)
     collector: Collector | None = None
     while True:
         try:

@@ -3,10 +3,12 @@
 from dataclasses import replace
 
 import pytest
+import torch
 
 from latentplan.config import CollectionConfig, Config, EnvConfig, ReplayConfig, RunConfig
 from latentplan.replay import FRAME_BYTES
-from latentplan.training.resources import replay_capacity
+from latentplan.training import resources
+from latentplan.training.resources import collector_threads, replay_capacity
 
 
 @pytest.mark.parametrize("budget", [{"minutes": 600.0}, {"frames": 1000}])
@@ -24,3 +26,10 @@ def test_short_episodes_fit_whole_into_replay(tmp_path):
     collection = CollectionConfig(episode_decisions=16)
     config = Config(run=RunConfig(frames=100_000), env=EnvConfig(action_repeat=1), collection=collection)
     assert replay_capacity(config, tmp_path) >= 100_000 * 17 / 16
+
+
+@pytest.mark.parametrize(("cores", "expected"), [(1, 1), (2, 1), (8, 2), (16, 4), (64, 4)])
+def test_a_process_that_collects_beside_a_gpu_plans_with_some_of_the_cores(cores, expected, monkeypatch):
+    monkeypatch.setattr(resources, "_count_cores", lambda: cores)
+    assert collector_threads(torch.device("cuda")) == expected
+    assert collector_threads(torch.device("cpu")) == 1
