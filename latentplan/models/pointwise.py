@@ -6,6 +6,7 @@ All are of plain tensors, without autograd. Names ending in `_back` take gradien
 from __future__ import annotations
 
 import functools
+import importlib.util
 from collections.abc import Callable
 from typing import Any
 
@@ -20,13 +21,13 @@ NORM_EPS = 1e-5
 
 
 def run(function: Callable[..., Any], *arguments: Any) -> Any:
-    """Call one of the functions here, compiled where its tensors are on a GPU."""
+    """Call one of the functions here, compiled where its tensors are on a GPU and torch can compile for it."""
     return (_compiled(function) if arguments[0].is_cuda else function)(*arguments)
 
 
 @functools.cache
 def _compiled(function: Callable[..., Any]) -> Callable[..., Any]:
-    return torch.compile(function, dynamic=False)
+    return function if importlib.util.find_spec("triton") is None else torch.compile(function, dynamic=False)
 
 
 def norm_silu(product: Tensor, scale: Tensor, shift: Tensor) -> Tensor:
