@@ -18,6 +18,7 @@ from latentplan.models.noise import CorrelatedNoise
 from latentplan.models.symmetry import TurnedModel, flat, folded, mean_over_turns, per_turn, turned, unturned
 from latentplan.planning import CEMPlanner, ModelPredictiveController
 from latentplan.planning.objectives import Constraint, Term
+from latentplan.random_agent import RandomAgent
 
 
 class ModelAgent:
@@ -163,6 +164,12 @@ class ModelAgent:
 class PlanningAgent(ModelAgent):
     """Decides by CEM-MPC in the latent, and executes only the first action of each plan.
 
+    With `planner.surprise_limit` the actor decides where the newest frame surprised the model: what it imagines from
+    there is to be trusted less than what it learned there.
+
+    Attributes:
+        num_surprised: Decisions so far, in the first environment, that were the actor's for that reason.
+
     Args:
         model: The world model.
         config: Settings it was trained with.
@@ -185,7 +192,9 @@ class PlanningAgent(ModelAgent):
         seed: int = 0,
     ) -> None:
         super().__init__(model, config, noise_std=noise_std, noise_correlation=noise_correlation, seed=seed)
-        search = CEMPlanner.from_config(planner or config.planner, action_dim=model.action_dim, discount=discount)
+        settings = planner or config.planner
+        self.surprise_limit, self.num_surprised = settings.surprise_limit, 0
+        search = CEMPlanner.from_config(settings, action_dim=model.action_dim, discount=discount)
         self.controller = ModelPredictiveController(search, self.imagined, generator=self.generator)
 
     def reset(self, mask: np.ndarray | None = None) -> None:
@@ -230,7 +239,13 @@ class PlanningAgent(ModelAgent):
         with self.model.trunk_precision():
             action = self.controller.act(state)
         self.last_source = self.controller.source
-        return action
+        if self.surprise_limit is None or self.controller.objective is not None or self.controller.constraints:
+            return action
+        is_surprised = self.imagined.surprise(state) > self.surprise_limit
+        if bool(is_surprised[0]):
+            self.num_surprised += self.last_source == "plan"
+            self.last_source = "actor"
+        return torch.where(is_surprised[:, None], self.imagined.policy(state), action)
 
 
 class ActorAgent(ModelAgent):
@@ -270,31 +285,6 @@ class ActorAgent(ModelAgent):
         if not self.explore:
             return mean
         return sample_action(mean, std, self.noise.draw(mean, self.generator, self._forget))
-
-
-class RandomAgent:
-    """Uniform actions in [-1, 1]."""
-
-    last_source = "actor"
-
-    def __init__(self, num_actions: int, seed: int = 0) -> None:
-        self.num_actions = num_actions
-        self.seed(seed)
-
-    def seed(self, seed: int) -> None:
-        """Restart the agent's random stream."""
-        self._rng = np.random.default_rng(seed)
-
-    def reset(self, mask: np.ndarray | None = None) -> None:
-        """Nothing to forget."""
-
-    def imagine(self) -> None:
-        """There is no plan to picture."""
-
-    def act(self, frame: np.ndarray) -> np.ndarray:
-        """A random action, float32 (action,), or (batch, action) for several frames."""
-        shape = (self.num_actions,) if frame.ndim == 3 else (len(frame), self.num_actions)
-        return self._rng.uniform(-1.0, 1.0, shape).astype(np.float32)
 
 
 Agent = PlanningAgent | ActorAgent | RandomAgent

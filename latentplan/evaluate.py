@@ -134,6 +134,8 @@ def _play_and_report(
             result = {**about, **summarize_timed(episodes, clock), **scores}
             if request.mode == "gated":  # where a plan goes on none was made
                 result["planned_fraction"] = result["action_source"]["plan"] / sum(result["action_source"].values())
+            if request.mode == "planner" and agent.surprise_limit is not None:
+                result["surprised"] = agent.num_surprised
             _report(request, result)
     return 130 if interrupted else 0
 
@@ -169,8 +171,12 @@ def _report(request: EvaluationRequest, result: dict[str, Any]) -> None:
         means = "   ".join(f"{name} {value:.2f}" for name, value in result["quantities"].items())
         print(f"on average   {means}")
     print(f"decision ms  {latency}", flush=True)
-    failed = result["action_source"]["tail"] + result["action_source"]["actor"]
-    if failed and request.mode == "planner":
+    surprised = result.get("surprised", 0)
+    if surprised:
+        decisions = sum(result["action_source"].values())
+        print(f"surprised    {surprised} of {decisions} decisions are its actor's", flush=True)
+    failed = result["action_source"]["tail"] + result["action_source"]["actor"] - surprised
+    if failed > 0 and request.mode == "planner":
         why = "the search found nothing finite"
         if result["planner"]["deadline_ms"] is not None:
             why = f"there was no time for a search, or {why}"

@@ -35,6 +35,9 @@ class PlannerConfig:
         noise_beta: Exponent of coloured sampling noise; 0 is white.
         keep_elite_fraction: Share of the elites kept for the next iteration and the next plan.
         deadline_ms: Milliseconds that a search may take; null lets it do all its iterations.
+        surprise_limit: Nats by which a frame may differ from what was predicted of it (`WorldModel.surprise`) for
+            `PlanningAgent` to trust the plan from there: beyond, the actor acts; null trusts it always, and so does an
+            agent to which a goal or constraint is set, of which the actor knows nothing.
     """
 
     horizon: int = 8
@@ -57,11 +60,12 @@ class PlannerConfig:
     noise_beta: float = 0.0
     keep_elite_fraction: float = 0.0
     deadline_ms: float | None = None
+    surprise_limit: float | None = None
 
     def __post_init__(self) -> None:
         at_least(self, horizon=1, num_samples=2, num_elites=1, num_iterations=1, warm_start_iterations=1)
         at_least(self, num_policy_samples=0, init_std=0.0, min_std=0.0, noise_beta=0.0)
-        above_zero(self, "goal_horizon", "smoothing", "deadline_ms")
+        above_zero(self, "goal_horizon", "smoothing", "deadline_ms", "surprise_limit")
         within(self, smoothing=(0.0, 1.0), keep_elite_fraction=(0.0, 1.0))
         one_of(self, start=("shifted", "policy", "both"), tail=("zero", "hold", "policy"))
         one_of(self, warm_start_variance=("reset", "keep", "inflate"), final=("mean", "best", "better"))

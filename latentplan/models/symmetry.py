@@ -107,6 +107,10 @@ class TurnedModel:
         """The mean of the turns' probabilities of going on, (batch,)."""
         return mean_over_turns(self.model.continues(flat(state)), state)
 
+    def surprise(self, state: State) -> Tensor:
+        """The mean of the turns' surprise, in nats, (batch,)."""
+        return mean_over_turns(self.model.surprise(flat(state)), state)
+
     def policy(self, state: State, generator: torch.Generator | None = None) -> Tensor:
         """The mean of the turns' actions, (batch, action): samples with a generator, modes without."""
         return mean_over_turns(self.model.policy(flat(state), generator), state)

@@ -224,6 +224,14 @@ class WorldModel(nn.Module):
             self._kept = kept
         return kept[1]
 
+    def surprise(self, state: State) -> Tensor:
+        """How far the latents of beliefs lie from what was predicted of them, in nats, (rows,).
+
+        Half the squared distance from the prior's mean, in its standard deviations: what a frame told against it.
+        """
+        prior = self.dynamics.prior(state.deter)
+        return 0.5 * ((state.stoch - prior.mean) / prior.std).square().sum(-1)
+
     def _advance_mean(self, state: State, action: Tensor) -> State:
         deter = self.dynamics.advance(state, action)
         return State(deter, self.dynamics.prior(deter).mean)

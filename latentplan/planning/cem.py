@@ -130,6 +130,7 @@ class CEMPlanner:
     ) -> CEMPlanner:
         """The planner that a configuration describes, for actions of `action_dim` numbers."""
         options: dict[str, Any] = {f.name: getattr(config, f.name) for f in dataclasses.fields(config)}
+        del options["surprise_limit"]  # an agent's: a planner sees no frames
         return cls(action_dim=action_dim, discount=discount, action_low=action_low, action_high=action_high, **options)
 
     def plan(

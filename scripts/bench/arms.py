@@ -75,7 +75,8 @@ def parse_arms(text: str, base: PlannerConfig) -> list[Arm]:
 def without_actor(base: PlannerConfig) -> dict[str, Any]:
     """The settings that keep the actor out of a search."""
     tail = {"tail": "zero"} if base.tail == "policy" else {}
-    return {"num_policy_samples": 0, "start": "shifted", **tail}
+    trust = {} if base.surprise_limit is None else {"surprise_limit": None}
+    return {"num_policy_samples": 0, "start": "shifted", **tail, **trust}
 
 
 def play_arm(checkpoint: str, arm: Arm, seeds: Sequence[int], device: str, threads: int) -> Outcome:
