@@ -1,4 +1,4 @@
-"""What lies between the matrix products of a step, forwards and backwards: each function is one kernel on a GPU.
+"""What lies between the matrix products of a step, forwards and backwards: on a GPU a kernel each, or two.
 
 All are of plain tensors, without autograd. Names ending in `_back` take gradients of what the others return.
 """
