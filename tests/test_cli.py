@@ -58,10 +58,10 @@ def test_the_last_of_a_repeated_flag_wins():
 
 
 def test_file_beats_preset_and_flags_beat_the_file(config_file):
-    path = config_file("env: {action_repeat: 3, camera: 1}\nlearning: {batch_size: 5}\n")
+    path = config_file("env: {action_repeat: 3, camera: 1}\nlearning: {batch_size: 5}\n")  # the preset has 32
     config = parse(f"--preset gpu --config {path} --env.camera 0")
     assert (config.env.action_repeat, config.env.camera) == (3, 0)
-    assert (config.learning.batch_size, config.learning.sequence_length) == (5, 32)
+    assert (config.learning.batch_size, config.learning.imagination_starts) == (5, 512)
 
 
 def test_preset_beats_domain_and_task_beats_domain(tmp_path, monkeypatch):
@@ -108,11 +108,11 @@ def test_every_shipped_file_is_valid(stem):
     compose.build_config(compose.read_layer(compose.config_folder() / f"{stem}.yaml"))
 
 
-def test_presets_differ_only_in_sizes_ratios_and_budget():
+def test_presets_differ_only_in_sizes_ratios_budget_and_where_learning_lives():
     sizes = {
         "model": {"deter_dim", "hidden_dim", "encoder_channels", "decoder_channels"},
         "planner": {"num_samples", "num_elites", "num_policy_samples"},
-        "learning": {"batch_size", "sequence_length", "imagination_starts"},
+        "learning": {"batch_size", "sequence_length", "imagination_starts", "cuda_graph"},
         "collection": {"round_decisions", "updates_per_decision"},
         "env": {"num_envs"},
         "replay": {"on_device"},
