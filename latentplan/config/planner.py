@@ -35,9 +35,9 @@ class PlannerConfig:
         noise_beta: Exponent of coloured sampling noise; 0 is white.
         keep_elite_fraction: Share of the elites kept for the next iteration and the next plan.
         deadline_ms: Milliseconds that a search may take; null lets it do all its iterations.
-        surprise_limit: Nats by which a frame may differ from what was predicted of it (`WorldModel.surprise`) for
-            `PlanningAgent` to trust the plan from there: beyond, the actor acts; null trusts it always, and so does an
-            agent to which a goal or constraint is set, of which the actor knows nothing.
+        surprise_limit: Nats by which a frame may differ from what was predicted of it (`WorldModel.surprise`) for the
+            plan from there to be trusted: beyond, the actor acts; null trusts it always. Heeded by `--mode planner`,
+            unless a goal or constraint is set, of which the actor knows nothing.
     """
 
     horizon: int = 8
