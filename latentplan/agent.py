@@ -242,6 +242,8 @@ class PlanningAgent(ModelAgent):
         if self.surprise_limit is None or self.controller.objective is not None or self.controller.constraints:
             return action
         is_surprised = self.imagined.surprise(state) > self.surprise_limit
+        if not bool(is_surprised.any()):
+            return action
         if bool(is_surprised[0]):
             self.num_surprised += self.last_source == "plan"
             self.last_source = "actor"
