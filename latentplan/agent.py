@@ -168,7 +168,7 @@ class PlanningAgent(ModelAgent):
     there is to be trusted less than what it learned there.
 
     Attributes:
-        num_surprised: Decisions so far, in the first environment, that were the actor's for that reason.
+        was_surprised: Whether that is why the latest action was the actor's, in the first environment.
 
     Args:
         model: The world model.
@@ -193,7 +193,7 @@ class PlanningAgent(ModelAgent):
     ) -> None:
         super().__init__(model, config, noise_std=noise_std, noise_correlation=noise_correlation, seed=seed)
         settings = planner or config.planner
-        self.surprise_limit, self.num_surprised = settings.surprise_limit, 0
+        self.surprise_limit, self.was_surprised = settings.surprise_limit, False
         search = CEMPlanner.from_config(settings, action_dim=model.action_dim, discount=discount)
         self.controller = ModelPredictiveController(search, self.imagined, generator=self.generator)
 
@@ -219,8 +219,8 @@ class PlanningAgent(ModelAgent):
 
     @torch.no_grad()
     def imagine(self) -> np.ndarray | None:
-        """The decoded last state of the present plan, uint8 (32, 32, 3), of the first environment."""
-        if self.controller.plan is None or self.state is None:
+        """The decoded last state of the plan that is followed, uint8 (32, 32, 3), of the first environment."""
+        if self.controller.plan is None or self.state is None or self.was_surprised:
             return None
         return self._picture(self.state, self.controller.plan.actions)
 
@@ -239,14 +239,14 @@ class PlanningAgent(ModelAgent):
         with self.model.trunk_precision():
             action = self.controller.act(state)
         self.last_source = self.controller.source
+        self.was_surprised = False
         if self.surprise_limit is None or self.controller.objective is not None or self.controller.constraints:
             return action
         is_surprised = self.imagined.surprise(state) > self.surprise_limit
         if not bool(is_surprised.any()):
             return action
         if bool(is_surprised[0]):
-            self.num_surprised += self.last_source == "plan"
-            self.last_source = "actor"
+            self.was_surprised, self.last_source = self.last_source == "plan", "actor"
         return torch.where(is_surprised[:, None], self.imagined.policy(state), action)
 
 

@@ -6,6 +6,7 @@ Torch and the simulator are imported when a rollout needs them, so that `--help`
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import json
 import os
 import sys
@@ -135,7 +136,7 @@ def _play_and_report(
             if request.mode == "gated":  # where a plan goes on none was made
                 result["planned_fraction"] = result["action_source"]["plan"] / sum(result["action_source"].values())
             if request.mode == "planner" and agent.surprise_limit is not None:
-                result["surprised"] = agent.num_surprised
+                result["surprised"] = sum(episode.surprised for episode in episodes)
             _report(request, result)
     return 130 if interrupted else 0
 
@@ -155,7 +156,11 @@ def _describe(
         "floor": env.floor,
         "renderer": render_info()["renderer"],
     }
-    return {**described, "planner": to_dict(planner)} if request.mode in PLANNING_MODES else described
+    if request.mode not in PLANNING_MODES:
+        return described
+    if request.mode != "planner" or request.objective is not None or request.constraint is not None:
+        planner = dataclasses.replace(planner, surprise_limit=None)  # which is not heeded then
+    return {**described, "planner": to_dict(planner)}
 
 
 def _report(request: EvaluationRequest, result: dict[str, Any]) -> None:

@@ -78,6 +78,7 @@ class Episode:
         env_frames: Simulator control steps, counted before action repeat.
         decision_ms: Milliseconds from a frame in memory to an action, (decision,).
         action_source: Decisions by what their action came from: "plan", "tail" or "actor".
+        surprised: Those of "actor" where there was a plan that a surprising frame discredited.
     """
 
     total_return: float
@@ -85,6 +86,7 @@ class Episode:
     env_frames: int
     decision_ms: Floats
     action_source: dict[str, int] = field(default_factory=dict)
+    surprised: int = 0
 
 
 OnStep = Callable[[Step], None]
@@ -138,12 +140,13 @@ def _run_episode(env: gymnasium.Env[Any, Any], agent: Agent, index: int, seed: i
     agent.seed(derive_seed(seed, "agent"))  # a stream of its own: the start must not correlate with the actions
     total_return, env_frames, over = 0.0, 0, False
     decision_ms: list[float] = []
-    action_source = dict.fromkeys(SOURCES, 0)
+    action_source, surprised = dict.fromkeys(SOURCES, 0), 0
     while not over:
         started = time.perf_counter()
         action = agent.act(frame)
         decision_ms.append(1000.0 * (time.perf_counter() - started))
         action_source[getattr(agent, "last_source", "actor")] += 1
+        surprised += getattr(agent, "was_surprised", False)
         if on_step is not None:
             on_step(Step(index, len(decision_ms) - 1, total_return, frame, action))
         frame, reward, terminated, truncated, info = env.step(action)
@@ -152,7 +155,7 @@ def _run_episode(env: gymnasium.Env[Any, Any], agent: Agent, index: int, seed: i
         over = terminated or truncated
     if on_step is not None:
         on_step(Step(index, len(decision_ms), total_return, frame, None))
-    return Episode(total_return, len(decision_ms), env_frames, np.asarray(decision_ms), action_source)
+    return Episode(total_return, len(decision_ms), env_frames, np.asarray(decision_ms), action_source, surprised)
 
 
 def summarize(episodes: Sequence[Episode]) -> dict[str, Any]:

@@ -206,6 +206,7 @@ class _Record:
         self.deadline_misses = 0
         self._decision_ms: list[float] = []
         self._sources = dict.fromkeys(SOURCES, 0)
+        self._surprised = 0
         self._plan_age_ms: list[float] = []
         self._planned_ms = 0.0  # when the present plan's frame was seen
 
@@ -214,6 +215,7 @@ class _Record:
         self._decision_ms.append(decision_ms)
         source = getattr(agent, "last_source", "actor")
         self._sources[source] += 1
+        self._surprised += getattr(agent, "was_surprised", False)
         if source == "actor":
             return
         if isinstance(agent, BackgroundAgent) and isinstance(agent.scheduler.executor, VirtualExecutor):
@@ -231,6 +233,7 @@ class _Record:
             env_frames,
             np.asarray(self._decision_ms),
             self._sources,
+            self._surprised,
             self.deadline_misses,
             np.asarray(self._plan_age_ms),
         )

@@ -209,8 +209,9 @@ def test_a_search_that_finds_nothing_finite_is_told(capsys, checkpoint, monkeypa
     assert "at 10 decisions the search found nothing finite" in capsys.readouterr().err
 
 
-def test_what_surprised_the_model_is_no_failed_search(capsys, tmp_path, checkpoint):
-    result = result_of(tmp_path, checkpoint, "--episodes", 1, "--planner.surprise_limit", 1e-9)
+@pytest.mark.parametrize("flags", [[], ["--control-hz", 1]])
+def test_what_surprised_the_model_is_no_failed_search(capsys, tmp_path, checkpoint, flags):
+    result = result_of(tmp_path, checkpoint, "--episodes", 1, "--planner.surprise_limit", 1e-9, *flags)
     assert result["surprised"] == result["action_source"]["actor"] == 10
     told = capsys.readouterr()
     assert "surprised    10 of 10 decisions" in told.out and told.err == ""

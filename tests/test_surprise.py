@@ -66,7 +66,8 @@ def test_where_a_frame_surprises_the_model_the_actor_acts(model, frames, monkeyp
         expected = acted if surprise[row] > limit else planned
         assert np.allclose(action[row], expected[row], atol=0.02)
     is_surprised = bool(surprise[0] > limit)
-    assert limited.last_source == ("actor" if is_surprised else "plan") and limited.num_surprised == is_surprised
+    assert (limited.imagine() is None) == is_surprised
+    assert limited.last_source == ("actor" if is_surprised else "plan") and limited.was_surprised == is_surprised
 
 
 @pytest.mark.parametrize("asked", ASKED)

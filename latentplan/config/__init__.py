@@ -208,7 +208,8 @@ class Config:
         if self.model.turns > 1 and self.learning.turned_share == 0.0:
             raise UserError("model.turns 4 needs learning.turned_share above 0: turned frames have to be learned from")
         if self.learning.cuda_graph and not self.replay.on_device:
-            raise UserError("learning.cuda_graph needs replay.on_device: a graph gathers its sequences itself")
+            why = "a graph gathers its sequences itself; give both, or neither"
+            raise UserError(f"learning.cuda_graph needs replay.on_device: {why}")
 
 
 def to_dict(config: Any) -> dict[str, Any]:

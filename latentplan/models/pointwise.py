@@ -6,7 +6,7 @@ All are of plain tensors, without autograd. Names ending in `_back` take gradien
 from __future__ import annotations
 
 import functools
-import importlib.util
+import warnings
 from collections.abc import Callable
 from typing import Any
 
@@ -18,6 +18,7 @@ from latentplan.models.dynamics import UPDATE_SHIFT, latent_std
 from latentplan.models.heads import action_distribution
 
 NORM_EPS = 1e-5
+MOST_SHAPES = 64  # for which a function is compiled: beyond, torch runs it uncompiled
 
 
 def run(function: Callable[..., Any], *arguments: Any) -> Any:
@@ -27,7 +28,22 @@ def run(function: Callable[..., Any], *arguments: Any) -> Any:
 
 @functools.cache
 def _compiled(function: Callable[..., Any]) -> Callable[..., Any]:
-    return function if importlib.util.find_spec("triton") is None else torch.compile(function, dynamic=False)
+    return torch.compile(function, dynamic=False) if can_compile("cuda") else function
+
+
+@functools.cache
+def can_compile(device: str) -> bool:
+    """Whether torch compiles for a device here, tried once: it wants a C compiler, and a GPU that Triton knows."""
+    import torch._dynamo
+
+    torch._dynamo.config.recompile_limit = max(torch._dynamo.config.recompile_limit, MOST_SHAPES)
+    try:
+        torch.compile(lambda values: values + 1.0, dynamic=False)(torch.zeros(2, device=device))
+    except Exception as error:  # each part of the compiler raises types of its own
+        reason = (str(error).strip() or type(error).__name__).splitlines()[0]
+        warnings.warn(f"torch cannot compile here, so updates take longer: {reason}", RuntimeWarning, stacklevel=2)
+        return False
+    return True
 
 
 def norm_silu(product: Tensor, scale: Tensor, shift: Tensor) -> Tensor:

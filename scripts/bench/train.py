@@ -31,9 +31,13 @@ def run(flags: Flags) -> int:
     config = composed_config(flags)
     device = choose_device(flags)
     action_dim = action_size(flags, config)
+    import torch
+
     from bench.machine import describe_machine, product_limits
     from bench.update import measure_update
+    from latentplan.training.resources import set_up_torch
 
+    set_up_torch(torch.get_num_threads(), device)  # as a run does
     before = product_limits(device)
     measured = measure_update(config, action_dim, device, updates)
     after = product_limits(device)  # the better of two: other work may have disturbed one
