@@ -181,7 +181,7 @@ def _report(request: EvaluationRequest, result: dict[str, Any]) -> None:
         decisions = sum(result["action_source"].values())
         print(f"surprised    {surprised} of {decisions} decisions are its actor's", flush=True)
     failed = result["action_source"]["tail"] + result["action_source"]["actor"] - surprised
-    if failed > 0 and request.mode == "planner":
+    if failed and request.mode == "planner":
         why = "the search found nothing finite"
         if result["planner"]["deadline_ms"] is not None:
             why = f"there was no time for a search, or {why}"

@@ -7,23 +7,12 @@ import pytest
 import torch
 
 from latentplan.agent import ActorAgent, PlanningAgent, RandomAgent
-from latentplan.config import Config, ModelConfig, PlannerConfig
-from latentplan.models import WorldModel
-
-CONFIG = Config(
-    model=ModelConfig(deter_dim=16, hidden_dim=16, encoder_channels=(8, 8), decoder_channels=2, num_bins=15),
-    planner=PlannerConfig(horizon=3, num_samples=24, num_elites=6, num_iterations=2, num_policy_samples=4),
-)
+from tests.small_agents import CONFIG, make_model
 
 
 @pytest.fixture(scope="module")
 def model():
-    torch.manual_seed(0)
-    model = WorldModel(CONFIG.model, action_dim=2)
-    with torch.no_grad():
-        model.reward_head.mlp.output.weight.normal_(std=0.3)
-        model.actor.mlp.output.weight.normal_(std=0.3)
-    return model
+    return make_model()
 
 
 def make_planner(model, **options):

@@ -57,19 +57,16 @@ class Rssm(nn.Module):
         """The next deterministic state (rows, deter) after action (rows, action)."""
         hidden = self.input(torch.cat([state.stoch, action], -1))
         gates = self.gates_norm(self.gates(torch.cat([hidden, state.deter.to(hidden.dtype)], -1)))
-        reset, candidate, update = gates.chunk(3, -1)
-        candidate = torch.tanh(torch.sigmoid(reset) * candidate)
-        dtype = state.deter.dtype
-        return torch.lerp(state.deter, candidate.to(dtype), torch.sigmoid(update - UPDATE_SHIFT).to(dtype))
+        return next_deter(gates, state.deter)
 
     def prior(self, deter: Tensor) -> Gaussian:
         """What the latent will be, judged from the past alone, for deter (..., deter)."""
-        return _gaussian(self.prior_output(self.prior_hidden(deter)))
+        return gaussian(self.prior_output(self.prior_hidden(deter)))
 
     def posterior(self, deter: Tensor, embedding: Tensor) -> Gaussian:
         """What the latent is, given deter (..., deter) and the frame's embedding (..., embedding)."""
         hidden = functional.silu(self.posterior_norm(self.posterior_deter(deter) + embedding))
-        return _gaussian(self.posterior_output(hidden))
+        return gaussian(self.posterior_output(hidden))
 
     def observe(self, embeddings: Tensor, actions: Tensor, deter: Tensor, noise: Tensor) -> tuple[State, Gaussian]:
         """Follow a sequence of frames.
@@ -123,11 +120,14 @@ def kl_divergence(left: Gaussian, right: Gaussian) -> Tensor:
     return 0.5 * (ratio + distance - 1.0 - ratio.log()).sum(-1)
 
 
-def _gaussian(raw: Tensor) -> Gaussian:
+def next_deter(gates: Tensor, deter: Tensor) -> Tensor:
+    """The deterministic state (rows, deter) that normed gates (rows, 3 deter) lead to: reset, candidate and update."""
+    reset, candidate, update = gates.chunk(3, -1)
+    candidate = torch.tanh(torch.sigmoid(reset) * candidate)
+    return torch.lerp(deter, candidate.to(deter.dtype), torch.sigmoid(update - UPDATE_SHIFT).to(deter.dtype))
+
+
+def gaussian(raw: Tensor) -> Gaussian:
+    """The latent's distribution, for what a layer returned (..., 2 latent); std in 0.1 to 2.1."""
     mean, raw_std = raw.float().chunk(2, -1)
-    return Gaussian(mean, latent_std(raw_std))
-
-
-def latent_std(raw: Tensor) -> Tensor:
-    """Standard deviation of the latent, above `MIN_STD`, for what a layer returned (..., latent)."""
-    return 2.0 * torch.sigmoid(raw / 2.0) + MIN_STD
+    return Gaussian(mean, 2.0 * torch.sigmoid(raw_std / 2.0) + MIN_STD)

@@ -21,6 +21,8 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
+from latentplan.models.dynamics import next_deter
+
 SOURCES = tuple(Path(__file__).with_name(name) for name in ("rows.h", "vectors.h", "kernels.c", "imagine.c"))
 # Sums may be taken in any order, without which none would be a vector's; nothing else of IEEE 754 is given up.
 ARITHMETIC = ("-fassociative-math", "-fno-signed-zeros", "-fno-trapping-math", "-fno-math-errno")
@@ -60,9 +62,7 @@ def gates(product: Tensor, norm: Norm, deter: Tensor) -> tuple[Tensor, Tensor]:
     library = _library_for(product, scale, shift, deter)
     if library is None:
         normed = functional.layer_norm(product.to(scale.dtype), product.shape[-1:], scale, shift).to(deter.dtype)
-        reset, candidate, update = normed.chunk(3, -1)
-        candidate = torch.tanh(torch.sigmoid(reset) * candidate)
-        following = torch.lerp(deter, candidate, torch.sigmoid(update - 1.0))
+        following = next_deter(normed, deter)
         return following, following.to(product.dtype)
     deter = deter.contiguous()
     following, rounded = torch.empty_like(deter), torch.empty_like(deter, dtype=product.dtype)

@@ -14,15 +14,15 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from latentplan.models.dynamics import UPDATE_SHIFT, latent_std
-from latentplan.models.heads import action_distribution
+from latentplan.models.dynamics import UPDATE_SHIFT, gaussian, next_deter
+from latentplan.models.heads import action_distribution, sample_action
 
 NORM_EPS = 1e-5
 MOST_SHAPES = 64  # for which a function is compiled: beyond, torch runs it uncompiled
 
 
 def run(function: Callable[..., Any], *arguments: Any) -> Any:
-    """Call one of the functions here, compiled where its tensors are on a GPU and torch can compile for it."""
+    """Call a function such as those here, compiled where its tensors are on a GPU and torch can compile for it."""
     return (_compiled(function) if arguments[0].is_cuda else function)(*arguments)
 
 
@@ -69,9 +69,7 @@ def norm_silu_back(gradient: Tensor, product: Tensor, scale: Tensor, shift: Tens
 def gated(product: Tensor, scale: Tensor, shift: Tensor, deter: Tensor) -> Tensor:
     """The next deter (rows, deter) from reset, candidate and update gates side by side, as in `Rssm.advance`."""
     normed = functional.layer_norm(product, product.shape[-1:], scale, shift, NORM_EPS)
-    reset, candidate, update = normed.chunk(3, -1)
-    candidate = torch.tanh(torch.sigmoid(reset) * candidate)
-    return torch.lerp(deter, candidate, torch.sigmoid(update - UPDATE_SHIFT))
+    return next_deter(normed, deter)
 
 
 def gated_back(
@@ -115,7 +113,7 @@ def gated_back(
 
 def drawn(raw: Tensor, noise: Tensor | None, action: Tensor | None) -> tuple[Tensor, Tensor, Tensor, Tensor | None]:
     """A latent, or without noise its mean; mean and std, (rows, latent) each; the latent beside the next action."""
-    mean, std = _gaussian(raw)
+    mean, std = gaussian(raw)
     stoch = mean if noise is None else mean + std * noise
     return stoch, mean, std, None if action is None else torch.cat([stoch, action], -1)
 
@@ -143,37 +141,20 @@ def drawn_back(
 
 def felt(raw: Tensor, noise: Tensor, deter: Tensor) -> tuple[Tensor, Tensor]:
     """A latent (rows, latent), and the features that it makes with deter."""
-    mean, std = _gaussian(raw)
+    mean, std = gaussian(raw)
     stoch = mean + std * noise
     return stoch, torch.cat([deter, stoch], -1)
 
 
 def acted(raw: Tensor, noise: Tensor, stoch: Tensor) -> Tensor:
     """The latent beside an actor's sample, for what the actor's last layer returned (rows, 2 action)."""
-    mean, std = action_distribution(raw)
-    return torch.cat([stoch, (mean + std * noise).clamp(-1.0, 1.0)], -1)
+    return torch.cat([stoch, sample_action(*action_distribution(raw), noise)], -1)
 
 
 def norm_back(of_scaled: Tensor, product: Tensor) -> tuple[Tensor, Tensor]:
     """Gradients of a layer norm's scale and shift, (size,) each, over rows (rows, size)."""
     centred, rstd = _centred(product)
     return (of_scaled * centred * rstd).sum(0), of_scaled.sum(0)
-
-
-def lambda_return(rewards: Tensor, discounts: Tensor, values: Tensor, lambda_: float) -> Tensor:
-    """The recursion of `training.losses.lambda_return`, over the first dim; autograd follows it."""
-    following, returns = values[-1], []
-    steps = zip(rewards.unbind(), discounts.unbind(), values.unbind(), strict=True)
-    for reward, discount, value in reversed(list(steps)):
-        mixed = (1.0 - lambda_) * value + lambda_ * following
-        following = reward + discount * mixed
-        returns.append(following)
-    return torch.stack(returns[::-1])
-
-
-def _gaussian(raw: Tensor) -> tuple[Tensor, Tensor]:
-    mean, raw_std = raw.chunk(2, -1)
-    return mean, latent_std(raw_std)
 
 
 def _centred(product: Tensor) -> tuple[Tensor, Tensor]:

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from latentplan.models.dynamics import State
+from latentplan.models.dynamics import State, next_deter
 from latentplan.models.encoder import FRAME_SIZE, PATCH
 from latentplan.models.heads import NormedLinear, action_distribution
 from latentplan.models.world_model import WorldModel
@@ -90,8 +90,7 @@ def advance(reflex: Reflex, state: State, action: Tensor) -> Tensor:
     weight, norm = reflex.gates
     product = functional.linear(torch.cat([hidden, state.deter], -1), weight)
     gates = functional.layer_norm(product, product.shape[-1:], *norm, NORM_EPS)
-    reset, candidate, update = gates.chunk(3, -1)
-    return torch.lerp(state.deter, torch.tanh(torch.sigmoid(reset) * candidate), torch.sigmoid(update - 1.0))
+    return next_deter(gates, state.deter)
 
 
 def act(reflex: Reflex, state: State) -> tuple[Tensor, Tensor]:

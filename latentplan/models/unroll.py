@@ -15,7 +15,7 @@ from torch import Tensor
 
 from latentplan.models import pointwise
 from latentplan.models.dynamics import Gaussian, State
-from latentplan.models.heads import NormedLinear
+from latentplan.models.heads import NormedLinear, sample_action
 from latentplan.models.pointwise import run
 
 if TYPE_CHECKING:
@@ -90,7 +90,7 @@ def dream(
         stacked = torch.stack(features)
     # The actor's own gradient is no recurrence: it is asked once more, about all states at once.
     mean, std = actor(stacked[:-1])
-    actions = mean + std * action_noise
+    actions = sample_action(mean, std, action_noise)
     return _Dreamt.apply(actions, stacked, steps, noise, decay), std
 
 

@@ -185,8 +185,18 @@ def lambda_return(rewards: Tensor, discounts: Tensor, values: Tensor, lambda_: f
     Returns:
         The return from state t on, (time, ...).
     """
-    returns: Tensor = pointwise.run(pointwise.lambda_return, rewards, discounts, values, lambda_)
+    returns: Tensor = pointwise.run(_lambda_return, rewards, discounts, values, lambda_)
     return returns
+
+
+def _lambda_return(rewards: Tensor, discounts: Tensor, values: Tensor, lambda_: float) -> Tensor:
+    following, returns = values[-1], []
+    steps = zip(rewards.unbind(), discounts.unbind(), values.unbind(), strict=True)
+    for reward, discount, value in reversed(list(steps)):
+        mixed = (1.0 - lambda_) * value + lambda_ * following
+        following = reward + discount * mixed
+        returns.append(following)
+    return torch.stack(returns[::-1])
 
 
 def value_loss(head: ScalarHead, features: Tensor, returns: Tensor, weights: Tensor) -> Tensor:

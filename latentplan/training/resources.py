@@ -45,7 +45,7 @@ def set_up_torch(threads: int, device: torch.device) -> None:
     """Have torch compute with so many threads and, on a GPU, on its tensor cores."""
     torch.set_num_threads(threads)
     if device.type == "cuda":
-        torch.set_float32_matmul_precision("high")  # TF32: three more bits than bfloat16, at the speed of it
+        torch.set_float32_matmul_precision("high")  # TF32, which has three more bits than bfloat16
 
 
 def replay_capacity(config: Config, saved: Path) -> int:
