@@ -97,10 +97,10 @@ def test_values_take_the_types_of_their_fields():
 
 def test_auto_takes_the_preset_of_the_machine(monkeypatch):
     monkeypatch.setattr(compose, "has_cuda", lambda: True)
-    assert parse("").env == parse("--preset gpu").env
-    assert parse("--device cpu").env == parse("--preset cpu").env
+    assert parse("").learning == parse("--preset gpu").learning
+    assert parse("--device cpu").learning == parse("--preset cpu").learning != parse("--preset gpu").learning
     monkeypatch.setattr(compose, "has_cuda", lambda: False)
-    assert parse("").env == parse("--preset cpu").env
+    assert parse("").learning == parse("--preset cpu").learning
 
 
 @pytest.mark.parametrize("stem", CONFIG_FILES)
