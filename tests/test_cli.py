@@ -108,13 +108,11 @@ def test_every_shipped_file_is_valid(stem):
     compose.build_config(compose.read_layer(compose.config_folder() / f"{stem}.yaml"))
 
 
-def test_presets_differ_only_in_sizes_ratios_budget_and_where_learning_lives():
+def test_presets_differ_only_in_sizes_budget_and_where_learning_lives():
     sizes = {
         "model": {"deter_dim", "hidden_dim", "encoder_channels", "decoder_channels"},
         "planner": {"num_samples", "num_elites", "num_policy_samples"},
         "learning": {"batch_size", "sequence_length", "imagination_starts", "cuda_graph"},
-        "collection": {"round_decisions", "updates_per_decision"},
-        "env": {"num_envs"},
         "replay": {"on_device"},
         "run": {"minutes", "threads"},
     }

@@ -14,13 +14,13 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from latentplan.models.dynamics import State, next_deter
+from latentplan.models import pointwise
+from latentplan.models.dynamics import State
 from latentplan.models.encoder import FRAME_SIZE, PATCH
 from latentplan.models.heads import NormedLinear, action_distribution
 from latentplan.models.world_model import WorldModel
 
 KERNEL, STRIDE, PADDING = 4, 2, 1  # of the encoder's convolutions
-NORM_EPS = 1e-5
 
 Affine = tuple[Tensor, Tensor]  # weight (out, in) and shift (out,)
 Norm = tuple[Tensor, Tensor]  # scale and shift
@@ -81,7 +81,7 @@ def lay_out(model: WorldModel) -> Reflex:
 def see(reflex: Reflex, deter: Tensor, frames: Tensor) -> State:
     """The belief with posterior mean for deter (rows, deter) and uint8 frames (rows, 64, 64, 3)."""
     product = functional.linear(deter, reflex.posterior_deter) + _embed(reflex, frames)
-    return State(deter, functional.linear(_normed(product, reflex.posterior_norm), *reflex.posterior_mean))
+    return State(deter, functional.linear(pointwise.norm_silu(product, *reflex.posterior_norm), *reflex.posterior_mean))
 
 
 def advance(reflex: Reflex, state: State, action: Tensor) -> Tensor:
@@ -89,8 +89,7 @@ def advance(reflex: Reflex, state: State, action: Tensor) -> Tensor:
     hidden = _layer(torch.cat([state.stoch, action], -1), reflex.input)
     weight, norm = reflex.gates
     product = functional.linear(torch.cat([hidden, state.deter], -1), weight)
-    gates = functional.layer_norm(product, product.shape[-1:], *norm, NORM_EPS)
-    return next_deter(gates, state.deter)
+    return pointwise.gated(product, *norm, state.deter)
 
 
 def act(reflex: Reflex, state: State) -> tuple[Tensor, Tensor]:
@@ -130,11 +129,7 @@ def _windows(picture: Tensor) -> Tensor:
 
 def _layer(features: Tensor, layer: Hidden) -> Tensor:
     weight, norm = layer
-    return _normed(functional.linear(features, weight), norm)
-
-
-def _normed(product: Tensor, norm: Norm) -> Tensor:
-    return functional.silu(functional.layer_norm(product, product.shape[-1:], *norm, NORM_EPS))
+    return pointwise.norm_silu(functional.linear(features, weight), *norm)
 
 
 def _convolution(layer: nn.Conv2d) -> Affine:
