@@ -5,6 +5,7 @@ Parsing imports neither torch nor lightning nor a simulator, so that `--help` an
 
 from __future__ import annotations
 
+import errno
 import os
 import sys
 from argparse import SUPPRESS
@@ -115,6 +116,11 @@ def run_guarded(command: Callable[[Sequence[str]], int], argv: Sequence[str]) ->
     except BrokenPipeError:  # as in `train.py --help | head`: what read the output has seen enough
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 141
+    except OSError as error:
+        if error.errno != errno.ENAMETOOLONG:
+            raise
+        print(f"error: a file name is too long: {str(error.filename)[:80]}...", file=sys.stderr)
+        return 2
 
 
 def parse_train(argv: Sequence[str]) -> TrainCommand:

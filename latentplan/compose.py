@@ -216,7 +216,8 @@ def _number(section: str, name: str, value: Any) -> Any:
 
 def _wrong_type(section: str, name: str, values: Layer) -> UserError:
     hint = _hint(section, name)
-    wanted = " or ".join(TYPE_WORDS.get(kind, "a list such as [16, 32]") for kind in _alternatives(hint))
+    items = '["speed -> 1.0"]' if str in typing.get_args(hint) else "[16, 32]"
+    wanted = " or ".join(TYPE_WORDS.get(kind, f"a list such as {items}") for kind in _alternatives(hint))
     return UserError(f"{section}.{name} must be {wanted}, got {values[section].get(name)!r}")
 
 

@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from latentplan.config import RENDER_QUALITIES, EnvConfig, UserError
+from latentplan.memory import free_memory
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
@@ -180,8 +181,9 @@ def _frame_times() -> Iterator[Finding]:
 
 
 def _space() -> Iterator[Finding]:
-    memory = _available_memory_gib()
-    if memory is not None:
+    free = free_memory()
+    if free < sys.maxsize:
+        memory = free / _GIB
         short = memory < _ENOUGH_MEMORY_GIB
         remedy = f"below {_ENOUGH_MEMORY_GIB:g} GiB: lower --replay.capacity, or end other programs"
         yield Finding("memory available", f"{memory:.1f} GiB", remedy if short else None, fatal=False)
@@ -189,23 +191,6 @@ def _space() -> Iterator[Finding]:
     short = disk < _ENOUGH_DISK_GIB
     remedy = f"below {_ENOUGH_DISK_GIB:g} GiB: free some, or write elsewhere with --run-dir"
     yield Finding("disk free here", f"{disk:.1f} GiB", remedy if short else None, fatal=False)
-
-
-def _available_memory_gib() -> float | None:
-    """Memory that programs can still take, the container's limit included; None where it cannot be told."""
-    try:
-        lines = Path("/proc/meminfo").read_text().splitlines()
-        kib = next(int(line.split()[1]) for line in lines if line.startswith("MemAvailable:"))
-    except (OSError, StopIteration):
-        return None
-    available = kib * 1024
-    try:
-        limit = Path("/sys/fs/cgroup/memory.max").read_text().strip()
-        if limit != "max":
-            available = min(available, int(limit) - int(Path("/sys/fs/cgroup/memory.current").read_text()))
-    except OSError:
-        pass  # no such limit
-    return available / _GIB
 
 
 def _video() -> Iterator[Finding]:

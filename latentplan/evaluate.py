@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
     from latentplan.envs.suite import SuiteEnv
     from latentplan.rollout import Agent, OnStep
-    from latentplan.scoring import ScoredEnv
+    from latentplan.scoring import Goals, ScoredEnv
     from latentplan.timed_rollout import TimedEpisode
     from latentplan.virtual_clock import VirtualClock
 
@@ -86,7 +86,7 @@ def _evaluate(argv: Sequence[str]) -> int:
     try:
         clock = VirtualClock(request.control_hz, request.latency)
         agent = load_timed_agent(request.checkpoint, request.mode, clock, device, **overrides)
-        about = _describe(request, info, world, planner)
+        about = _describe(request, info, world, planner, goals)
         print(
             f"{about['domain']}-{about['task']}, {request.mode} on {device}, pictures by {about['renderer']}",
             flush=True,
@@ -142,7 +142,7 @@ def _play_and_report(
 
 
 def _describe(
-    request: EvaluationRequest, info: dict[str, Any], env: EnvConfig, planner: PlannerConfig
+    request: EvaluationRequest, info: dict[str, Any], env: EnvConfig, planner: PlannerConfig, goals: Goals | None
 ) -> dict[str, Any]:
     from latentplan.envs import render_info
 
@@ -158,7 +158,8 @@ def _describe(
     }
     if request.mode not in PLANNING_MODES:
         return described
-    if request.mode != "planner" or request.objective is not None or request.constraint is not None:
+    is_own = goals is None or (any(phase.objective.is_return for phase in goals.phases) and not goals.constraints)
+    if request.mode != "planner" or not is_own:
         planner = dataclasses.replace(planner, surprise_limit=None)  # which is not heeded then
     return {**described, "planner": to_dict(planner)}
 

@@ -26,7 +26,7 @@ from torch.utils._pytree import tree_flatten, tree_unflatten
 
 from latentplan.agent import ModelAgent
 from latentplan.checkpoint import load_model
-from latentplan.config import UserError
+from latentplan.config import UserError, output_file
 from latentplan.models import State, WorldModel, reflex
 from latentplan.models.symmetry import turned
 
@@ -87,8 +87,7 @@ def export_actor(agent_or_checkpoint: ModelAgent | str | Path, path: str | Path,
     other = next((name for name in FORMATS if name != format and target.suffix == f".{name}"), None)
     if other is not None:
         raise UserError(f"{target} would hold a program in format {format}: give --format {other}, or another name")
-    if target.is_dir() or not target.absolute().parent.is_dir():
-        raise UserError(f"cannot write {target}: give a file in a folder that exists")
+    target = output_file(target, "--out")
     if isinstance(agent_or_checkpoint, ModelAgent):
         model = agent_or_checkpoint.model
     else:

@@ -150,17 +150,18 @@ class GatedAgent(PlanningAgent):
             is_due = is_due | ~is_tail
             action = torch.where(is_tail[:, None].to(action.device), planned.to(action.dtype), action)
         is_planned = is_due | self._is_doubtful(state, action, is_due)
-        is_found = is_planned
+        is_found = is_searched = is_planned
         if bool(is_planned.any()):
             with self.model.trunk_precision():
                 planned = self.controller.act_where(state, is_planned)
             assert self.controller.plan is not None
             is_found = is_planned & ~self.controller.plan.failures()
+            is_searched = is_found & ~self.controller.plan.info["is_policy"].cpu()
             kept = is_found[is_planned].to(action.device)
             action[is_found.to(action.device)] = planned[kept].to(action.dtype)
         else:
             self.controller.skip()
-        self._count(is_planned, is_found, is_tail)
+        self._count(is_planned, is_searched, is_tail)
         self._drift = torch.where(is_planned.to(self._drift.device), 0.0, self._drift)
         return action
 
@@ -212,14 +213,14 @@ class GatedAgent(PlanningAgent):
                 gap, weight = gap + weight * reward, weight * self.discount
             return (gap + weight * self._acting.value(state)).abs()
 
-    def _count(self, is_planned: Tensor, is_found: Tensor, is_tail: Tensor) -> None:
+    def _count(self, is_planned: Tensor, is_searched: Tensor, is_tail: Tensor) -> None:
         num_planned, num = int(is_planned.sum()), len(is_planned)
         self._num_planned += num_planned
         self._num_decisions += num
         self.threshold += GAIN * (num_planned - num * self.planning_budget)
         self.last_source = [
-            "plan" if found else "tail" if tail else "actor"
-            for found, tail in zip(is_found.tolist(), is_tail.tolist(), strict=True)
+            "plan" if searched else "tail" if tail else "actor"
+            for searched, tail in zip(is_searched.tolist(), is_tail.tolist(), strict=True)
         ]
 
 

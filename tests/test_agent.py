@@ -254,3 +254,9 @@ def test_a_planner_without_time_acts_by_its_actor_and_says_so(model, film):
     for _ in range(33):
         pace.record(("iteration", size), 1e3)  # seconds
     assert np.allclose(agent.act(film[0, 0]), actor.act(film[0, 0]), atol=0.02) and agent.last_source == "actor"
+
+
+@pytest.mark.parametrize("make", AGENTS)
+def test_frames_may_be_flipped_views(make, model, film):
+    flipped = film[0, 0][::-1]
+    assert np.array_equal(make(model, seed=3).act(flipped), make(model, seed=3).act(flipped.copy()))

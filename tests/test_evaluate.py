@@ -218,6 +218,19 @@ def test_what_surprised_the_model_is_no_failed_search(capsys, tmp_path, checkpoi
     assert "surprised" not in result_of(tmp_path, checkpoint, "--episodes", 1)
 
 
+@pytest.mark.parametrize(("objective", "limit"), [("return", 1e-9), ("return; 5: 2", 1e-9), ("2", None)])
+def test_the_result_tells_whether_surprise_was_heeded(tmp_path, checkpoint, objective, limit):
+    flags = ["--episodes", 1, "--planner.surprise_limit", 1e-9, "--objective", objective]
+    result = result_of(tmp_path, checkpoint, *flags)
+    assert result["planner"]["surprise_limit"] == limit
+    assert (result["surprised"] > 0) == (limit is not None)
+
+
+def test_a_name_that_is_too_long_is_one_line(capsys, checkpoint):
+    for flags in (["--checkpoint", "a" * 300], ["--checkpoint", checkpoint, "--json", "a" * 300]):
+        assert "too long" in error_line(capsys, *flags)
+
+
 @pytest.mark.parametrize("flag", ["--video", "--json"])
 def test_output_paths_are_tried_before_anything_is_played(capsys, tmp_path, checkpoint, flag):
     name = {"--video": "film.mp4", "--json": "result.json"}[flag]
@@ -225,6 +238,16 @@ def test_output_paths_are_tried_before_anything_is_played(capsys, tmp_path, chec
     assert f"nearest that exists is '{tmp_path}'" in line
     (tmp_path / name).mkdir()
     assert "is a folder" in error_line(capsys, "--checkpoint", checkpoint, flag, tmp_path / name)
+    device = tmp_path / f"device-{name}"
+    os.mkfifo(device)
+    assert "is not a file" in error_line(capsys, "--checkpoint", checkpoint, flag, device)
+    assert device.is_fifo()
+
+
+def test_a_result_goes_where_a_link_leads(tmp_path, checkpoint):
+    (tmp_path / "link.json").symlink_to("result.json")
+    request = evaluation_request.parse_arguments(["--checkpoint", str(checkpoint), "--json", f"{tmp_path}/link.json"])
+    assert request.json == tmp_path / "result.json"
 
 
 def test_a_folder_that_cannot_be_written_is_named(tmp_path):

@@ -130,7 +130,7 @@ def test_an_agent_in_memory_is_exported_as_it_is(tmp_path, program):
         (["--out", "actor.pt2"], ["--checkpoint"]),
         (["--checkpoint", "{checkpoint}"], ["--out"]),
         (["--checkpoint", "{checkpoint}", "--out", "a.pt2", "--format", "onx"], ["'onx'", "'onnx'"]),
-        (["--checkpoint", "{checkpoint}", "--out", "nowhere/a.pt2"], ["nowhere/a.pt2"]),
+        (["--checkpoint", "{checkpoint}", "--out", "nowhere/a.pt2"], ["'nowhere'"]),
         (["--checkpoint", "nothing", "--out", "a.pt2"], ["nothing"]),
         (["--checkpoint", "{checkpoint}", "--out", "a.onnx"], ["--format onnx"]),
         (["--chekpoint", "nothing", "--out", "a.pt2"], ["'--chekpoint'", "'--checkpoint'"]),

@@ -241,4 +241,20 @@ def test_the_memory_a_replay_takes_is_what_its_arrays_hold():
 
 def test_free_memory_is_known_or_unlimited_without_proc(monkeypatch):
     monkeypatch.setattr(memory, "MEMORY_FACTS", Path("/nowhere"))
+    monkeypatch.setattr(memory, "LIMIT_FACTS", Path("/nowhere"))
+    assert memory.free_memory() > 2**28
+
+
+@pytest.mark.parametrize(("limit", "left"), [("4096", 4096 - 3000 + 500), ("2000", 0)])
+def test_free_memory_is_what_a_containers_limit_leaves(tmp_path, monkeypatch, limit, left):
+    for name, text in {"max": limit, "current": "3000", "stat": "anon 2000\ninactive_file 500"}.items():
+        (tmp_path / f"memory.{name}").write_text(f"{text}\n")
+    monkeypatch.setattr(memory, "LIMIT_FACTS", tmp_path)
+    assert memory.free_memory() == left
+
+
+def test_a_container_without_a_limit_has_what_the_machine_has(tmp_path, monkeypatch):
+    for name, text in {"max": "max", "current": "3000", "stat": "anon 2000"}.items():
+        (tmp_path / f"memory.{name}").write_text(f"{text}\n")
+    monkeypatch.setattr(memory, "LIMIT_FACTS", tmp_path)
     assert memory.free_memory() > 2**28

@@ -32,16 +32,19 @@ def make_folder(path: Path) -> None:
 
 
 def output_file(path: Path, flag: str) -> Path:
-    """The path, tried before any work is spent on what goes there.
+    """The path, tried before any work is spent on what goes there; where a link leads, if it is one.
 
     Raises:
-        UserError: It is a folder, its folder does not exist, or nothing can be written in that.
+        UserError: It is a folder or a device, its folder does not exist, or nothing can be written in that.
     """
     import tempfile  # when there is a file to be written: every command imports this module
 
+    path = path.resolve() if path.is_symlink() else path  # a link stays, what it points to is replaced
     folder = path.parent
     if path.is_dir():
         raise UserError(f"{flag} {str(path)!r} is a folder; give a file in it")
+    if path.exists() and not path.is_file():
+        raise UserError(f"{flag} {str(path)!r} is not a file, and would be replaced by one; give another name")
     if not folder.is_dir():
         existing = next(parent for parent in folder.parents if parent.is_dir())
         raise UserError(f"{flag}: there is no folder {str(folder)!r}; the nearest that exists is {str(existing)!r}")

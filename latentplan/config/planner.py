@@ -8,6 +8,9 @@ from typing import Any
 
 from latentplan.config.checks import above_zero, at_least, one_of, within
 
+WIDEST_STD = 1e15  # its square is a float32
+STEEPEST_NOISE = 100.0  # beyond, all steps of a sequence are one number times a cosine
+
 
 @dataclass(frozen=True)
 class PlannerConfig:
@@ -64,9 +67,10 @@ class PlannerConfig:
 
     def __post_init__(self) -> None:
         at_least(self, horizon=1, num_samples=2, num_elites=1, num_iterations=1, warm_start_iterations=1)
-        at_least(self, num_policy_samples=0, init_std=0.0, min_std=0.0, noise_beta=0.0)
+        at_least(self, num_policy_samples=0)
         above_zero(self, "goal_horizon", "smoothing", "deadline_ms", "surprise_limit")
         within(self, smoothing=(0.0, 1.0), keep_elite_fraction=(0.0, 1.0))
+        within(self, noise_beta=(0.0, STEEPEST_NOISE), min_std=(0.0, WIDEST_STD), init_std=(0.0, WIDEST_STD))
         one_of(self, start=("shifted", "policy", "both"), tail=("zero", "hold", "policy"))
         one_of(self, warm_start_variance=("reset", "keep", "inflate"), final=("mean", "best", "better"))
         for name in ("num_elites", "num_policy_samples"):

@@ -9,7 +9,7 @@ hold are kept with some distance.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from functools import partial
+from functools import cache, partial
 from typing import Any
 
 import torch
@@ -130,7 +130,8 @@ def plan_objective(
     if guide is not None and not any(isinstance(term, LearnedReturn) for _, term in expression.terms):
         objectives.append(guide)
     if quantities:
-        objectives.append(Objective(partial(_worth, tuple(quantities)), needs_states=True, needs=("probe",)))
+        needs = ("probe",) if expression.names else ()
+        objectives.append(Objective(partial(_worth, tuple(quantities)), needs_states=True, needs=needs))
     return sum(objectives[1:], objectives[0])
 
 
@@ -157,11 +158,14 @@ def predicted_quantities(rollout: Rollout) -> Lookup:
     Returns:
         A function from a quantity's name to its values.
     """
-    features = torch.stack([state.features for state in rollout.states])
-    flat = rollout.model.probe(rearrange(features, "step rows feature -> (step rows) feature")).float()
-    labels = rearrange(flat, "(step rows) label -> label step rows", step=len(features))
-    places = {name: index for index, name in enumerate(rollout.model.label_names)}
-    return lambda name: labels[places[name]]
+
+    @cache
+    def labels() -> Tensor:  # once there is something to look up: not every model has a probe
+        features = torch.stack([state.features for state in rollout.states])
+        flat = rollout.model.probe(rearrange(features, "step rows feature -> (step rows) feature")).float()
+        return rearrange(flat, "(step rows) label -> label step rows", step=len(features))
+
+    return lambda name: labels()[list(rollout.model.label_names).index(name)]
 
 
 def _violation(clauses: Sequence[Clause], rollout: Rollout) -> Tensor:

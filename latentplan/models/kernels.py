@@ -102,7 +102,7 @@ def load() -> ctypes.CDLL | None:
         return None
     try:
         library = ctypes.CDLL(str(_compiled()))
-    except (OSError, subprocess.SubprocessError):
+    except (OSError, RuntimeError, subprocess.SubprocessError):
         return None
     place, count, threads = ctypes.c_void_p, ctypes.c_long, ctypes.c_int
     for dtype in DTYPES.values():
@@ -118,6 +118,7 @@ def _compiled() -> Path:
 
     Raises:
         OSError: There is no compiler, or nowhere to write.
+        RuntimeError: Nobody's home directory is known.
         subprocess.SubprocessError: The compiler failed.
     """
     compiler = os.environ.get("CC") or next(filter(shutil.which, ("cc", "gcc", "clang")), None)

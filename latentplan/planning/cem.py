@@ -15,6 +15,7 @@ import torch
 from torch import Tensor
 
 from latentplan.config import PlannerConfig
+from latentplan.config.planner import STEEPEST_NOISE, WIDEST_STD
 from latentplan.planning.deadline import Pace
 from latentplan.planning.model import Model, State, per_dimension
 from latentplan.planning.objectives import Constraint, Term
@@ -201,9 +202,12 @@ def _validate(planner: CEMPlanner) -> None:
     for name in ("smoothing", "discount"):
         if not 0.0 < getattr(planner, name) <= 1.0:
             raise ValueError(f"{name} must lie in (0, 1], got {getattr(planner, name)}")
-    for name in ("min_std", "noise_beta", "stop_std", "constraint_penalty"):
+    for name in ("stop_std", "constraint_penalty"):
         if not 0.0 <= (getattr(planner, name) or 0.0) < math.inf:
             raise ValueError(f"{name} must be finite and at least 0, got {getattr(planner, name)}")
+    for name, most in (("min_std", WIDEST_STD), ("noise_beta", STEEPEST_NOISE)):
+        if not 0.0 <= getattr(planner, name) <= most:
+            raise ValueError(f"{name} must lie in [0, {most:g}], got {getattr(planner, name)}")
     if not 0.0 <= planner.keep_elite_fraction <= 1.0:
         raise ValueError(f"keep_elite_fraction must lie in [0, 1], got {planner.keep_elite_fraction}")
     for name in ("temperature", "gradient_step_size", "deadline_ms"):
@@ -224,5 +228,5 @@ def _validate_bounds(planner: CEMPlanner) -> None:
         raise ValueError(f"action_low {low.tolist()} must lie below action_high {high.tolist()}")
     if planner.init_std is not None:
         init_std = per_dimension(planner.init_std, planner.action_dim, "init_std")
-        if not bool((init_std >= 0).all()):
-            raise ValueError(f"init_std must be at least 0, got {init_std.tolist()}")
+        if not bool(((init_std >= 0) & (init_std <= WIDEST_STD)).all()):
+            raise ValueError(f"init_std must lie in [0, {WIDEST_STD:g}], got {init_std.tolist()}")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import warnings
 from collections.abc import Callable, Iterator
 from typing import TYPE_CHECKING, Any, Protocol
 
@@ -88,6 +89,34 @@ def filming(
             films[0].write(picture)
 
         yield film
+
+
+@contextlib.contextmanager
+def filming_if_possible(
+    path: str | os.PathLike[str], env: gymnasium.Env[Any, Any], planner: Imagining | None, *, every: int = 1
+) -> Iterator[Callable[[Moment], None]]:
+    """As `filming`, but where a film fails there is a warning and no film, and the episode goes on without it."""
+    errors: list[Exception] = []
+    with contextlib.ExitStack() as stack:
+        film = stack.enter_context(filming(path, env, planner, every=every))
+
+        def try_to_film(moment: Moment) -> None:
+            if not errors:
+                try:
+                    film(moment)
+                except Exception as error:
+                    errors.append(error)
+
+        yield try_to_film
+        try:
+            if errors:
+                stack.pop_all().__exit__(type(errors[0]), errors[0], errors[0].__traceback__)
+            else:
+                stack.close()
+        except Exception as error:
+            errors.append(error)
+    if errors:
+        warnings.warn(f"no film at {path}: {errors[0]}", RuntimeWarning, stacklevel=2)
 
 
 def _compose(moment: Moment, env: gymnasium.Env[Any, Any], planner: Imagining | None, judge: Judge | None) -> Frame:

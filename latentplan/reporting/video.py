@@ -58,7 +58,8 @@ class VideoWriter:
             raise ValueError(f"a film's width and height must be positive and even, got {size}")
         if not fps > 0:
             raise ValueError(f"fps must be above 0, got {fps}")
-        self._partial = self.path.with_name(f".{self.path.stem}.{os.getpid()}{self.path.suffix}")
+        # Absolute, because OpenCV takes what stands before a colon in a relative path for a protocol.
+        self._partial = self.path.absolute().with_name(f".{self.path.stem}.{os.getpid()}{self.path.suffix}")
         codec = cv2.VideoWriter.fourcc(*CODECS[self.path.suffix])
         with _quiet_stderr():
             self._writer = cv2.VideoWriter(str(self._partial), cv2.CAP_FFMPEG, codec, fps, size)

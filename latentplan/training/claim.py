@@ -11,6 +11,24 @@ from pathlib import Path
 from latentplan.config import UserError, make_folder
 
 LOCK = ".lock"
+MARKS = {"config.yaml": "a run", "info.json": "an agent", "goals.pt": "an agent", "resume/distill.pt": "an agent"}
+
+
+def refuse_used(folder: Path, own: str, flag: str) -> None:
+    """Refuses a folder in which something has been learned: its agent would be mistaken for the new one.
+
+    Args:
+        folder: Where something new is to go.
+        own: The one of `MARKS` from which the same kind of learning can go on.
+        flag: What names another folder.
+
+    Raises:
+        UserError: There is something.
+    """
+    for name, what in MARKS.items():
+        if (folder / name).exists():
+            go_on = f"continue with --resume {folder}, or " if (folder / own).exists() else ""
+            raise UserError(f"{folder} already holds {what}: {go_on}choose another {flag}")
 
 
 @contextlib.contextmanager

@@ -19,7 +19,7 @@ from latentplan.envs import make_env, make_from, make_vector_env, render_info
 from latentplan.models import WorldModel
 from latentplan.models.symmetry import unturned
 from latentplan.replay import Rows
-from latentplan.reporting.film import filming
+from latentplan.reporting.film import filming_if_possible
 from latentplan.rollout import episode_seed, run_episodes
 from latentplan.training.rewards import RewardCheck
 
@@ -172,7 +172,7 @@ class Collector:
 
         Args:
             episodes: Episodes of each.
-            film: Where the planner's first episode is filmed, if anywhere.
+            film: Where the planner's first episode is filmed, if anywhere; where that fails there is a warning.
             weights: State of the world model; None keeps that of the last round.
             actor: Whether the actor plays too; without, only the planner's returns are given.
         """
@@ -185,7 +185,7 @@ class Collector:
             on_step = None
             if film is not None:
                 every = -(-(self._decisions or 0) // FILMED_FRAMES) or 1
-                on_step = stack.enter_context(filming(film, self._eval_env, planner, every=every))
+                on_step = stack.enter_context(filming_if_possible(film, self._eval_env, planner, every=every))
             played = {"planner": run_episodes(self._eval_env, planner, seeds, on_step=on_step)}
         if actor:
             played["actor"] = run_episodes(self._eval_env, self._judged["actor"], seeds)

@@ -18,12 +18,12 @@ import numpy as np
 import torch
 
 from latentplan.agent import ActorAgent, ModelAgent, PlanningAgent
-from latentplan.checkpoint import INFO, load_model, read_info, resolve_checkpoint, save_checkpoint
-from latentplan.config import DistillConfig, PlannerConfig, UserError, derive_seed, to_dict
+from latentplan.checkpoint import load_model, read_info, resolve_checkpoint, save_checkpoint
+from latentplan.config import USER_DOMAIN, DistillConfig, PlannerConfig, UserError, derive_seed, to_dict
 from latentplan.envs import make_env, make_from
 from latentplan.models import Gaussian, State
 from latentplan.rollout import OnStep, Step, episode_seed, iterate_episodes
-from latentplan.training.claim import claim
+from latentplan.training.claim import claim, refuse_used
 from latentplan.training.collector import EnvFactory
 from latentplan.training.comparison import Comparison, describe_mean
 from latentplan.training.demonstrations import Demonstrations, first_actions, plan_actions
@@ -51,7 +51,7 @@ def distill(
         checkpoint: The agent, or a run that holds one.
         folder: Where the distilled agent goes, and what it takes to resume.
         settings: Of the distillation.
-        planner: Settings of the search that labels; None takes the agent's own.
+        planner: Settings of the search that labels; None takes the agent's own. A deadline is lifted: nothing waits.
         device: `cpu` or `cuda`.
         make_env: The user's environment, as given to `train`; None takes the suite's task it was trained on.
 
@@ -62,11 +62,7 @@ def distill(
         UserError: The checkpoint, the folder or a setting cannot be used.
     """
     folder = Path(folder)
-    for name in (INFO, STATE_FILE):
-        if (folder / name).exists():
-            raise UserError(
-                f"{folder} already holds an agent: continue with --resume {folder}, or choose another --out"
-            )
+    refuse_used(folder, str(STATE_FILE), "--out")
     source = resolve_checkpoint(checkpoint)
     return _Distillation(source, folder, settings or DistillConfig(), planner, device, make_env).run()
 
@@ -114,8 +110,10 @@ class _Distillation:
     ) -> None:
         self.source, self.folder, self.settings = source, folder, settings
         self.model, self.config, self.info = load_model(source, device)
+        if self.model.goal_dim:
+            raise UserError(f"{source} has learned goals, which build on its actor: distill before scripts/goals.py")
         self.model.requires_grad_(False)
-        self.planner_config = planner or self.config.planner
+        self.planner_config = replace(planner or self.config.planner, deadline_ms=None)
         self.planning = PlanningAgent(self.model, self.config, self.info["discount"], planner=self.planner_config)
         self.acting = ActorAgent(self.model, self.config)
         build = make_env if make_user_env is None else make_from(make_user_env)
@@ -141,7 +139,10 @@ class _Distillation:
                     self._save()
                 return Result(self.folder, 0, self._finish())
         except KeyboardInterrupt:
-            self.line.print(f"stopped; to go on: python scripts/distill.py --resume {self.folder}")
+            command = f"python scripts/distill.py --resume {self.folder}"
+            if self.config.env.domain == USER_DOMAIN:
+                command = f'latentplan.training.resume_distillation("{self.folder}", make_env=...)'
+            self.line.print(f"stopped; to go on: {command}")
             return Result(self.folder, INTERRUPTED, {})
         finally:
             self.env.close()

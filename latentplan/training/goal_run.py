@@ -14,11 +14,11 @@ from typing import Any
 
 import torch
 
-from latentplan.checkpoint import INFO, load_model, read_info, resolve_checkpoint, save_checkpoint
+from latentplan.checkpoint import load_model, read_info, resolve_checkpoint, save_checkpoint
 from latentplan.config import USER_DOMAIN, Config, GoalsConfig, UserError, derive_seed, to_dict
 from latentplan.models import WorldModel
 from latentplan.replay import Replay, read_saved
-from latentplan.training.claim import claim
+from latentplan.training.claim import claim, refuse_used
 from latentplan.training.goals import GoalLearner
 from latentplan.training.play import play
 from latentplan.training.progress import StatusLine
@@ -48,9 +48,7 @@ def learn_goals(
         UserError: The agent, its replay or the folder cannot be used.
     """
     folder = Path(folder)
-    for name in (INFO, GOALS_FILE):
-        if (folder / name).exists():
-            raise UserError(f"{folder} already holds an agent: go on with --resume {folder}, or choose another --out")
+    refuse_used(folder, GOALS_FILE, "--out")
     with claim(folder):
         return _learn(Path(checkpoint), folder, settings or GoalsConfig(), device, None)
 

@@ -22,7 +22,7 @@ from latentplan.envs import default_task
 from latentplan.models import WorldModel
 from latentplan.replay import Replay
 from latentplan.training.callbacks import Experience, Restore, Save, Stop, weights_of
-from latentplan.training.claim import claim
+from latentplan.training.claim import claim, refuse_used
 from latentplan.training.collector import Description, EnvFactory
 from latentplan.training.curriculum import Curriculum
 from latentplan.training.data import ReplayBatches, ReplayData
@@ -78,9 +78,10 @@ def train(config: Config, make_env: EnvFactory | None = None) -> Result:
         stamp = datetime.now().strftime("%Y%m%d-%H%M%S")
         name = f"{config.env.domain}-{config.env.task}-seed{config.run.seed}-{stamp}"
         config = replace(config, run=replace(config.run, run_dir=str(Path("runs") / name)))
+    if config.run.run_dir == "":
+        raise UserError("--run-dir must name a folder, got an empty text")
     folder = Path(str(config.run.run_dir))
-    if (folder / "config.yaml").exists():
-        raise UserError(f"{folder} already holds a run: continue with --resume {folder}, or choose another --run-dir")
+    refuse_used(folder, "config.yaml", "--run-dir")
     return _start(config, folder, make_env, resume=False)
 
 

@@ -182,6 +182,13 @@ def test_what_the_model_does_not_predict_is_refused():
         require_labels(nodes, ())
 
 
+def test_a_constant_asks_nothing_of_the_model():
+    constant = objective("3")
+    rollout = rollout_of(torch.tensor([[[1.0, 0.0]], [[2.0, 0.0]]]))
+    rollout.model.probe = rollout.model.label_names = None
+    assert constant.needs == () and constant(rollout).shape == (1,)
+
+
 def test_terms_of_the_planner_mix_with_expressions():
     mixed = objective("cart > 0.3") + 0.1 * learned_return()
     assert isinstance(mixed, Objective) and mixed.needs_states

@@ -101,6 +101,15 @@ def test_a_machine_without_a_compiler_or_with_a_broken_one_goes_on_in_torch(tmp_
         assert done.stdout.strip() == "None", done.stderr
 
 
+def test_without_a_home_torch_does_it(monkeypatch):
+    def nobodys():
+        raise RuntimeError("Could not determine home directory.")
+
+    monkeypatch.delenv("XDG_CACHE_HOME", raising=False)
+    monkeypatch.setattr(kernels.Path, "home", nobodys)
+    assert kernels.load.__wrapped__() is None
+
+
 @compiled
 def test_kernels_are_compiled_once_and_kept(tmp_path, monkeypatch):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))

@@ -96,6 +96,18 @@ def test_a_model_without_step_and_a_state_that_is_none_are_named():
         check_model(model, STATE, 2)
 
 
+def test_what_steps_that_sample_come_to_is_not_compared():
+    def dynamics(state, action):
+        return state + 0.1 * torch.randn_like(state)
+
+    def rollout(state, actions):
+        return torch.zeros(actions.shape[:2]), state + torch.randn_like(state)
+
+    model = FunctionModel(dynamics, lambda state, action: torch.zeros(len(state)), rollout=rollout)
+    model.fast_step = model.step
+    assert check_model(model, STATE, 2) == ("rollout", "fast_step")
+
+
 def test_a_layer_that_mixes_the_batch_is_found():
     layer = torch.nn.BatchNorm1d(4)
     model = FunctionModel(lambda state, action: layer(state + action[:, :1]), lambda state, action: action[:, 0])

@@ -129,6 +129,13 @@ def test_a_search_that_found_nothing_leaves_the_decisions_to_the_policy():
     assert [(decision.source, decision.action.item()) for decision in decisions] == [("actor", pytest.approx(0.05))] * 6
 
 
+def test_what_the_policy_does_for_want_of_time_is_no_plan(model):
+    planner = CEMPlanner(action_dim=1, horizon=HORIZON, num_policy_samples=4, deadline_ms=1e-6)
+    executor = VirtualExecutor(planner, model, itertools.repeat(0.5))
+    decisions, _ = drive(PlanScheduler(planner, model, executor), executor, 6)
+    assert len(executor.requests) == 6 and [decision.source for decision in decisions] == ["actor"] * 6
+
+
 def make(model, durations, **options):
     planner = CEMPlanner(
         action_dim=1, horizon=HORIZON, num_samples=32, num_elites=4, num_iterations=3, warm_start_iterations=1

@@ -3,8 +3,9 @@ from types import SimpleNamespace
 import cv2
 import gymnasium
 import numpy as np
+import pytest
 
-from latentplan.reporting.film import filming
+from latentplan.reporting.film import filming, filming_if_possible
 
 
 class SharpEnv(gymnasium.Env):
@@ -78,3 +79,34 @@ def test_the_last_moment_is_filmed_however_few_are(tmp_path):
     _, frames = film_of(tmp_path / "film.mp4", SharpEnv(), BlueDreamer(), moments, every=4)
     shown = [share(frame, (0, 0, 200)) > 0.35 for frame in frames]
     assert shown == [True, True, True, False]  # 0, 4, 8, and that it is over
+
+
+class TransparentEnv(SharpEnv):
+    """Renders four channels, which no film takes."""
+
+    def render_large(self, size):
+        return np.zeros((size, size, 4), np.uint8)
+
+
+@pytest.mark.parametrize(("name", "env"), [("missing/film.mp4", SharpEnv()), ("film.mp4", TransparentEnv())])
+def test_an_episode_goes_on_without_a_film_that_cannot_be_made(tmp_path, name, env):
+    (tmp_path / "film.mp4").write_bytes(b"older")
+    with pytest.warns(RuntimeWarning, match="no film at"), filming_if_possible(tmp_path / name, env, None) as film:
+        for each in [moment(0), moment(1), moment(2, action=None)]:
+            film(each)
+    assert [path.name for path in tmp_path.iterdir()] == ["film.mp4"]
+    assert (tmp_path / "film.mp4").read_bytes() == b"older"
+
+
+def test_a_film_that_can_be_made_is_made_without_a_warning(tmp_path, recwarn):
+    with filming_if_possible(tmp_path / "film.mp4", SharpEnv(), None) as film:
+        film(moment(0))
+    assert (tmp_path / "film.mp4").stat().st_size > 0
+    assert not recwarn
+
+
+def test_what_goes_wrong_beside_the_film_is_raised(tmp_path):
+    with pytest.raises(ZeroDivisionError), filming_if_possible(tmp_path / "film.mp4", SharpEnv(), None) as film:
+        film(moment(0))
+        raise ZeroDivisionError
+    assert not list(tmp_path.iterdir())

@@ -147,3 +147,10 @@ def test_text_stays_out_of_the_pictures_and_inside_the_frame():
     border = np.concatenate([long[:2].reshape(-1, 3), long[-2:].reshape(-1, 3), long[:, :4].reshape(-1, 3)])
     assert (border == long[0, 0]).all()
     assert (long[:, -4:] == long[0, 0]).all()
+
+
+def test_a_relative_name_may_hold_a_colon(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    with VideoWriter("18:30.mp4", 12.5, SIZE) as film:
+        film.write(flat(100))
+    assert len(read_back(tmp_path / "18:30.mp4")[1]) == 1

@@ -1,5 +1,7 @@
 """Distillation: the actor comes to do what the planner does, and nothing else changes."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -141,6 +143,12 @@ def test_an_interrupted_distillation_ends_as_if_nothing_had_happened(
     assert all(torch.equal(saved["demonstrations"][name], part) for name, part in reference["demonstrations"].items())
 
 
+def test_in_an_environment_of_ones_own_it_goes_on_from_python(model, tiny, push, tmp_path, capsys, interrupting):
+    save_checkpoint(tmp_path / "mine", model, tiny("", env={"domain": "user"}, planner=vars(PLANNER)), INFO)
+    distill(tmp_path / "mine", tmp_path / "out", SETTINGS, make_env=interrupting(push, 5).make)
+    assert f'resume_distillation("{tmp_path / "out"}", make_env=...)' in "".join(capsys.readouterr().out.split("\n"))
+
+
 def test_more_rounds_may_follow(checkpoint, push, tmp_path):
     small = DistillConfig(rounds=1, episodes=1, updates=5, evaluation_episodes=2)
     distill(checkpoint, tmp_path / "out", small, make_env=push)
@@ -157,6 +165,12 @@ def test_no_round_begins_after_the_minutes_are_spent(checkpoint, push, tmp_path)
 def test_folders_that_do_not_fit_are_refused(finished, checkpoint, push, tmp_path):
     with pytest.raises(UserError, match="--resume"):
         distill(checkpoint, finished.run_dir, SETTINGS, make_env=push)
+    with pytest.raises(UserError, match="already holds an agent: choose another --out"):
+        distill(checkpoint, checkpoint, SETTINGS, make_env=push)
+    (tmp_path / "run").mkdir()
+    (tmp_path / "run" / "config.yaml").touch()
+    with pytest.raises(UserError, match="already holds a run: choose another --out"):
+        distill(checkpoint, tmp_path / "run", SETTINGS, make_env=push)
     with pytest.raises(UserError, match="nothing to resume"):
         resume_distillation(tmp_path)
     with claim(tmp_path / "held"), pytest.raises(UserError, match="another process learns"):
@@ -165,6 +179,20 @@ def test_folders_that_do_not_fit_are_refused(finished, checkpoint, push, tmp_pat
     (tmp_path / "resume" / "distill.pt").write_bytes((finished.run_dir / "resume" / "distill.pt").read_bytes()[:-100])
     with pytest.raises(UserError, match=r"distill\.pt is damaged"):
         resume_distillation(tmp_path)
+
+
+def test_an_agent_whose_goals_build_on_its_actor_is_refused(model, tiny, push, tmp_path):
+    knows_goals = WorldModel(tiny("").model, action_dim=1, labels={"speed": 1.0}, goal_dim=8)
+    save_checkpoint(tmp_path / "agent", knows_goals, tiny(""), INFO)
+    with pytest.raises(UserError, match="distill before"):
+        distill(tmp_path / "agent", tmp_path / "out", SETTINGS, make_env=push)
+
+
+def test_a_deadline_of_the_search_is_lifted(checkpoint, push, tmp_path):
+    small = DistillConfig(rounds=1, episodes=1, updates=5, evaluation_episodes=2)
+    hurried = replace(PLANNER, deadline_ms=1e-6)
+    assert distill(checkpoint, tmp_path / "out", small, planner=hurried, make_env=push).exit_code == 0
+    assert read_info(tmp_path / "out")["distilled"]["planner"]["deadline_ms"] is None
 
 
 def test_old_labels_are_planned_again_in_each_round(finished):

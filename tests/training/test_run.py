@@ -81,6 +81,12 @@ def test_another_seed_is_another_run(finished, tiny, dot, tmp_path):
 def test_a_folder_holds_one_run(finished, tiny, dot, tmp_path):
     with pytest.raises(UserError, match="already holds a run"):
         train(tiny(finished.run_dir), dot)
+    with pytest.raises(UserError, match="--run-dir must name a folder"):
+        train(tiny(""), dot)
+    (tmp_path / "agent").mkdir()
+    (tmp_path / "agent" / "info.json").touch()
+    with pytest.raises(UserError, match="already holds an agent: choose another --run-dir"):
+        train(tiny(tmp_path / "agent"), dot)
     with claim(finished.run_dir), pytest.raises(UserError, match="another process learns"):
         resume(finished.run_dir, make_env=dot)
     with claim(tmp_path), pytest.raises(UserError, match="another process learns"):
