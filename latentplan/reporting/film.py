@@ -116,7 +116,7 @@ def filming_if_possible(
         except Exception as error:
             errors.append(error)
     if errors:
-        warnings.warn(f"no film at {path}: {errors[0]}", RuntimeWarning, stacklevel=2)
+        warnings.warn(f"no film at {path}: {errors[0]}", RuntimeWarning, stacklevel=1)
 
 
 def _compose(moment: Moment, env: gymnasium.Env[Any, Any], planner: Imagining | None, judge: Judge | None) -> Frame:
