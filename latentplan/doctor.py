@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from latentplan.config import RENDER_QUALITIES, EnvConfig, UserError
-from latentplan.memory import free_memory
+from latentplan.memory import MEMORY_FACTS, free_memory
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
@@ -182,7 +182,7 @@ def _frame_times() -> Iterator[Finding]:
 
 def _space() -> Iterator[Finding]:
     free = free_memory()
-    if free < sys.maxsize:
+    if MEMORY_FACTS.exists():  # elsewhere nobody tells what is free
         memory = free / _GIB
         short = memory < _ENOUGH_MEMORY_GIB
         remedy = f"below {_ENOUGH_MEMORY_GIB:g} GiB: lower --replay.capacity, or end other programs"

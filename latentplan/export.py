@@ -87,7 +87,7 @@ def export_actor(agent_or_checkpoint: ModelAgent | str | Path, path: str | Path,
     other = next((name for name in FORMATS if name != format and target.suffix == f".{name}"), None)
     if other is not None:
         raise UserError(f"{target} would hold a program in format {format}: give --format {other}, or another name")
-    target = output_file(target, "--out")
+    target = output_file(target, "the program's path")
     if isinstance(agent_or_checkpoint, ModelAgent):
         model = agent_or_checkpoint.model
     else:

@@ -59,7 +59,7 @@ class GatedAgent(PlanningAgent):
     Attributes:
         last_source: "plan", "tail" (of an older plan) or "actor", of the most recent decision; a list of these for
             several frames.
-        planned_fraction: Share of planned decisions so far, 0 before the first.
+        planned_fraction: Share of decisions so far at which a search was asked for, in time or not; 0 before the first.
 
     Args:
         model: The world model.
@@ -109,7 +109,7 @@ class GatedAgent(PlanningAgent):
 
     @property
     def planned_fraction(self) -> float:
-        """Share of planned decisions so far, 0 before the first."""
+        """Share of decisions so far at which a search was asked for, in time or not; 0 before the first."""
         return self._num_planned / self._num_decisions if self._num_decisions else 0.0
 
     @torch.no_grad()
@@ -150,18 +150,19 @@ class GatedAgent(PlanningAgent):
             is_due = is_due | ~is_tail
             action = torch.where(is_tail[:, None].to(action.device), planned.to(action.dtype), action)
         is_planned = is_due | self._is_doubtful(state, action, is_due)
-        is_found = is_searched = is_planned
+        is_usable = is_found = is_planned
         if bool(is_planned.any()):
             with self.model.trunk_precision():
                 planned = self.controller.act_where(state, is_planned)
             assert self.controller.plan is not None
-            is_found = is_planned & ~self.controller.plan.failures()
-            is_searched = is_found & ~self.controller.plan.info["is_policy"].cpu()
-            kept = is_found[is_planned].to(action.device)
-            action[is_found.to(action.device)] = planned[kept].to(action.dtype)
+            self.controller.plan.warn_of_failures()
+            is_usable = is_planned & ~self.controller.plan.failures()
+            is_found = is_usable & ~self.controller.plan.info["is_policy"].cpu()
+            kept = is_usable[is_planned].to(action.device)
+            action[is_usable.to(action.device)] = planned[kept].to(action.dtype)
         else:
             self.controller.skip()
-        self._count(is_planned, is_searched, is_tail)
+        self._count(is_planned, is_found, is_tail)
         self._drift = torch.where(is_planned.to(self._drift.device), 0.0, self._drift)
         return action
 
@@ -213,14 +214,14 @@ class GatedAgent(PlanningAgent):
                 gap, weight = gap + weight * reward, weight * self.discount
             return (gap + weight * self._acting.value(state)).abs()
 
-    def _count(self, is_planned: Tensor, is_searched: Tensor, is_tail: Tensor) -> None:
+    def _count(self, is_planned: Tensor, is_found: Tensor, is_tail: Tensor) -> None:
         num_planned, num = int(is_planned.sum()), len(is_planned)
         self._num_planned += num_planned
         self._num_decisions += num
         self.threshold += GAIN * (num_planned - num * self.planning_budget)
         self.last_source = [
-            "plan" if searched else "tail" if tail else "actor"
-            for searched, tail in zip(is_searched.tolist(), is_tail.tolist(), strict=True)
+            "plan" if found else "tail" if tail else "actor"
+            for found, tail in zip(is_found.tolist(), is_tail.tolist(), strict=True)
         ]
 
 

@@ -245,9 +245,17 @@ def test_output_paths_are_tried_before_anything_is_played(capsys, tmp_path, chec
 
 
 def test_a_result_goes_where_a_link_leads(tmp_path, checkpoint):
-    (tmp_path / "link.json").symlink_to("result.json")
-    request = evaluation_request.parse_arguments(["--checkpoint", str(checkpoint), "--json", f"{tmp_path}/link.json"])
-    assert request.json == tmp_path / "result.json"
+    (tmp_path / "link.json").symlink_to("target.json")
+    assert run(checkpoint, "--episodes", 1, "--json", tmp_path / "link.json") == 0
+    assert (tmp_path / "link.json").is_symlink()
+    assert json.loads((tmp_path / "target.json").read_text())["episodes"] == 1
+
+
+def test_a_link_that_leads_nowhere_is_refused(tmp_path, capsys, checkpoint):
+    (tmp_path / "loop.json").symlink_to("loop.json")
+    (tmp_path / "lost.json").symlink_to("no/where.json")
+    for name in ("loop.json", "lost.json"):
+        assert "leads nowhere" in error_line(capsys, "--checkpoint", checkpoint, "--json", tmp_path / name)
 
 
 def test_a_folder_that_cannot_be_written_is_named(tmp_path):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import os
 from pathlib import Path
 from typing import Any
 
@@ -39,12 +40,16 @@ def output_file(path: Path, flag: str) -> Path:
     """
     import tempfile  # when there is a file to be written: every command imports this module
 
-    path = path.resolve() if path.is_symlink() else path  # a link stays, what it points to is replaced
-    folder = path.parent
+    given, folder = str(path), path.parent
+    if path.is_symlink():  # it stays, what it leads to is replaced
+        path = Path(os.path.realpath(path))
+        folder = path.parent
+        if path.is_symlink() or not folder.is_dir():
+            raise UserError(f"{flag} {given!r} is a link that leads nowhere; give another name")
     if path.is_dir():
-        raise UserError(f"{flag} {str(path)!r} is a folder; give a file in it")
+        raise UserError(f"{flag} {given!r} is a folder; give a file in it")
     if path.exists() and not path.is_file():
-        raise UserError(f"{flag} {str(path)!r} is not a file, and would be replaced by one; give another name")
+        raise UserError(f"{flag} {given!r} is not a file, and would be replaced by one; give another name")
     if not folder.is_dir():
         existing = next(parent for parent in folder.parents if parent.is_dir())
         raise UserError(f"{flag}: there is no folder {str(folder)!r}; the nearest that exists is {str(existing)!r}")

@@ -8,8 +8,8 @@ from typing import Any
 
 from latentplan.config.checks import above_zero, at_least, one_of, within
 
-WIDEST_STD = 1e15  # its square is a float32
-STEEPEST_NOISE = 100.0  # beyond, all steps of a sequence are one number times a cosine
+WIDEST_STD = 1e15  # its square, and sums of such, are finite in float32
+STEEPEST_NOISE = 100.0  # long before this all steps are one cosine; from 150 on powers overflow at some horizons
 
 
 @dataclass(frozen=True)

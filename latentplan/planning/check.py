@@ -148,7 +148,7 @@ def _state_problems(name: str, state: State, following: State) -> Iterator[str]:
 
 def _row_problems(model: Any, name: str, inputs: Inputs, together: Any, tolerance: float) -> Iterator[str]:
     """Whether the first row gets something else when it comes alone."""
-    if not _repeats(model, name, inputs, tolerance):
+    if not _agree(together, getattr(model, name)(*_ARGUMENTS[name](*inputs)), tolerance):
         return  # a method that samples: which row gets which draw is the model's own business
     state, actions = inputs
     problems, alone = _tried(model, name, (tree_map(lambda leaf: leaf[:1], state), actions[:1]))
@@ -159,12 +159,6 @@ def _row_problems(model: Any, name: str, inputs: Inputs, together: Any, toleranc
     if not _agree(first, alone, tolerance if name == "step" else 10 * tolerance):
         order = ", or rows are not batch-major" if name in _PER_ROW else ""
         yield f"rows influence each other: {name}() gives a row something else when it comes alone{order}"
-
-
-def _repeats(model: Any, name: str, inputs: Inputs, tolerance: float) -> bool:
-    """Whether a method answers alike when it is asked again."""
-    first, second = (getattr(model, name)(*_ARGUMENTS[name](*inputs)) for _ in range(2))
-    return _agree(first, second, tolerance)
 
 
 def _sample_problems(model: Any, inputs: Inputs) -> Iterator[str]:
@@ -178,7 +172,7 @@ def _sample_problems(model: Any, inputs: Inputs) -> Iterator[str]:
 def _disagreements(model: Any, inputs: Inputs, tolerance: float) -> Iterator[str]:
     """Where a faster way does not come to what steps come to."""
     state, actions = inputs
-    if not _repeats(model, "step", inputs, tolerance):
+    if not _agree(model.step(state, actions[:, 0]), model.step(state, actions[:, 0]), tolerance):
         return  # a step that samples has nothing to agree with
     if supports(model, "fast_step") and not _tried(model, "fast_step", inputs)[0]:
         if not _agree(model.fast_step(state, actions[:, 0]), model.step(state, actions[:, 0]), 10 * tolerance):

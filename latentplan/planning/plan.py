@@ -61,13 +61,14 @@ class Plan:
     def failures(self) -> Tensor:
         """Where neither a search nor a policy stands behind the actions, (batch,) bool on the CPU.
 
-        Whoever has a policy had better follow that than what is left there of the last plan, or zeros. Warns where
-        nothing finite was found.
+        Whoever has a policy had better follow that than what is left there of the last plan, or zeros.
         """
-        failed: Tensor = (self.info["is_fallback"] & ~self.info["is_policy"]).cpu()
-        if bool(failed.any()) and bool((failed & (self.info["num_nonfinite"] > 0).cpu()).any()):
+        return (self.info["is_fallback"] & ~self.info["is_policy"]).cpu()
+
+    def warn_of_failures(self) -> None:
+        """Warns where nothing finite was found, and a policy acts instead."""
+        if bool((self.failures() & (self.info["num_nonfinite"] > 0).cpu()).any()):
             warnings.warn("a search found nothing finite; the policy acts", RuntimeWarning, stacklevel=2)
-        return failed
 
     def forget(self, mask: Tensor) -> Plan:
         """The same plan, except that environments in mask (batch,) bool start their next search cold."""

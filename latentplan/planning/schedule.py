@@ -184,8 +184,8 @@ class PlanScheduler:
         self._is_warmed_up = True
         if asked is None or asked[1] != tick:  # asked for before a reset
             return
-        plan.failures()  # which warns of them
-        if bool(plan.info["is_fallback"].all()):  # nothing was searched; the policy knows better here and now
+        plan.warn_of_failures()
+        if bool(plan.info["is_fallback"].all()):  # who decides when the time has come knows more than this plan does
             return
         self.buffer.submit(plan.actions, tick)
         now, nominals = self.tick, self._nominals.items()

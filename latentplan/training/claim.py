@@ -27,7 +27,7 @@ def refuse_used(folder: Path, own: str, flag: str) -> None:
     """
     for name, what in MARKS.items():
         if (folder / name).exists():
-            go_on = f"continue with --resume {folder}, or " if (folder / own).exists() else ""
+            go_on = f"go on with --resume {folder} (or resume from Python), or " if (folder / own).exists() else ""
             raise UserError(f"{folder} already holds {what}: {go_on}choose another {flag}")
 
 

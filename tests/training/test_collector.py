@@ -83,6 +83,12 @@ def test_episodes_cut_short_restart_and_do_not_count_as_ends_of_the_task(make_co
     assert first.episode_returns == pytest.approx([rows.rewards[:8].sum(), rows.rewards[9:17].sum()], rel=1e-5)
 
 
+def test_an_evaluation_goes_on_without_a_film_that_cannot_be_made(make_collector, tmp_path):
+    with pytest.warns(RuntimeWarning, match="no film at"):
+        returns = make_collector().evaluate(2, film=tmp_path / "missing" / "film.webm")
+    assert [len(returns[mode]) for mode in ("planner", "actor")] == [2, 2]
+
+
 def test_evaluations_are_whole_where_collection_is_cut_short(make_collector, tiny):
     weights = weights_of(tiny(""))
     cut, whole = make_collector(collection={"episode_decisions": 8}), make_collector()
