@@ -154,7 +154,6 @@ def test_resuming_takes_saved_settings_and_hands_on_the_changes(tmp_path):
         ("--collection.goals speed", 'collection.goals must be a list such as ["speed'),
         ("--planner.noise_beta 500", "planner.noise_beta must be in [0.0, 100.0]"),
         ("--planner.min_std 1e300", "planner.min_std must be in"),
-        ("--planner.init_std 1e300", "planner.init_std must be in"),
         ("--planner.num_elites 999", "planner.num_elites (999)"),
         ("--env.render_quality fats", "env.render_quality must be one of exact, fast, fastest"),
         ("--minutes nan", "run.minutes must be finite"),
