@@ -181,9 +181,8 @@ def _frame_times() -> Iterator[Finding]:
 
 
 def _space() -> Iterator[Finding]:
-    free = free_memory()
     if MEMORY_FACTS.exists():  # elsewhere nobody tells what is free
-        memory = free / _GIB
+        memory = free_memory() / _GIB
         short = memory < _ENOUGH_MEMORY_GIB
         remedy = f"below {_ENOUGH_MEMORY_GIB:g} GiB: lower --replay.capacity, or end other programs"
         yield Finding("memory available", f"{memory:.1f} GiB", remedy if short else None, fatal=False)

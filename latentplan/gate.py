@@ -150,16 +150,17 @@ class GatedAgent(PlanningAgent):
             is_due = is_due | ~is_tail
             action = torch.where(is_tail[:, None].to(action.device), planned.to(action.dtype), action)
         is_planned = is_due | self._is_doubtful(state, action, is_due)
-        is_usable = is_found = is_planned
+        is_found = is_planned
         if bool(is_planned.any()):
             with self.model.trunk_precision():
                 planned = self.controller.act_where(state, is_planned)
-            assert self.controller.plan is not None
-            self.controller.plan.warn_of_failures()
-            is_usable = is_planned & ~self.controller.plan.failures()
-            is_found = is_usable & ~self.controller.plan.info["is_policy"].cpu()
-            kept = is_usable[is_planned].to(action.device)
-            action[is_usable.to(action.device)] = planned[kept].to(action.dtype)
+            plan = self.controller.plan
+            assert plan is not None
+            is_found = is_planned & ~plan.info["is_fallback"].cpu()
+            if not torch.equal(is_found, is_planned):
+                plan.warn_of_failures()
+            kept = is_found[is_planned].to(action.device)
+            action[is_found.to(action.device)] = planned[kept].to(action.dtype)
         else:
             self.controller.skip()
         self._count(is_planned, is_found, is_tail)

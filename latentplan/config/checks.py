@@ -40,12 +40,12 @@ def output_file(path: Path, flag: str) -> Path:
     """
     import tempfile  # when there is a file to be written: every command imports this module
 
-    given, folder = str(path), path.parent
+    given = str(path)
     if path.is_symlink():  # it stays, what it leads to is replaced
         path = Path(os.path.realpath(path))
-        folder = path.parent
-        if path.is_symlink() or not folder.is_dir():
+        if path.is_symlink() or not path.parent.is_dir():
             raise UserError(f"{flag} {given!r} is a link that leads nowhere; give another name")
+    folder = path.parent
     if path.is_dir():
         raise UserError(f"{flag} {given!r} is a folder; give a file in it")
     if path.exists() and not path.is_file():

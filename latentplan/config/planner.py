@@ -35,7 +35,7 @@ class PlannerConfig:
         warm_start_variance: Variance of a warm start: `reset`, `keep` or `inflate`.
         final: What is executed: the `mean` of the distribution, the `best` candidate, or the `better` of the mean and
             the actor's own plan, by their predicted returns.
-        noise_beta: Exponent of coloured sampling noise; 0 is white.
+        noise_beta: Exponent of coloured sampling noise, in [0, 100]; 0 is white.
         keep_elite_fraction: Share of the elites kept for the next iteration and the next plan.
         deadline_ms: Milliseconds that a search may take; null lets it do all its iterations.
         surprise_limit: Nats by which a frame may differ from what was predicted of it (`WorldModel.surprise`) for the

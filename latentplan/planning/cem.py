@@ -62,7 +62,7 @@ class CEMPlanner:
         warm_start_variance: Variance of a warm start: `reset`, `keep`, or `inflate` (halfway between these).
         final: What is executed: the `mean` of the distribution, the `best` candidate, or the `better` of the mean and
             the policy's mode, by their predicted returns; where the policy has no say `better` is `mean`.
-        noise_beta: Exponent of coloured sampling noise, 0 for white; larger is smoother over the horizon.
+        noise_beta: Exponent of coloured sampling noise, 0 for white, at most 100; larger is smoother over the horizon.
         keep_elite_fraction: Share of the elites that stay candidates in the next iteration and, shifted, the next plan.
         stop_std: Stop early where the search distribution is narrower than this everywhere, in action units; 0 never.
         temperature: None weighs elites alike; a number weighs them by exp(return / temperature) as MPPI does.

@@ -8,10 +8,13 @@ import os
 from collections.abc import Iterator
 from pathlib import Path
 
+from latentplan.checkpoint import INFO
 from latentplan.config import UserError, make_folder
+from latentplan.training.standing import STATE_FILE
 
 LOCK = ".lock"
-MARKS = {"config.yaml": "a run", "info.json": "an agent", "goals.pt": "an agent", "resume/distill.pt": "an agent"}
+GOALS_FILE = "goals.pt"
+MARKS = {"config.yaml": "a run", INFO: "an agent", GOALS_FILE: "an agent", str(STATE_FILE): "an agent"}
 
 
 def refuse_used(folder: Path, own: str, flag: str) -> None:

@@ -18,14 +18,13 @@ from latentplan.checkpoint import load_model, read_info, resolve_checkpoint, sav
 from latentplan.config import USER_DOMAIN, Config, GoalsConfig, UserError, derive_seed, to_dict
 from latentplan.models import WorldModel
 from latentplan.replay import Replay, read_saved
-from latentplan.training.claim import claim, refuse_used
+from latentplan.training.claim import GOALS_FILE, claim, refuse_used
 from latentplan.training.goals import GoalLearner
 from latentplan.training.play import play
 from latentplan.training.progress import StatusLine
 from latentplan.training.run import Result
 from latentplan.training.state import INTERRUPTED
 
-GOALS_FILE = "goals.pt"
 SAVE_SECONDS = 300.0
 PLAYED = "played.json"  # beside a replay: by which agent, and how
 

@@ -101,6 +101,7 @@ def test_a_machine_without_a_compiler_or_with_a_broken_one_goes_on_in_torch(tmp_
         assert done.stdout.strip() == "None", done.stderr
 
 
+@compiled
 def test_without_a_home_torch_does_it(monkeypatch):
     def nobodys():
         raise RuntimeError("Could not determine home directory.")

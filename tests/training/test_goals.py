@@ -18,8 +18,8 @@ from latentplan.goals.parser import parse_objective
 from latentplan.models import State, WorldModel
 from latentplan.replay import Replay, Rows
 from latentplan.training import goals, learn_goals, resume_goals
-from latentplan.training.claim import claim
-from latentplan.training.goal_run import GOALS_FILE, load_replay
+from latentplan.training.claim import GOALS_FILE, claim
+from latentplan.training.goal_run import load_replay
 from latentplan.training.goals import Boxes, BoxSource, GoalLearner
 from latentplan.training.optimization import descend
 from latentplan.training.play import describe_box
