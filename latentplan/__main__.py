@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 
-from latentplan.cli import main
+from latentplan.commands.main import main
 
 if __name__ == "__main__":
     sys.exit(main())

@@ -9,8 +9,8 @@ from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
-from latentplan.cli import read_flags, run_guarded  # noqa: E402
-from latentplan.compose import field_names, raise_unknown  # noqa: E402
+from latentplan.commands.main import read_flags, run_guarded  # noqa: E402
+from latentplan.config.files import field_names, raise_unknown  # noqa: E402
 
 COMMANDS = {
     "train": "what an update costs, part by part, and how near it comes to what the machine can do",

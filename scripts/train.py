@@ -7,7 +7,7 @@ from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
-from latentplan.cli import train_main  # noqa: E402
+from latentplan.commands.main import train_main  # noqa: E402
 
 if __name__ == "__main__":
     sys.exit(train_main())

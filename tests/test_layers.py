@@ -1,4 +1,4 @@
-"""Who may import whom, how long files and functions may be, and what importing must not do."""
+"""Which room may import which, that no import is circular, and what importing must not do."""
 
 import ast
 import re
@@ -10,65 +10,31 @@ import pytest
 ROOT = Path(__file__).resolve().parent.parent
 PACKAGE = ROOT / "latentplan"
 
-# layer: (layers of latentplan it may import, libraries it may import); None allows anything.
-ALL = (
-    "config",
-    "planning",
-    "models",
-    "envs",
-    "replay",
-    "reporting",
-    "goals",
-    "scoring",
-    "agent",
-    "background",
-    "gate",
-    "rollout",
-    "checkpoint",
-)
 SIMULATION = {"dm_control", "dm_env", "mujoco", "gymnasium", "OpenGL"}
-LAYERS = {
-    "config": ((), set()),
+# room: (rooms it may import, libraries it may import); the standard library and the room itself are always allowed.
+BELOW_AGENTS = ("config", "planning", "models", "replay", "objectives")
+ROOMS = {
+    "config": ((), {"yaml", "jsonargparse"}),
     "planning": (("config",), {"torch", "einops"}),
-    "goals": (("config", "planning"), {"torch", "einops", "numpy", "cv2"}),
     "models": (("config",), {"torch", "einops"}),
-    "envs": (("config", "goals"), {*SIMULATION, "numpy", "cv2"}),
-    "memory": (("config",), {"torch"}),
-    "replay": (("config", "memory"), {"numpy", "torch", "einops"}),
-    "reporting": (("config",), {"numpy", "cv2", "matplotlib", "rich"}),
-    "random_agent": ((), {"numpy"}),
-    "agent": (("config", "models", "planning", "goals", "random_agent"), {"torch", "numpy", "einops"}),
-    "scoring": (("config", "envs", "goals"), {"numpy", "gymnasium"}),
-    "background": (("config", "models", "planning", "goals", "agent"), {"torch", "numpy"}),
-    "gate": (("config", "models", "planning", "goals", "agent"), {"torch", "numpy"}),
-    "rollout": (("config", "envs", "replay", "agent"), {"numpy"}),
-    "latency": (("config",), {"numpy"}),
-    "virtual_clock": (("config", "planning", "latency", "rollout"), {"numpy", "torch"}),
-    "checkpoint": (
-        ("config", "models", "planning", "agent", "background", "gate"),
-        {"torch", "numpy", "safetensors"},
-    ),
-    "timed_rollout": (
-        ("config", "agent", "background", "rollout", "checkpoint", "virtual_clock"),
-        {"numpy"},
-    ),
-    "export": (("config", "models", "agent", "checkpoint"), {"torch"}),
+    "replay": (("config",), {"numpy", "torch", "einops"}),
+    "reporting": (("config",), {"numpy", "cv2", "matplotlib"}),
+    "objectives": (("config", "planning", "models", "replay"), {"torch", "einops", "numpy", "cv2", "lark"}),
+    "envs": (BELOW_AGENTS, {*SIMULATION, "numpy", "cv2"}),
+    "agents": (BELOW_AGENTS, {"torch", "numpy", "einops", "safetensors"}),
+    "evaluation": ((*BELOW_AGENTS, "envs", "agents"), {"numpy", "scipy", "torch", "gymnasium"}),
     "training": (
-        (*ALL, "compose"),
+        (*BELOW_AGENTS, "envs", "agents", "evaluation", "reporting"),
         {"lightning", "torch", "numpy", "einops", "rich", "tensorboard", "gymnasium", "yaml"},
     ),
-    "compose": (("config",), {"jsonargparse", "yaml"}),
-    "setting_flags": (("config", "compose"), set()),
-    "cli": None,
-    "doctor": None,
-    "evaluate": None,
-    "evaluation_request": None,
-    "distill": None,
-    "learn_goals": None,
-    "__init__": None,
-    "__main__": None,
+    "commands": (
+        (*BELOW_AGENTS, "envs", "agents", "evaluation", "reporting", "training"),
+        {"torch", "numpy", "rich", "jsonargparse", "shtab", "yaml", *SIMULATION, "cv2", "lightning", "docstring_parser"},
+    ),
+    "__init__": (("agents",), set()),
+    "__main__": (("commands",), set()),
 }
-EAGER = {"config", "compose", "cli", "jsonargparse", "rich"}  # what the command line may import before it is used
+EAGER = {"config", "commands", "jsonargparse", "rich"}  # what the command line may import before it is used
 IGNORED = {".git", ".venv", "runs", "build", "dist", "__pycache__"}
 MACHINE_PATHS = re.compile(r"(?<![\w.])/(?:work|opt|root|home|mnt|data|Users)/|\.\./shared")
 
@@ -78,9 +44,15 @@ def files_under(folder, *suffixes):
     return sorted(path for path in paths if not suffixes or path.suffix in suffixes)
 
 
-def layer_of(path):
-    """The layer a file belongs to: the first name below the package."""
+def room_of(path):
+    """The room a file belongs to: the first name below the package."""
     return path.relative_to(PACKAGE).with_suffix("").parts[0]
+
+
+def module_of(path):
+    """The dotted name of a file; that of its package for an `__init__`."""
+    parts = path.relative_to(ROOT).with_suffix("").parts
+    return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
 
 
 def type_checking_lines(tree):
@@ -102,36 +74,79 @@ def imports(tree):
             yield node.lineno, "." * node.level + (node.module or ""), tuple(alias.name for alias in node.names)
 
 
-def imported_layers(module, names):
-    """The layers that `import module` or `from module import names` reaches."""
+def imported_rooms(module, names):
+    """The rooms that `import module` or `from module import names` reaches."""
     parts = module.split(".")
-    return parts[1:2] or [name if name in LAYERS else "__init__" for name in names or ("",)]
+    return parts[1:2] or [name if name in ROOMS else "__init__" for name in names or ("",)]
 
 
 def violations(path, source):
     """What a file imports and may not, as `file:line: reason`."""
-    layer, tree = layer_of(path), ast.parse(source)
+    room, tree = room_of(path), ast.parse(source)
     where, typing_only = path.relative_to(ROOT), type_checking_lines(tree)
-    assert layer in LAYERS, f"{where}: {layer!r} is in no layer; add it to the table"
-    if LAYERS[layer] is None:
-        return []
-    layers, libraries = LAYERS[layer]
+    assert room in ROOMS, f"{where}: {room!r} is no room; add it to the table"
+    rooms, libraries = ROOMS[room]
     found = []
     for line, module, names in imports(tree):
         top = module.split(".")[0]
         if module.startswith("."):
             found.append(f"{where}:{line}: relative import")
         elif top == "latentplan":
-            wrong = [name for name in imported_layers(module, names) if name not in (layer, *layers, "__init__")]
-            found += [f"{where}:{line}: {layer} may not import latentplan.{name}" for name in wrong]
+            wrong = [name for name in imported_rooms(module, names) if name not in (room, *rooms, "__init__")]
+            found += [f"{where}:{line}: {room} may not import latentplan.{name}" for name in wrong]
         elif top not in sys.stdlib_module_names and top not in libraries and line not in typing_only:
-            found.append(f"{where}:{line}: {layer} may not import {top}")
+            found.append(f"{where}:{line}: {room} may not import {top}")
     return found
 
 
-def test_layers_import_only_what_lies_below_them():
+def import_graph(sources):
+    """The modules of the package that each module imports, anywhere in its file but for type checkers."""
+    graph = {}
+    for module, source in sources.items():
+        tree = ast.parse(source)
+        typing_only, found = type_checking_lines(tree), set()
+        for line, imported, names in imports(tree):
+            if line not in typing_only:
+                found.update(f"{imported}.{name}" if f"{imported}.{name}" in sources else imported for name in names)
+                found.update(() if names else (imported,))
+        graph[module] = sorted(found & set(sources) - {module})
+    return graph
+
+
+def circles(graph):
+    """Import circles: each as the modules on the way round."""
+    found, done = [], set()
+
+    def visit(module, way):
+        if module in way:
+            found.append([*way[way.index(module) :], module])
+        elif module not in done:
+            for imported in graph[module]:
+                visit(imported, [*way, module])
+            done.add(module)
+
+    for module in graph:
+        visit(module, [])
+    return found
+
+
+def test_files_import_only_the_rooms_below_theirs():
     found = [text for path in files_under(PACKAGE, ".py") for text in violations(path, path.read_text())]
     assert not found, "\n".join(found)
+
+
+def test_no_import_is_circular():
+    found = circles(import_graph({module_of(path): path.read_text() for path in files_under(PACKAGE, ".py")}))
+    assert not found, "\n".join(" -> ".join(circle) for circle in found)
+
+
+def test_circles_finds_a_circle_through_a_late_import():
+    sources = {"a": "def late():\n    from b import x", "b": "import c", "c": "from a import y", "d": "import a"}
+    assert circles(import_graph(sources)) == [["a", "b", "c", "a"]]
+
+
+def test_nothing_lies_loose_at_the_root_of_the_package():
+    assert {path.name for path in PACKAGE.iterdir() if path.is_file()} == {"__init__.py", "__main__.py", "py.typed"}
 
 
 @pytest.mark.parametrize(
@@ -148,30 +163,31 @@ def test_layers_import_only_what_lies_below_them():
         ("def late():\n    import lightning", False),
     ],
 )
-def test_the_layer_check_sees_every_way_to_import(line, allowed):
-    assert (violations(PACKAGE / "planning" / "cem.py", line) == []) == allowed
+def test_violations_sees_every_way_to_import(line, allowed):
+    assert (violations(PACKAGE / "planning" / "search" / "cem.py", line) == []) == allowed
 
 
 def test_the_command_line_imports_libraries_only_when_used():
-    for path in [PACKAGE / f"{name}.py" for name in ("__init__", "__main__", "cli", "compose")]:
+    paths = [PACKAGE / "__init__.py", PACKAGE / "__main__.py", *files_under(PACKAGE / "commands", ".py")]
+    for path in paths:
         tree = ast.parse(path.read_text())
         top_level = ast.Module([node for node in tree.body if not isinstance(node, ast.If)], [])
         outer = [node for node in top_level.body if isinstance(node, ast.Import | ast.ImportFrom)]
         for line, module, names in imports(ast.Module(outer, [])):
             top = module.split(".")[0]
-            reached = imported_layers(module, names) if top == "latentplan" else [top]
+            reached = imported_rooms(module, names) if top == "latentplan" else [top]
             for name in reached:
                 standard = name in sys.stdlib_module_names or name == "__init__"
                 assert standard or name in EAGER, f"{path.name}:{line}: import {module} where it is used"
 
 
-def test_files_and_functions_stay_short():
+def test_functions_stay_under_60_lines_and_files_under_500():
     found = []
     for path in [path for folder in ("latentplan", "scripts", "tests") for path in files_under(ROOT / folder, ".py")]:
         source = path.read_text()
         where = path.relative_to(ROOT)
-        if len(source.splitlines()) > 300:
-            found.append(f"{where}: {len(source.splitlines())} lines, allowed are 300")
+        if len(source.splitlines()) > 500:
+            found.append(f"{where}: {len(source.splitlines())} lines, allowed are 500")
         for node in ast.walk(ast.parse(source)):
             if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef) and node.end_lineno - node.lineno >= 60:
                 found.append(f"{where}:{node.lineno}: {node.name} is longer than 60 lines")
@@ -195,14 +211,3 @@ def test_importing_latentplan_does_no_work(run_python):
     code = "import sys, latentplan; print(sorted({'torch', 'numpy', 'lightning', 'dm_control'} & set(sys.modules)))"
     result = run_python("-c", code)
     assert (result.stdout.strip(), result.returncode) == ("[]", 0), result.stderr
-
-
-def test_planning_imports_without_the_rest_of_the_libraries(run_python):
-    code = (
-        "import sys\n"
-        "for name in ('dm_control', 'mujoco', 'cv2', 'gymnasium', 'lightning', 'rich', 'jsonargparse'):\n"
-        "    sys.modules[name] = None\n"
-        "import latentplan.planning\n"
-    )
-    result = run_python("-c", code)
-    assert result.returncode == 0, result.stderr

@@ -93,7 +93,7 @@ def test_continuous_integration_runs_the_two_commands_and_nothing_else():
 
 
 def test_the_flags_of_continuous_integration_are_valid():
-    from latentplan.cli import parse_train
+    from latentplan.commands.main import parse_train
 
     script = (ROOT / ".ci" / "run").read_text().replace("\\\n", " ")
     arguments = re.search(r'ARGS="([^"]*)"', script)[1].split()

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from latentplan.envs.quantities import clause_degree, scales
-from latentplan.goals.expression import evaluate
-from latentplan.goals.parser import parse_reward
+from latentplan.envs.true_quantities import clause_degree, scales
+from latentplan.objectives.expression import evaluate
+from latentplan.objectives.parser import parse_reward
 
 
 class ObjectiveReward:

@@ -14,10 +14,10 @@ from gymnasium.error import ResetNeeded
 
 from latentplan.config import EnvConfig, UserError
 from latentplan.envs.gl import explain_gl_errors, require_backend
-from latentplan.envs.quantities import measure, scales, true_values
 from latentplan.envs.render import FrameRenderer, draw_floor_behind
 from latentplan.envs.reward import ObjectiveReward
-from latentplan.envs.schedule import control_step, split_schedule
+from latentplan.envs.substeps import control_step, split_schedule
+from latentplan.envs.true_quantities import measure, scales, true_values
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Sequence

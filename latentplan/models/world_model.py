@@ -11,13 +11,13 @@ from torch import Tensor, nn
 
 from latentplan.config import ModelConfig
 from latentplan.config.quantities import TASK_PREFIX
-from latentplan.models import fused
 from latentplan.models.decoder import Decoder
 from latentplan.models.dynamics import Rssm, State
 from latentplan.models.encoder import Encoder
+from latentplan.models.fast import compiled as fused
+from latentplan.models.fast.rollout import Weights, follow_actor, imagine, lay_out
 from latentplan.models.goal_heads import GoalHeads
 from latentplan.models.heads import Actor, Mlp, ScalarHead, sample_action
-from latentplan.models.imagination import Weights, follow_actor, imagine, lay_out
 
 PROBE_SHARE = 3  # quantities lie near the surface of the latent: a narrow head reads them
 

@@ -4,13 +4,10 @@ Imports torch and einops, and of this project only the settings.
 """
 
 from latentplan.planning.adapters import CEMTrajectoryOptimizer
-from latentplan.planning.cem import CEMPlanner
 from latentplan.planning.check import check_model
 from latentplan.planning.compiled import compile_rollout
 from latentplan.planning.conditioned import conditioned
 from latentplan.planning.controller import ModelPredictiveController
-from latentplan.planning.elites import refit
-from latentplan.planning.family import icem_planner, mppi_planner
 from latentplan.planning.model import FunctionModel, Model
 from latentplan.planning.objectives import (
     Objective,
@@ -25,9 +22,12 @@ from latentplan.planning.objectives import (
     uncertainty_penalty,
 )
 from latentplan.planning.plan import Plan
-from latentplan.planning.realtime import BackgroundPlanner, PlanBuffer
-from latentplan.planning.schedule import Decision, PlanExecutor, PlanScheduler
-from latentplan.planning.worker import settle
+from latentplan.planning.realtime.planner import BackgroundPlanner, PlanBuffer
+from latentplan.planning.realtime.scheduler import Decision, PlanExecutor, PlanScheduler
+from latentplan.planning.realtime.worker import settle
+from latentplan.planning.search.cem import CEMPlanner
+from latentplan.planning.search.elites import refit
+from latentplan.planning.search.family import icem_planner, mppi_planner
 
 __all__ = [
     "BackgroundPlanner",

@@ -12,9 +12,9 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from latentplan.planning.cem import CEMPlanner
-from latentplan.planning.elites import refit
 from latentplan.planning.plan import Plan
+from latentplan.planning.search.cem import CEMPlanner
+from latentplan.planning.search.elites import refit
 
 if TYPE_CHECKING:
     import numpy as np

@@ -13,11 +13,11 @@ from torch import Tensor
 from torch.utils._pytree import tree_map
 
 from latentplan.planning.adapters import CEMTrajectoryOptimizer, RolloutController
-from latentplan.planning.cem import CEMPlanner
 from latentplan.planning.model import Model, State, count_rows, state_device
 from latentplan.planning.objectives import Constraint, Term
 from latentplan.planning.plan import Plan
-from latentplan.planning.sampling import Generators
+from latentplan.planning.search.cem import CEMPlanner
+from latentplan.planning.search.sampling import Generators
 
 
 class ModelPredictiveController:

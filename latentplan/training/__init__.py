@@ -1,7 +1,7 @@
 """Learning: losses, the Lightning module, collection, the run itself, distillation and goals."""
 
-from latentplan.training.distill import distill, resume_distillation
-from latentplan.training.goal_run import learn_goals, resume_goals
-from latentplan.training.run import Result, resume, train
+from latentplan.training.distillation.run import distill, resume_distillation
+from latentplan.training.goal_conditioning.run import learn_goals, resume_goals
+from latentplan.training.train import Result, resume, train
 
 __all__ = ["Result", "distill", "learn_goals", "resume", "resume_distillation", "resume_goals", "train"]

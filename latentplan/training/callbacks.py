@@ -12,17 +12,17 @@ import lightning
 import numpy as np
 import torch
 
-from latentplan.checkpoint import save_checkpoint
+from latentplan.agents.checkpoint import save_checkpoint
 from latentplan.config import CollectionConfig, Config
 from latentplan.models import WorldModel
-from latentplan.replay import Replay
-from latentplan.training.collector import Collected
-from latentplan.training.optimization import take_up
+from latentplan.replay.buffer import Replay
+from latentplan.training.collection.collector import Collected
+from latentplan.training.collection.process import Worker
+from latentplan.training.learner.optimization import take_up
 from latentplan.training.state import INTERRUPTED, RunState, save_state
-from latentplan.training.worker import Worker
 
 if TYPE_CHECKING:
-    from latentplan.training.module import Learner
+    from latentplan.training.learner.module import Learner
 
 SAVE_MINUTES = 5.0
 

@@ -13,8 +13,8 @@ from latentplan.training.callbacks import Experience
 from latentplan.training.state import RunState
 
 if TYPE_CHECKING:
-    from latentplan.training.module import Learner
-    from latentplan.training.progress import Progress
+    from latentplan.training.console import Progress
+    from latentplan.training.learner.module import Learner
 
 COLUMNS = (
     *("env_frames", "decisions", "updates", "minutes", "episode_return"),

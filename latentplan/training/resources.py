@@ -8,7 +8,7 @@ from pathlib import Path
 import torch
 
 from latentplan.config import Config, RunConfig, UserError
-from latentplan.replay import FRAME_BYTES
+from latentplan.replay.buffer import FRAME_BYTES
 
 UNKNOWN_LENGTH_CAPACITY = 200_000
 COLLECTOR_THREADS = 4  # at most: runs often share a machine

@@ -10,10 +10,10 @@ from typing import TYPE_CHECKING, Any
 import torch
 
 from latentplan.config import UserError
-from latentplan.replay import Replay, read_saved
+from latentplan.replay.buffer import Replay, read_saved
 
 if TYPE_CHECKING:
-    from latentplan.training.module import Learner
+    from latentplan.training.learner.module import Learner
 
 STATE_FILE = "state.pt"
 INTERRUPTED = 130  # exit code of a run that the user ended

@@ -35,7 +35,7 @@ def run(flags: Flags) -> int:
     info, planner = check_checkpoint(Path(checkpoint))
     arms = parse_arms(flags.get("--arms", ",".join(NAMES)), planner)
     device = str(choose_device(flags))
-    from latentplan.rollout import episode_seed
+    from latentplan.evaluation.episodes import episode_seed
 
     seeds = [episode_seed(seed, index) for index in range(episodes)]
     about = {

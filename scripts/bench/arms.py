@@ -7,8 +7,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from latentplan.compose import build_config, field_names, raise_unknown
 from latentplan.config import PlannerConfig, UserError, to_dict
+from latentplan.config.files import build_config, field_names, raise_unknown
 from latentplan.config.planner import override_planner
 
 REFERENCE = "full"
@@ -92,9 +92,10 @@ def play_arm(checkpoint: str, arm: Arm, seeds: Sequence[int], device: str, threa
     import numpy as np
     import torch
 
-    from latentplan.checkpoint import load_agent, load_model
+    from latentplan.agents.checkpoint import load_agent, load_model
     from latentplan.envs import make_env
-    from latentplan.rollout import Step, latency_percentiles, run_episodes
+    from latentplan.evaluation.episodes import Step, run_episodes
+    from latentplan.evaluation.statistics import latency_percentiles
 
     torch.set_num_threads(threads)
     _, config, _ = load_model(checkpoint)
@@ -133,7 +134,7 @@ def check_checkpoint(path: Path) -> tuple[dict[str, Any], PlannerConfig]:
     Raises:
         UserError: There is none, or it is damaged.
     """
-    from latentplan.checkpoint import load_model
+    from latentplan.agents.checkpoint import load_model
 
     _, config, info = load_model(path)
     return info, config.planner

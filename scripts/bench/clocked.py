@@ -10,7 +10,7 @@ import numpy as np
 
 if TYPE_CHECKING:
     from latentplan.envs.suite import SuiteEnv
-    from latentplan.timed_rollout import TimedEpisode
+    from latentplan.evaluation.timed import TimedEpisode
 
 ITERATIONS = {  # warm searches have their cold first one do as much as the cold ones do
     "5 cold": {"num_iterations": 5, "warm_start": False},
@@ -56,9 +56,9 @@ class Trial:
             control_hz: Of a world that does not wait for what thinking takes here; None for one that waits.
             prepare: Changes the agent before it plays.
         """
-        from latentplan.latency import Latency
-        from latentplan.timed_rollout import iterate_timed_episodes, load_timed_agent, summarize_timed
-        from latentplan.virtual_clock import VirtualClock
+        from latentplan.evaluation.clock import VirtualClock
+        from latentplan.evaluation.latency import Latency
+        from latentplan.evaluation.timed import iterate_timed_episodes, load_timed_agent, summarize_timed
 
         clock = VirtualClock(control_hz, Latency())
         agent = load_timed_agent(self.checkpoint, mode, clock, self.device, **settings)
@@ -99,7 +99,7 @@ def measure_error(trial: Trial) -> Iterator[Row]:
 
     Each row also tells what a model would do that expects nothing to change: latent and reward stay where they were.
     """
-    from latentplan.checkpoint import load_agent
+    from latentplan.agents.checkpoint import load_agent
 
     agent: Any = load_agent(trial.checkpoint, mode="actor", device=trial.device)
     parts = [_prediction_errors(agent.model, *_record(agent, trial.env, seed)) for seed in trial.seeds]

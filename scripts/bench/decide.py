@@ -22,13 +22,13 @@ from bench.options import (
     whole_number,
 )
 from bench.report import format_table, number, write_json
-from latentplan.compose import build_config
 from latentplan.config import Config, UserError, to_dict
+from latentplan.config.files import build_config
 
 if TYPE_CHECKING:
     import torch
 
-    from latentplan.agent import Agent
+    from latentplan.agents.checkpoint import Agent
     from latentplan.models import WorldModel
 
 FLAGS = {
@@ -84,7 +84,7 @@ def measure_decisions(agent: Agent, batch: int, decisions: int) -> dict[str, Any
     """
     import numpy as np
 
-    from latentplan.rollout import latency_percentiles
+    from latentplan.evaluation.statistics import latency_percentiles
 
     shape = (64, 64, 3) if batch == 1 else (batch, 64, 64, 3)
     rng, milliseconds = np.random.default_rng(0), []
@@ -131,7 +131,7 @@ def _load(flags: Flags, composed: Config | None, device: torch.device) -> tuple[
 
         torch.manual_seed(0)
         return WorldModel(composed.model, action_size(flags, composed)).to(device), composed, UNTRAINED_DISCOUNT
-    from latentplan.checkpoint import load_model
+    from latentplan.agents.checkpoint import load_model
 
     model, config, info = load_model(Path(flags["--checkpoint"]), str(device))
     layer = {"planner": {**to_dict(config.planner), **settings_layer(flags).get("planner", {})}}
@@ -140,7 +140,8 @@ def _load(flags: Flags, composed: Config | None, device: torch.device) -> tuple[
 
 def _agents(model: WorldModel, config: Config, discount: float) -> dict[str, Agent]:
     from bench.arms import without_actor
-    from latentplan.agent import ActorAgent, PlanningAgent
+    from latentplan.agents.actor import ActorAgent
+    from latentplan.agents.planning import PlanningAgent
 
     alone = replace(config.planner, **without_actor(config.planner))
     return {

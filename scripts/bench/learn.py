@@ -17,9 +17,9 @@ from bench.anchors import FRAMES, published
 from bench.learn_plot import Curve, Point, plot_runs
 from bench.options import Flags, choice, numbers, words
 from bench.report import format_table, interval, number, write_csv, write_json
-from latentplan.cli import parse_train
-from latentplan.compose import SECTIONS, read_config
+from latentplan.commands.main import parse_train
 from latentplan.config import Config, RunConfig, UserError, make_folder, to_dict
+from latentplan.config.files import SECTIONS, read_config
 
 FLAGS = {
     "--tasks": ("T,T", "domain-task each (cartpole-swingup,walker-walk)"),

@@ -7,9 +7,9 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from latentplan.cli import use_device
-from latentplan.compose import PRESETS, Layer, compose, raise_unknown
+from latentplan.commands.main import use_device
 from latentplan.config import DEVICES, Config, UserError, output_file
+from latentplan.config.files import PRESETS, Layer, compose, raise_unknown
 
 if TYPE_CHECKING:
     import torch

@@ -22,8 +22,8 @@ from bench.options import (
 )
 from bench.peers.install import FOLDER, PEERS, PeerError
 from bench.report import format_table, number, write_json
-from latentplan.compose import raise_unknown
 from latentplan.config import to_dict
+from latentplan.config.files import raise_unknown
 
 if TYPE_CHECKING:
     from bench.peers.client import PeerProcess
@@ -162,7 +162,7 @@ def summarise(times: Times, threads: int) -> dict[str, Any]:
     """
     import numpy as np
 
-    from latentplan.rollout import latency_percentiles
+    from latentplan.evaluation.statistics import latency_percentiles
 
     facts = {key: latency_percentiles(np.asarray(laps)) for key, laps in times.items()}
     p50 = {key: percentiles["p50"] for key, percentiles in facts.items()}

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from typing import Any
 
-from latentplan.checkpoint import load_agent, load_model
+from latentplan.agents.checkpoint import load_agent, load_model
+from latentplan.agents.gated import GatedAgent
 from latentplan.config import PlannerConfig, to_dict
 from latentplan.config.planner import override_planner
-from latentplan.gate import GatedAgent
 
 
 class PlainGate(GatedAgent):

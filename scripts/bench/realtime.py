@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any
 
 from bench.options import DEVICE_FLAGS, Flags, choose_device, output_path, positive_number, whole_number, words
 from bench.report import format_table, interval, number, write_json
-from latentplan.compose import raise_unknown
 from latentplan.config import UserError, to_dict
+from latentplan.config.files import raise_unknown
 
 if TYPE_CHECKING:
     from bench.clocked import Row, Trial
@@ -43,9 +43,9 @@ def run(flags: Flags) -> int:
     from bench.arms import check_checkpoint
     from bench.clocked import Trial
     from bench.machine import describe_machine
-    from latentplan.checkpoint import load_model
+    from latentplan.agents.checkpoint import load_model
     from latentplan.envs import make_env
-    from latentplan.rollout import episode_seed
+    from latentplan.evaluation.episodes import episode_seed
 
     info, planner = check_checkpoint(Path(flags["--checkpoint"]))
     about = {

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any
 
 from bench.options import Flags, output_path, whole_number, words
 from bench.report import format_table, number, write_json
-from latentplan.compose import DOMAINS, compose, raise_unknown
 from latentplan.config import RENDER_QUALITIES, EnvConfig
+from latentplan.config.files import DOMAINS, compose, raise_unknown
 
 if TYPE_CHECKING:
     import numpy as np

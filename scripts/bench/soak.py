@@ -12,13 +12,13 @@ from typing import TYPE_CHECKING, Any
 
 from bench.options import DEVICE_FLAGS, Flags, choose_device, output_path, positive_number, whole_number, words
 from bench.report import format_table, number, write_json
-from latentplan.compose import raise_unknown
 from latentplan.config import UserError
+from latentplan.config.files import raise_unknown
 
 if TYPE_CHECKING:
     import numpy as np
 
-    from latentplan.rollout import Agent
+    from latentplan.evaluation.episodes import Agent
 
 MODES = ("actor", "gated", "background", "planner")
 IDLE = "no-op"
@@ -155,7 +155,7 @@ def soak_rows(tallies: Mapping[str, Tally]) -> dict[str, dict[str, Any]]:
     """What each agent did, as plain values; agents that had no turn are left out."""
     import numpy as np
 
-    from latentplan.rollout import latency_percentiles
+    from latentplan.evaluation.statistics import latency_percentiles
 
     played = {name: tally for name, tally in tallies.items() if tally.due}
     idle = played[IDLE].misses / played[IDLE].due if IDLE in played else math.nan
@@ -195,7 +195,7 @@ def soak_table(rows: Mapping[str, dict[str, Any]]) -> str:
 
 def _record_frames(checkpoint: Path, device: str) -> list[np.ndarray]:
     """What the actor sees in an episode, held in memory."""
-    from latentplan.checkpoint import load_agent, load_model
+    from latentplan.agents.checkpoint import load_agent, load_model
     from latentplan.envs import make_env
 
     _, config, _ = load_model(checkpoint)
@@ -216,8 +216,8 @@ def _record_frames(checkpoint: Path, device: str) -> list[np.ndarray]:
 @contextlib.contextmanager
 def _loaded_agents(checkpoint: str, modes: Sequence[str], device: str, deadline_ms: float) -> Any:
     """The agents by name, ready to act; those that search before they act have a deadline."""
-    from latentplan.background import BackgroundAgent
-    from latentplan.checkpoint import load_agent
+    from latentplan.agents.background import BackgroundAgent
+    from latentplan.agents.checkpoint import load_agent
 
     with contextlib.ExitStack() as stack:
         agents: dict[str, Any] = {IDLE: IdleAgent()}

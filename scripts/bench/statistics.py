@@ -7,8 +7,9 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
+from scipy.special import stdtrit
 
-from latentplan.rollout import confidence_interval, t_quantile
+from latentplan.evaluation.statistics import confidence_interval
 
 NUM_RESAMPLES = 2000
 LEAST_RESAMPLED = 5
@@ -73,4 +74,4 @@ def _student_half(groups: Sequence[Sequence[float]]) -> float:
     """Half of Student's 95 % interval for the mean of returns that fall into groups of their own spread."""
     squared = sum(len(group) * float(np.var(group, ddof=1)) for group in groups)  # of the sum
     freedom = sum(len(group) - 1 for group in groups)
-    return t_quantile(freedom) * math.sqrt(squared) / sum(map(len, groups))
+    return float(stdtrit(freedom, 0.975)) * math.sqrt(squared) / sum(map(len, groups))

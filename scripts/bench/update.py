@@ -15,11 +15,12 @@ from torch.utils.flop_counter import FlopCounterMode
 
 from bench.machine import now
 from latentplan.config import Config
-from latentplan.models import WorldModel, unroll
-from latentplan.replay import Batch, Replay, Rows
-from latentplan.training.graphed import WARM_UP_UPDATES as GRAPH_WARM_UP_UPDATES
-from latentplan.training.graphed import GraphedLearner
-from latentplan.training.module import Learner
+from latentplan.models import WorldModel
+from latentplan.models.fast import unroll
+from latentplan.replay.buffer import Batch, Replay, Rows
+from latentplan.training.learner.graphed import WARM_UP_UPDATES as GRAPH_WARM_UP_UPDATES
+from latentplan.training.learner.graphed import GraphedLearner
+from latentplan.training.learner.module import Learner
 
 NUM_ROWS = 4096
 WARM_UP_UPDATES = 2

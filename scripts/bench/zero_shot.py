@@ -18,14 +18,14 @@ from bench.options import (
     whole_number,
 )
 from bench.report import format_table, interval, number, write_json
-from latentplan.compose import build_config, raise_unknown
 from latentplan.config import EnvConfig, UserError, to_dict
+from latentplan.config.files import build_config, raise_unknown
 from latentplan.config.planner import override_planner
-from latentplan.goals.tokens import split_outside_quotes
+from latentplan.objectives.tokens import split_outside_quotes
 
 if TYPE_CHECKING:
     from latentplan.envs import SuiteEnv
-    from latentplan.rollout import Step
+    from latentplan.evaluation.episodes import Step
 
 FLAGS = {
     "--checkpoint": ("DIR", "trained agent, or run (its best checkpoint)"),
@@ -107,8 +107,8 @@ def run(flags: Flags) -> int:
     planner = build_config({"planner": override_planner(to_dict(trained), typed)}).planner
     overrides = {name: getattr(planner, name) for name in typed}
     device = str(choose_device(flags))
-    from latentplan.rollout import episode_seed
-    from latentplan.scoring import goal_env
+    from latentplan.evaluation.episodes import episode_seed
+    from latentplan.evaluation.goals import goal_env
 
     seeds = [episode_seed(seed, index) for index in range(episodes)]
     about = {
@@ -176,10 +176,11 @@ def play_job(conditions: Conditions, job: Job) -> dict[str, Any]:
 
     from bench.players import make_player
     from bench.statistics import mean_estimate
-    from latentplan.checkpoint import load_model
+    from latentplan.agents.checkpoint import load_model
     from latentplan.envs import make_env
-    from latentplan.rollout import run_episodes, summarize
-    from latentplan.scoring import goal_env, read_goals, score_env
+    from latentplan.evaluation.episodes import run_episodes
+    from latentplan.evaluation.goals import goal_env, read_goals, score_env
+    from latentplan.evaluation.statistics import summarize
 
     torch.set_num_threads(1)
     checkpoint, player, search = conditions.checkpoint, job.player, conditions.planner
@@ -242,7 +243,7 @@ def _parts(text: str) -> list[str]:
 
 
 def _check_goals(jobs: Sequence[Job], domain: str) -> None:
-    from latentplan.scoring import read_goals
+    from latentplan.evaluation.goals import read_goals
 
     for job in jobs:
         read_goals(job.objective, job.constraint, domain)

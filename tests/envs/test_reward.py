@@ -5,7 +5,7 @@ import pytest
 
 from latentplan.config import Config, EnvConfig, RunConfig, UserError
 from latentplan.envs import make_env
-from latentplan.scoring import ScoredEnv, read_goals
+from latentplan.evaluation.goals import ScoredEnv, read_goals
 from latentplan.training import train
 
 OBJECTIVE = "0.5 * (cart -> 0.5 and upright > 0.9) + 0.1 * abs(pole_speed) + 0.25 * task(balance)"

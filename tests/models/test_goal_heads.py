@@ -5,8 +5,8 @@ import math
 import pytest
 import torch
 
-from latentplan.goals.box import BoxView
 from latentplan.models import WorldModel
+from latentplan.objectives.box import BoxView
 from latentplan.planning import CEMPlanner, check_model, conditioned
 
 LABELS = {"height": 0.5, "speed": 2.0, "task.walk": 0.5}
@@ -90,8 +90,8 @@ def test_other_boxes_are_worth_and_done_otherwise(knowing, state):
 
 
 def test_plans_for_a_box_can_keep_constraints(knowing, state):
-    from latentplan.goals.objective import plan_constraint
-    from latentplan.goals.parser import parse_constraints
+    from latentplan.objectives.objective import plan_constraint
+    from latentplan.objectives.parser import parse_constraints
 
     planner = CEMPlanner(action_dim=3, horizon=3, num_samples=16, num_elites=4, num_policy_samples=4)
     constraint = plan_constraint(parse_constraints("height < 0.3", LABELS))

@@ -104,7 +104,7 @@ def test_a_candidate_is_worth_the_mean_of_what_the_turns_promise(model, beliefs)
 
 def judged(model, state, actions):
     """What candidates are worth, (batch, sample)."""
-    from latentplan.planning.imagination import Scorer
+    from latentplan.planning.search.scorer import Scorer
 
     discounts = 0.9 ** torch.arange(actions.shape[2] + 1)
     scorer = Scorer.build(model, None, (), discounts, terminal_value=None, use_continues=False, penalty=None)

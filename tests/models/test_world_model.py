@@ -50,7 +50,7 @@ def test_a_rollout_passes_gradients_to_its_actions(model, state, actions):
 
 def test_rows_beyond_a_block_are_the_same_rows(model, state, actions, monkeypatch):
     whole, last = model.rollout(state, actions)
-    monkeypatch.setattr("latentplan.models.imagination.ROWS_PER_THREAD", 1)
+    monkeypatch.setattr("latentplan.models.fast.rollout.ROWS_PER_THREAD", 1)
     monkeypatch.setattr(torch, "get_num_threads", lambda: 2)
     in_blocks, also_last = model.rollout(state, actions)
     assert torch.allclose(in_blocks, whole, **LOOSE)

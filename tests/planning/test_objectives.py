@@ -16,7 +16,7 @@ from latentplan.planning import (
     terminal_value,
     uncertainty_penalty,
 )
-from latentplan.planning.imagination import Scorer
+from latentplan.planning.search.scorer import Scorer
 
 
 def score(model, objective, state, actions, *, discount=1.0, constraints=(), penalty=None):

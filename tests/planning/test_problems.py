@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from latentplan.planning import FunctionModel, ModelPredictiveController, icem_planner
-from latentplan.planning.imagination import Scorer
+from latentplan.planning.search.scorer import Scorer
 
 
 def linear_problem(num_states, generator):

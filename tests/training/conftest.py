@@ -20,9 +20,9 @@ from latentplan.config import (
     RunConfig,
 )
 from latentplan.models import WorldModel
-from latentplan.replay import Batch, Replay
+from latentplan.replay.buffer import Batch, Replay
 from latentplan.training import train
-from latentplan.training.module import Learner
+from latentplan.training.learner.module import Learner
 
 TINY = Config(
     env=EnvConfig(action_repeat=1),

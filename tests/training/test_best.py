@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 import torch
 
-from latentplan.checkpoint import read_info
+from latentplan.agents.checkpoint import read_info
 from latentplan.training import resume, train
 from latentplan.training.callbacks import Experience, Save, Stop
-from latentplan.training.collector import Collector
+from latentplan.training.collection.collector import Collector
 from latentplan.training.state import RunState
 
 

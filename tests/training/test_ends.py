@@ -4,8 +4,8 @@ import pytest
 import torch
 
 from latentplan.models import WorldModel
-from latentplan.training.losses import world_model_loss
-from latentplan.training.module import refreshed
+from latentplan.training.learner.losses import world_model_loss
+from latentplan.training.learner.module import refreshed
 
 END = 2  # transitions of the first sequence until it ends
 

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from latentplan.config import CollectionConfig, Config, EnvConfig, ReplayConfig, RunConfig
-from latentplan.replay import FRAME_BYTES
+from latentplan.replay.buffer import FRAME_BYTES
 from latentplan.training import resources
 from latentplan.training.resources import collector_threads, replay_capacity
 

@@ -11,8 +11,8 @@ import pytest
 import torch
 
 from latentplan.training import callbacks, resume, train
-from latentplan.training.run import INTERRUPTED, _Run
-from latentplan.training.worker import LocalWorker
+from latentplan.training.collection.process import LocalWorker
+from latentplan.training.train import INTERRUPTED, _Run
 from tests.training.run_folder import epochs_of, rows_of, saved_state
 
 
@@ -100,7 +100,7 @@ def test_a_run_is_interrupted_before_it_learns_and_goes_on(tiny, dot, tmp_path, 
             raise RuntimeError("the process that collects has ended unexpectedly")
 
     with monkeypatch.context() as patch:
-        patch.setattr("latentplan.training.worker.LocalWorker", Gone)
+        patch.setattr("latentplan.training.collection.process.LocalWorker", Gone)
         assert train(tiny(tmp_path / "run"), dot).exit_code == INTERRUPTED
     assert saved_state(tmp_path / "run")["run"]["decisions"] == 0
     assert resume(tmp_path / "run", make_env=dot).exit_code == 0

@@ -1,0 +1,53 @@
+"""An agent that decides by the learned actor alone."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from latentplan.agents.base import ModelAgent
+from latentplan.config import Config
+from latentplan.models import State, WorldModel
+from latentplan.models.fast import reflex
+from latentplan.models.heads import sample_action
+from latentplan.models.symmetry import flat, mean_over_turns
+
+
+class ActorAgent(ModelAgent):
+    """Decides by the actor alone: its mode, or samples when it explores.
+
+    Args:
+        model: The world model.
+        config: Settings it was trained with.
+        explore: Whether actions are sampled.
+        noise_correlation: Of the samples, between decisions.
+        seed: Of the agent's own random stream.
+    """
+
+    def __init__(
+        self,
+        model: WorldModel,
+        config: Config,
+        *,
+        explore: bool = False,
+        noise_correlation: float = 0.0,
+        seed: int = 0,
+    ) -> None:
+        super().__init__(model, config, noise_correlation=noise_correlation, seed=seed)
+        self.explore = explore
+
+    @torch.inference_mode()
+    def act(self, frame: np.ndarray) -> np.ndarray:
+        """The action in [-1, 1], float32 (action,) or (batch, action), for uint8 frame(s).
+
+        Raises:
+            ValueError: The frame has another shape or dtype, or the batch changed without a reset.
+        """
+        return super().act(frame)
+
+    def _choose(self, state: State) -> Tensor:
+        mean, std = (mean_over_turns(part, state) for part in reflex.act(self._weights, flat(state)))
+        if not self.explore:
+            return mean
+        return sample_action(mean, std, self.noise.draw(mean, self.generator, self._forget))

@@ -1,0 +1,138 @@
+"""The actor as a program of its own: a file that runs where torch does, without this package.
+
+One call is one decision. Inputs and outputs are plain tensors, and everything the actor remembers passes through them:
+
+    action, deter, stoch = program(frame, deter, stoch, action, is_first)
+
+`frame` uint8 (batch, 64, 64, 3); `deter` float32 (batch, deter) and `stoch` float32 (batch, latent), the belief that
+the last call returned (that of all four quarter turns side by side, where the agent sees these); `action` float32
+(batch, action) in [-1, 1], what was executed since; `is_first` bool (batch,), true at the first frame of an episode,
+where the three before it are not read (zeros will do). The batch may have any size, and changes nothing about each
+row's result.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import io
+import json
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+from torch.export import Dim, ExportedProgram
+from torch.utils._pytree import tree_flatten, tree_unflatten
+
+from latentplan.agents.base import ModelAgent
+from latentplan.agents.checkpoint import load_model
+from latentplan.config import UserError, output_file
+from latentplan.models import State, WorldModel
+from latentplan.models.fast import reflex
+from latentplan.models.symmetry import turned
+
+FORMATS = ("pt2", "onnx")
+SIZES = "actor.json"  # the part of a .pt2 file that names the sizes of its inputs
+INPUTS = ("frame", "deter", "stoch", "action", "is_first")
+OUTPUTS = ("new_action", "new_deter", "new_stoch")  # names that ONNX tells from the inputs'
+EXAMPLE_ROWS = 2  # a batch of one would be built into the program
+
+
+class _Decision(nn.Module):
+    """Belief update and actor with weights of their own."""
+
+    def __init__(self, weights: reflex.Reflex, turns: int) -> None:
+        super().__init__()
+        self._turns = turns
+        tensors, self._layout = tree_flatten(weights)
+        self._names = [f"weight_{index}" for index in range(len(tensors))]
+        for name, tensor in zip(self._names, tensors, strict=True):
+            self.register_buffer(name, tensor.detach().cpu().float().clone())
+
+    def forward(
+        self, frame: Tensor, deter: Tensor, stoch: Tensor, action: Tensor, is_first: Tensor
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        weights = tree_unflatten([getattr(self, name) for name in self._names], self._layout)
+        turns, (rows, size) = self._turns, action.shape
+        taken = action[:, None].expand(-1, turns, -1).reshape(rows * turns, size)
+        last = State(*(part.reshape(rows * turns, part.shape[1] // turns) for part in (deter, stoch)))
+        advanced = reflex.advance(weights, last, taken).reshape(rows, deter.shape[1])
+        begun = torch.where(is_first[:, None], 0.0, advanced).reshape(last.deter.shape)
+        state = reflex.see(weights, begun, turned(frame, turns))
+        modes, _ = reflex.act(weights, state)
+        mean = modes.reshape(rows, turns, size).mean(1)
+        deters, stochs = (part.reshape(rows, part.shape[1] * turns) for part in state)
+        return mean, deters, stochs
+
+
+def export_actor(agent_or_checkpoint: ModelAgent | str | Path, path: str | Path, format: str = "pt2") -> Path:
+    """Write the actor as a program that needs neither this package nor a state beyond its inputs.
+
+    Args:
+        agent_or_checkpoint: An agent with a model, or the folder of a checkpoint or run.
+        path: The file to write; replaced whole.
+        format: `pt2` (`torch.export`) or `onnx`, which needs the packages onnx and onnxscript.
+
+    Returns:
+        The path.
+
+    Raises:
+        UserError: The checkpoint, the format or the path cannot be used.
+    """
+    if format not in FORMATS:
+        raise UserError(f"format must be one of {', '.join(FORMATS)}, got {format!r}")
+    missing = [name for name in ("onnx", "onnxscript") if format == "onnx" and importlib.util.find_spec(name) is None]
+    if missing:
+        raise UserError(f"format onnx needs {' and '.join(missing)}: pip install onnx onnxscript, or --format pt2")
+    target = Path(path)
+    other = next((name for name in FORMATS if name != format and target.suffix == f".{name}"), None)
+    if other is not None:
+        raise UserError(f"{target} would hold a program in format {format}: give --format {other}, or another name")
+    target = output_file(target, "the program's path")
+    if isinstance(agent_or_checkpoint, ModelAgent):
+        model = agent_or_checkpoint.model
+    else:
+        model, _, _ = load_model(agent_or_checkpoint)
+    part = target.with_name(f".{target.name}.part")
+    try:
+        _write(_trace(model), model, part, format)
+        part.replace(target)
+    except OSError as error:
+        raise UserError(f"cannot write {target}: {error.strerror}") from None
+    finally:
+        part.unlink(missing_ok=True)
+    return target
+
+
+def sizes(model: WorldModel) -> dict[str, int]:
+    """Sizes of a program's vectors: `deter`, `stoch` and `action`."""
+    turns = model.config.turns
+    return {
+        "deter": turns * model.config.deter_dim,
+        "stoch": turns * model.config.latent_dim,
+        "action": model.action_dim,
+    }
+
+
+def _trace(model: WorldModel) -> ExportedProgram:
+    decision = _Decision(reflex.lay_out(model), model.config.turns).eval()
+    batch = Dim("batch", min=1)
+    dynamic = {name: {0: batch} for name in INPUTS}
+    with torch.no_grad():
+        return torch.export.export(decision, _example(model), dynamic_shapes=dynamic)
+
+
+def _example(model: WorldModel) -> tuple[Tensor, ...]:
+    vectors = [torch.zeros(EXAMPLE_ROWS, size) for size in sizes(model).values()]
+    frame = torch.zeros(EXAMPLE_ROWS, 64, 64, 3, dtype=torch.uint8)
+    return frame, *vectors, torch.ones(EXAMPLE_ROWS, dtype=torch.bool)
+
+
+def _write(program: ExportedProgram, model: WorldModel, path: Path, format: str) -> None:
+    if format == "pt2":
+        whole = io.BytesIO()  # a disk that is full ends the interpreter while torch writes to it
+        torch.export.save(program, whole, extra_files={SIZES: json.dumps(sizes(model))})
+        path.write_bytes(whole.getvalue())
+        return
+    options: dict[str, Any] = {"dynamo": True, "external_data": False, "verbose": False}
+    torch.onnx.export(program, (), str(path), input_names=INPUTS, output_names=OUTPUTS, **options)

@@ -1,0 +1,236 @@
+"""What an episode is worth under goals named after training, by what was true in the simulator.
+
+A score never sees a prediction: it comes from the quantities that the environment tells after every control step, and
+for a goal image from the camera's own pictures. It is the same whoever acts.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
+
+import gymnasium
+import numpy as np
+from numpy.typing import NDArray
+
+from latentplan.config import EnvConfig
+from latentplan.config.quantities import scales
+from latentplan.envs.true_quantities import clause_degree, quantity_names
+from latentplan.objectives.expression import (
+    Clause,
+    Expression,
+    GoalImage,
+    LearnedReturn,
+    Phase,
+    evaluate,
+    shortfall,
+)
+from latentplan.objectives.image import read_goal
+from latentplan.objectives.parser import parse_constraints, parse_schedule
+
+if TYPE_CHECKING:
+    from latentplan.envs import SuiteEnv
+
+Floats = NDArray[np.float64]
+MET = 0.9  # degree from which a clause counts as met in films
+PIXEL_MARGIN = 0.1  # root mean square difference to a goal image that counts as one margin; 1 is black to white
+
+
+@dataclass(frozen=True)
+class Goals:
+    """What the command line asks for.
+
+    Attributes:
+        phases: Objectives in the order of their start; empty keeps that of the training.
+        constraints: What must hold at every moment.
+        objective_text: As it was written, or None.
+        constraint_text: As it was written, or None.
+    """
+
+    phases: tuple[Phase, ...]
+    constraints: tuple[Clause, ...]
+    objective_text: str | None
+    constraint_text: str | None
+
+
+@dataclass(frozen=True)
+class Score:
+    """What one episode came to.
+
+    Attributes:
+        objective_return: Worth of the objective summed over env frames; 0 without one.
+        violation_rate: Share of the env frames at which a constraint was broken; 0 without one.
+        quantities: Mean of every true quantity over the env frames.
+    """
+
+    objective_return: float
+    violation_rate: float
+    quantities: dict[str, float]
+
+
+def goal_env(config: EnvConfig) -> EnvConfig:
+    """Where goals are pursued: the world of the training, the floor drawn behind the start as well.
+
+    What moves away from its start backwards would soon see nothing pass by, and could not tell its own speed.
+    """
+    return replace(config, floor="endless")
+
+
+def read_goals(objective: str | None, constraint: str | None, domain: str) -> Goals | None:
+    """The goals in these texts; None where both are None.
+
+    Raises:
+        UserError: A text is no expression over the quantities of the domain, or a goal image cannot be read.
+    """
+    if objective is None and constraint is None:
+        return None
+    known = scales(domain)
+    phases = () if objective is None else parse_schedule(objective, known)
+    constraints = () if constraint is None else parse_constraints(constraint, known)
+    for path in {path for phase in phases for path in _goal_paths(phase.objective)}:
+        read_goal(path)
+    return Goals(phases, constraints, objective, constraint)
+
+
+class ScoredEnv(gymnasium.Wrapper[Any, Any, Any, Any]):
+    """An environment that keeps the score of every episode, and tells who acts when the objective changes.
+
+    Attributes:
+        scores: Of the episodes that ended, in order.
+        worth: Worth of the objective at each env frame of the present episode.
+        substeps_per_decision: Steps of the simulator per decision.
+        clauses: The text of every clause of the present objective, then of every constraint, each with whether it was
+            met at the last env frame; empty before the first.
+    """
+
+    def __init__(self, env: SuiteEnv, goals: Goals, on_objective: Callable[[Expression], None] | None = None) -> None:
+        """Wraps an environment.
+
+        Args:
+            env: What is played.
+            goals: What is scored.
+            on_objective: Called with the objective when an episode begins and when another takes its place.
+        """
+        super().__init__(env)
+        self._suite_env, self.substeps_per_decision = env, env.substeps_per_decision
+        env.record_quantities = True
+        self.goals, self.scores = goals, list[Score]()
+        self.worth: list[float] = []
+        self.clauses: list[tuple[str, bool]] = []
+        self._on_objective = on_objective
+        self._names = quantity_names(env.domain, "")
+        self._pictures = {path: read_goal(path) for phase in goals.phases for path in _goal_paths(phase.objective)}
+        self._present: Phase | None = None
+        self._num_frames = self._num_violated = 0
+        self._totals = np.zeros(len(self._names))
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        """Begins an episode and a score."""
+        self._num_frames = self._num_violated = 0
+        self._totals = np.zeros(len(self._names))
+        self.worth, self.clauses, self._present = [], [], None
+        self._announce()
+        return self.env.reset(seed=seed, options=options)
+
+    def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
+        """Steps the environment and scores each of its control steps."""
+        return self.step_schedule([(action, self.substeps_per_decision)])
+
+    def step_schedule(self, schedule: Sequence[tuple[Any, int]]) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
+        """As `SuiteEnv.step_schedule`, and scores each control step."""
+        frame, reward, terminated, truncated, info = self._suite_env.step_schedule(schedule)
+        for quantities, frame_reward in zip(info["quantities"], info["rewards"], strict=True):
+            self._totals += quantities
+            self._score(dict(zip(self._names, quantities, strict=True)), frame_reward, frame)
+        if terminated or truncated:
+            self.scores.append(self._finished())
+        else:
+            self._announce()
+        return frame, reward, terminated, truncated, info
+
+    def summarize(self, episodes: int) -> dict[str, Any]:
+        """The scores of the first episodes as plain values for JSON.
+
+        Returns:
+            With an objective `objective`, `objective_returns` and their mean `objective_return`; with constraints
+            `constraint`, `violation_rates` and their mean `violation_rate`. Always `quantities`: the mean of each true
+            quantity over the env frames of all episodes.
+        """
+        scores = self.scores[:episodes]
+        means = {name: float(np.mean([score.quantities[name] for score in scores])) for name in self._names}
+        found: dict[str, Any] = {"quantities": means}
+        if self.goals.phases:
+            returns = [score.objective_return for score in scores]
+            found |= {"objective": self.goals.objective_text, "objective_return": float(np.mean(returns))}
+            found["objective_returns"] = returns
+        if self.goals.constraints:
+            rates = [score.violation_rate for score in scores]
+            found |= {"constraint": self.goals.constraint_text, "violation_rate": float(np.mean(rates))}
+            found["violation_rates"] = rates
+        return found
+
+    def _score(self, values: dict[str, np.float64], reward: float, picture: NDArray[np.uint8]) -> None:
+        phase = self._phase()
+        broken = [not shortfall(clause, values.__getitem__) < 0.0 for clause in self.goals.constraints]
+        self._num_violated += any(broken)
+        self._num_frames += 1
+        shown = [(clause.text, not is_broken) for clause, is_broken in zip(self.goals.constraints, broken, strict=True)]
+        if phase is not None:
+            terms = phase.objective.terms
+            self.worth.append(float(sum(weight * self._worth(term, values, reward, picture) for weight, term in terms)))
+            degrees = [
+                (clause.text, float(clause_degree(shortfall(clause, values.__getitem__))))
+                for clause in phase.objective.clauses
+            ]
+            shown = [(text, degree >= MET) for text, degree in degrees] + shown
+        self.clauses = shown
+
+    def _worth(self, term: Any, values: dict[str, np.float64], reward: float, picture: NDArray[np.uint8]) -> float:
+        if isinstance(term, LearnedReturn):
+            return reward
+        if isinstance(term, GoalImage):
+            difference = (picture.astype(float) - self._pictures[term.path]) / 255.0
+            return float(clause_degree(np.sqrt(np.mean(difference**2)) / PIXEL_MARGIN))
+        return float(evaluate(term, values.__getitem__, clause_degree))
+
+    def _phase(self) -> Phase | None:
+        """The objective of the env frame that comes next."""
+        return next((phase for phase in reversed(self.goals.phases) if phase.start <= self._num_frames), None)
+
+    def _announce(self) -> None:
+        phase = self._phase()
+        if phase is not self._present and phase is not None and self._on_objective is not None:
+            self._on_objective(phase.objective)
+        self._present = phase
+
+    def _finished(self) -> Score:
+        means = dict(zip(self._names, (self._totals / self._num_frames).tolist(), strict=True))
+        return Score(float(np.sum(self.worth)), self._num_violated / self._num_frames, means)
+
+
+def score_env(env: SuiteEnv, goals: Goals, planner: Any | None) -> ScoredEnv:
+    """The environment with scores, and the goals given to the agent that plans in it.
+
+    Args:
+        env: What is played.
+        goals: What is scored.
+        planner: A planning agent, which then pursues the goals; None where whoever acts does not know them.
+
+    Raises:
+        UserError: The agent does not predict what a goal is about.
+    """
+    if planner is None:
+        return ScoredEnv(env, goals)
+    constraints = goals.constraint_text or ()
+
+    def change(objective: Expression | None) -> None:
+        planner.set_objective(objective, constraints)
+
+    for objective in [None, *(phase.objective for phase in goals.phases)]:
+        change(objective)  # what cannot be planned for is refused before anything is played
+    return ScoredEnv(env, goals, change)
+
+
+def _goal_paths(objective: Expression) -> list[str]:
+    return [term.path for _, term in objective.terms if isinstance(term, GoalImage)]

@@ -1,0 +1,151 @@
+"""Whole imagined rollouts in one compiled call, on processors that multiply bfloat16 (AVX-512 or AMX).
+
+The weights are laid out here as `imagine.c` reads them. Sums and everything between the products are float32, so that
+rollouts differ from torch's only by what torch rounds in between.
+"""
+
+from __future__ import annotations
+
+import ctypes
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, NamedTuple
+
+import torch
+from torch import Tensor
+from torch.nn import functional
+
+from latentplan.models.fast.library import load
+
+if TYPE_CHECKING:
+    from latentplan.models.fast.rollout import Trunk, Weights
+
+TILE = 16  # columns of a tile of weights, and row pairs
+MULTIPLE = 2 * TILE  # what every size must be a multiple of
+
+
+class _Layer(ctypes.Structure):
+    _fields_ = (
+        *((name, ctypes.c_void_p) for name in ("weights", "scale", "shift")),
+        *((name, ctypes.c_long) for name in ("inputs", "outputs")),
+    )
+
+
+class _Model(ctypes.Structure):
+    _fields_ = (
+        ("layers", _Layer * 13),  # input, gates, prior, mean; then three of each: reward head, actor, value head
+        ("bin_values", ctypes.c_void_p),
+        *((name, ctypes.c_long) for name in ("action", "latent", "deter", "hidden", "bins")),
+    )
+
+
+class Packed(NamedTuple):
+    """What the compiled rollout reads, and the tensors that its pointers point into."""
+
+    model: _Model
+    tensors: tuple[Tensor, ...]
+
+
+def pack(weights: Weights, critic: tuple[Trunk, Tensor, Tensor]) -> Packed | None:
+    """The weights as the compiled rollout reads them; None where it cannot: here, in this dtype, or in these sizes.
+
+    Args:
+        weights: Of what imagines.
+        critic: Trunk, logits and their shift of the value head, as `weights` has those of the reward head.
+    """
+    library = load()
+    (action, hidden), latent, deter = weights.action.shape, len(weights.stoch), len(weights.prior)
+    known = weights.gates.device.type == "cpu" and weights.gates.dtype == torch.bfloat16
+    fit = all(size % MULTIPLE == 0 for size in (latent, deter, hidden))
+    if library is None or not (known and fit and library.can_imagine()):
+        return None
+
+    def turned(matrix: Tensor, first: int) -> Tensor:
+        """The rows from `first` on, before those above them: the state lies in another order here."""
+        return torch.cat([matrix[first:], matrix[:first]])
+
+    def output(matrix: Tensor, shift: Tensor) -> tuple[Tensor, None, Tensor]:
+        """A float32 product as two of bfloat16: what rounding leaves out goes beside what it keeps."""
+        matrix, shift = _padded(matrix, 1), _padded(shift, 0)
+        rounded = matrix.bfloat16()
+        return torch.cat([rounded, (matrix - rounded.float()).bfloat16()], 1), None, shift
+
+    def mlp(trunk: Trunk, matrix: Tensor, shift: Tensor) -> list[tuple[Tensor, Tensor | None, Tensor]]:
+        (first, first_norm), (second, second_norm) = trunk
+        return [(turned(first, deter), *first_norm), (second, *second_norm), output(matrix, shift)]
+
+    layers = [
+        (torch.cat([_padded(weights.action, 0), weights.stoch]), *weights.input_norm),
+        (turned(weights.gates, hidden), *weights.gates_norm),
+        (weights.prior, *weights.prior_norm),
+        (weights.mean, None, weights.mean_shift.float()),
+        *mlp(weights.head, weights.logits, weights.logits_shift),
+        *mlp(weights.actor, weights.actor_output, weights.actor_shift),
+        *mlp(*critic),
+    ]
+    return _lay_out(layers, weights.values, (action, latent, deter, hidden))
+
+
+def rollout(packed: Packed, deter: Tensor, stoch: Tensor, actions: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Rewards (rows, time) along actions (rows, time, action), and the deter and stoch reached, all float32."""
+    rewards = torch.empty(actions.shape[:2])
+    deter, stoch, actions = _own(deter), _own(stoch), actions.float().contiguous()
+    _call(packed, deter, stoch, actions, rewards)
+    return rewards, deter, stoch
+
+
+def follow(packed: Packed, deter: Tensor, stoch: Tensor, noise: Tensor) -> Tensor:
+    """The actor's actions, float32 (rows, time, action), for standard normal draws of the same shape."""
+    actions = _own(noise)
+    _call(packed, _own(deter), _own(stoch), actions)
+    return actions
+
+
+def judge(packed: Packed, deter: Tensor, stoch: Tensor) -> Tensor:
+    """The value of states, float32 (rows,)."""
+    values = torch.empty(len(deter))
+    _call(packed, _own(deter), _own(stoch), torch.empty(len(deter), 0, 0), values=values)
+    return values
+
+
+def _own(tensor: Tensor) -> Tensor:
+    """A copy to write to."""
+    return tensor.to(torch.float32, memory_format=torch.contiguous_format, copy=True)
+
+
+def _call(
+    packed: Packed,
+    deter: Tensor,
+    stoch: Tensor,
+    actions: Tensor,
+    rewards: Tensor | None = None,
+    values: Tensor | None = None,
+) -> None:
+    library, model, (rows, time) = load(), packed.model, actions.shape[:2]
+    assert library is not None
+    wanted = ((rows, model.deter), (rows, model.latent))
+    if (deter.shape, stoch.shape) != wanted or (time and actions.shape[2] != model.action):
+        given = ", ".join(str(tuple(tensor.shape)) for tensor in (deter, stoch, actions))
+        raise ValueError(f"deter, stoch and actions have shapes {given}; the model has {wanted} and {model.action}")
+    written = [None if tensor is None else tensor.data_ptr() for tensor in (deter, stoch, actions, rewards, values)]
+    if library.imagine(ctypes.addressof(packed.model), *written, rows, time, torch.get_num_threads()):
+        raise MemoryError("no memory for an imagined rollout")
+
+
+def _padded(matrix: Tensor, dim: int) -> Tensor:
+    """With zeros after the last row or column, up to a multiple of what a tile holds."""
+    missing = -matrix.shape[dim] % MULTIPLE
+    return functional.pad(matrix, [0, 0] * (matrix.dim() - 1 - dim) + [0, missing])
+
+
+def _lay_out(
+    layers: Sequence[tuple[Tensor, Tensor | None, Tensor]], values: Tensor, sizes: tuple[int, int, int, int]
+) -> Packed:
+    built, kept = [], [values]
+    for matrix, scale, shift in layers:
+        inputs, outputs = matrix.shape
+        tiles = matrix.view(inputs // MULTIPLE, TILE, 2, outputs // TILE, TILE).permute(3, 0, 1, 4, 2).contiguous()
+        kept += [tiles, shift] if scale is None else [tiles, scale, shift]
+        built.append(
+            _Layer(tiles.data_ptr(), None if scale is None else scale.data_ptr(), shift.data_ptr(), inputs, outputs)
+        )
+    return Packed(_Model((_Layer * len(built))(*built), values.data_ptr(), *sizes, len(values)), tuple(kept))

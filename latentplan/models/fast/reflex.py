@@ -1,0 +1,151 @@
+"""One frame in, one action out: the belief's update and the actor, arranged for few rows and one core.
+
+Equals `WorldModel.infer` followed by the actor, in float32. At one row the time goes into calls, not into arithmetic:
+so the weights are gathered once, the convolutions are products of patches (a convolution of one small picture spends
+most of its time on preparing itself), and the spread of the posterior is left out. Plain functions of tensors:
+`latentplan.agents.export` writes them down as a program of their own.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+from latentplan.models.dynamics import State
+from latentplan.models.encoder import FRAME_SIZE, PATCH
+from latentplan.models.fast import pointwise
+from latentplan.models.heads import NormedLinear, action_distribution
+from latentplan.models.world_model import WorldModel
+
+KERNEL, STRIDE, PADDING = 4, 2, 1  # of the encoder's convolutions
+
+Affine = tuple[Tensor, Tensor]  # weight (out, in) and shift (out,)
+Norm = tuple[Tensor, Tensor]  # scale and shift
+Hidden = tuple[Tensor, Norm]  # weight (out, in) and the norm behind it
+
+
+class Reflex(NamedTuple):
+    """The weights that seeing and acting need.
+
+    Attributes:
+        patches: On pixels in [-0.5, 0.5].
+        convolutions: Each with a weight (out, y x in), so that it multiplies patches.
+        embedding: From the last picture to the embedding.
+        input: From latent and action to the recurrence.
+        gates: Of the recurrence.
+        posterior_deter: The deterministic state's share of the posterior, (embedding, deter).
+        posterior_norm: Of its hidden layer.
+        posterior_mean: From there to the latent.
+        actor: Hidden layers of the actor.
+        action: From there to the mean and raw std of the action.
+    """
+
+    patches: Affine
+    convolutions: tuple[Affine, ...]
+    embedding: Affine
+    input: Hidden
+    gates: Hidden
+    posterior_deter: Tensor
+    posterior_norm: Norm
+    posterior_mean: Affine
+    actor: tuple[Hidden, ...]
+    action: Affine
+
+
+@torch.no_grad()
+def lay_out(model: WorldModel) -> Reflex:
+    """The weights of a world model.
+
+    On the CPU they share its memory and so follow whatever changes it in place; to that end the convolutions' weights
+    are moved, unchanged, to where their channels lie side by side. On other devices these are copies.
+    """
+    encoder, dynamics, latent = model.encoder, model.dynamics, model.dynamics.latent_dim
+    output = dynamics.posterior_output
+    return Reflex(
+        patches=_affine(encoder.patches),
+        convolutions=tuple(_convolution(layer) for layer in encoder.convolutions if isinstance(layer, nn.Conv2d)),
+        embedding=_affine(encoder.linear),
+        input=_hidden(dynamics.input),
+        gates=(dynamics.gates.weight.detach(), _norm(dynamics.gates_norm)),
+        posterior_deter=dynamics.posterior_deter.weight.detach(),
+        posterior_norm=_norm(dynamics.posterior_norm),
+        posterior_mean=(output.weight.detach()[:latent], output.bias.detach()[:latent]),
+        actor=tuple(_hidden(layer) for layer in model.actor.mlp.trunk if isinstance(layer, NormedLinear)),
+        action=_affine(model.actor.mlp.output),
+    )
+
+
+def see(reflex: Reflex, deter: Tensor, frames: Tensor) -> State:
+    """The belief with posterior mean for deter (rows, deter) and uint8 frames (rows, 64, 64, 3)."""
+    product = functional.linear(deter, reflex.posterior_deter) + _embed(reflex, frames)
+    return State(deter, functional.linear(pointwise.norm_silu(product, *reflex.posterior_norm), *reflex.posterior_mean))
+
+
+def advance(reflex: Reflex, state: State, action: Tensor) -> Tensor:
+    """The deterministic state (rows, deter) after action (rows, action) in [-1, 1]."""
+    hidden = _layer(torch.cat([state.stoch, action], -1), reflex.input)
+    weight, norm = reflex.gates
+    product = functional.linear(torch.cat([hidden, state.deter], -1), weight)
+    return pointwise.gated(product, *norm, state.deter)
+
+
+def act(reflex: Reflex, state: State) -> tuple[Tensor, Tensor]:
+    """Mean in [-1, 1] and std of the actor's action, (rows, action) each."""
+    hidden = state.features
+    for layer in reflex.actor:
+        hidden = _layer(hidden, layer)
+    return action_distribution(functional.linear(hidden, *reflex.action))
+
+
+def _embed(reflex: Reflex, frames: Tensor) -> Tensor:
+    """Embeddings (rows, embedding) of uint8 frames (rows, 64, 64, 3)."""
+    # Sizes come from `shape`: `len` would build the number of rows into an exported program.
+    rows, side = frames.shape[0], FRAME_SIZE // PATCH
+    patches = frames.reshape(rows, side, PATCH, side, 3 * PATCH).transpose(2, 3).reshape(rows, side * side, -1)
+    pixels = patches.to(reflex.patches[0].dtype).mul_(1.0 / 255.0).sub_(0.5)
+    tokens = functional.silu(functional.linear(pixels, *reflex.patches))
+    for weight, shift in reflex.convolutions:
+        windows = _windows(tokens.reshape(rows, side, side, -1))
+        tokens, side = functional.silu(functional.linear(windows, weight, shift)), side // STRIDE
+    return functional.linear(tokens.reshape(rows, -1), *reflex.embedding)
+
+
+def _windows(picture: Tensor) -> Tensor:
+    """What each output of a convolution reads, (rows, output, y x channel), of pictures (rows, side, side, channel)."""
+    rows, side, _, channels = picture.shape
+    padded = functional.pad(picture, (0, 0, PADDING, PADDING, PADDING, PADDING))
+    wide, outputs = side + 2 * PADDING, side // STRIDE
+    line = wide * channels
+    # A window's line of pixels lies in one piece, so that four pieces make a window.
+    windows = padded.as_strided(
+        (rows, outputs, outputs, KERNEL, KERNEL * channels),
+        (wide * line, STRIDE * line, STRIDE * channels, line, 1),
+    )
+    return windows.reshape(rows, outputs * outputs, KERNEL * KERNEL * channels)
+
+
+def _layer(features: Tensor, layer: Hidden) -> Tensor:
+    weight, norm = layer
+    return pointwise.norm_silu(functional.linear(features, weight), *norm)
+
+
+def _convolution(layer: nn.Conv2d) -> Affine:
+    assert layer.bias is not None
+    if layer.weight.device.type == "cpu":
+        layer.weight.data = layer.weight.data.contiguous(memory_format=torch.channels_last)
+    return layer.weight.detach().permute(0, 2, 3, 1).flatten(1), layer.bias.detach()
+
+
+def _affine(layer: nn.Linear) -> Affine:
+    return layer.weight.detach(), layer.bias.detach()
+
+
+def _norm(layer: nn.LayerNorm) -> Norm:
+    return layer.weight.detach(), layer.bias.detach()
+
+
+def _hidden(layer: NormedLinear) -> Hidden:
+    return layer.linear.weight.detach(), _norm(layer.norm)

@@ -1,0 +1,1 @@
+"""Plans that are searched beside the control loop."""

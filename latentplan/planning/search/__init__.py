@@ -1,0 +1,1 @@
+"""The search over action sequences: the loop, its options, and its parts."""

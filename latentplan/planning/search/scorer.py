@@ -1,0 +1,238 @@
+"""Candidate sequences through the model: what happens, and how good it is."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import torch
+from einops import rearrange, reduce, repeat
+from torch import Tensor
+from torch.utils._pytree import tree_map
+
+from latentplan.planning.model import (
+    Model,
+    State,
+    check_shape,
+    count_rows,
+    repeat_rows,
+    require,
+    split_rows,
+    supports,
+    take_step,
+)
+from latentplan.planning.objectives import Constraint, Objective, Rollout, Term, as_objective, predicted_return
+from latentplan.planning.search.elites import Scores
+
+
+@dataclass(frozen=True)
+class Scorer:
+    """The search problem of one plan: a model, and what is maximised in it.
+
+    Attributes:
+        model: The model that imagines.
+        objective: What is maximised.
+        constraints: What candidates must keep: each gives a violation (rows,), 0 where it holds.
+        discounts: Powers of the discount, (horizon + 1,), in the precision of the returns.
+        use_continues: Whether the model's probability of going on discounts what follows.
+        penalty: What a unit of violation costs; None leaves the return as it is and ranks by violation first.
+    """
+
+    model: Model
+    objective: Objective
+    constraints: tuple[Objective, ...]
+    discounts: Tensor
+    use_continues: bool
+    penalty: float | None
+
+    @classmethod
+    def build(
+        cls,
+        model: Model,
+        objective: Term | None,
+        constraints: Sequence[Constraint],
+        discounts: Tensor,
+        *,
+        terminal_value: bool | None,
+        use_continues: bool,
+        penalty: float | None,
+    ) -> Scorer:
+        """The scorer of a plan; without an objective, of predicted reward and (as `terminal_value` says) value.
+
+        Raises:
+            ValueError: The model lacks what a setting asks for.
+        """
+        if use_continues:
+            require(model, "continues", "use_continues=True")
+        chosen = predicted_return(model, terminal_value) if objective is None else as_objective(objective)
+        kept = tuple(as_objective(constraint) for constraint in constraints)
+        for term in (chosen, *kept):
+            term.check(model)
+        return cls(model, chosen, kept, discounts, use_continues, penalty)
+
+    @property
+    def num_particles(self) -> int:
+        """Rollouts of each candidate: as many as objective or constraints ask for, else as many as the model."""
+        asked = max(term.num_particles for term in (self.objective, *self.constraints))
+        return asked if asked > 1 else getattr(self.model, "num_particles", 1)
+
+    def start_rows(self, state: State, num: int) -> State:
+        """Where `num` candidates per environment start: rows (batch sample particle) for a state of rows (batch,)."""
+        particles = self.num_particles
+        if particles == 1:
+            return repeat_rows(state, num)
+        several = (
+            self.model.particles(state, particles)  # type: ignore[attr-defined]
+            if supports(self.model, "particles")
+            else repeat_rows(state, particles)
+        )
+        pattern = "(batch particle) ... -> (batch num particle) ..."
+        return tree_map(lambda leaf: repeat(leaf, pattern, particle=particles, num=num), several)
+
+    def score(self, start: State, actions: Tensor) -> Scores:
+        """Scores of given sequences.
+
+        Args:
+            start: What `start_rows` gave.
+            actions: Candidates, (batch, sample, horizon, action).
+        """
+        batch, particles = actions.shape[0], self.num_particles
+        rows = rearrange(actions, "batch sample horizon action -> (batch sample) horizon action")
+        if particles > 1:
+            rows = repeat_rows(rows, particles)
+        return self._judge(self._imagine(start, rows, batch, particles))
+
+    def propose(
+        self, state: State, num: int, generators: Sequence[torch.Generator], bounds: tuple[Tensor, Tensor]
+    ) -> Tensor:
+        """Sequences that the model's policy takes in imagination, its own mode first, (batch, num, horizon, action).
+
+        Args:
+            state: Where the plan starts, rows (batch,).
+            num: Sequences per environment; all but the first are sampled.
+            generators: One stream per environment, so that a sample does not depend on who shares the call.
+            bounds: Lowest and highest action, each (action,).
+
+        Returns:
+            The sequences, within the bounds; not finite where the policy is not.
+        """
+        require(self.model, "policy", "num_policy_samples above 0")
+        batch, horizon, (low, high) = len(generators), len(self.discounts) - 1, bounds
+        if supports(self.model, "propose"):
+            rows = self.model.propose(state, num, horizon, generators)  # type: ignore[attr-defined]
+            check_shape("propose()", rows, (batch * num, horizon, len(low)))
+            rows = torch.clamp(rows.to(low.dtype), low, high)
+            return rearrange(rows, "(batch num) horizon action -> batch num horizon action", batch=batch)
+        chosen: list[Tensor] = []
+
+        def choose(_: int, rows: State) -> Tensor:
+            action = _policy_actions(self.model, split_rows(rows, batch), num, generators)
+            check_shape("policy()", action, (batch * num, len(low)))
+            chosen.append(torch.clamp(action.to(low.dtype), low, high))
+            return chosen[-1]
+
+        self._step_through(repeat_rows(state, num), horizon, choose)
+        rows = torch.stack(chosen, dim=1)
+        return rearrange(rows, "(batch num) horizon action -> batch num horizon action", batch=batch)
+
+    def act(self, state: State, bounds: tuple[Tensor, Tensor]) -> Tensor:
+        """The mode of the model's policy, within the bounds, (batch, action); not finite where the policy is not."""
+        require(self.model, "policy", "num_policy_samples above 0")
+        action = self.model.policy(state, None)  # type: ignore[attr-defined]
+        low, high = bounds
+        check_shape("policy()", action, (count_rows(state), len(low)))
+        return torch.clamp(action.to(low.dtype), low, high)
+
+    def continue_by_policy(
+        self, state: State, actions: Tensor, is_tail: Tensor, bounds: tuple[Tensor, Tensor]
+    ) -> Tensor:
+        """The sequences (batch, horizon, action), with the policy's mode where is_tail (batch, horizon, 1)."""
+        require(self.model, "policy", 'tail="policy"')
+        filled: list[Tensor] = []
+        for step in range(actions.shape[1]):
+            action = actions[:, step]
+            if bool(is_tail[:, step].any()):
+                mode = self.act(state, bounds)
+                action = torch.where(is_tail[:, step] & torch.isfinite(mode), mode, action)
+            filled.append(action)
+            state, _ = take_step(self.model, state, action)
+        return torch.stack(filled, dim=1)
+
+    @property
+    def _needs_states(self) -> bool:
+        return any(term.needs_states for term in (self.objective, *self.constraints))
+
+    def _imagine(self, start: State, actions: Tensor, batch: int, particles: int) -> Rollout:
+        if self._needs_states or self.use_continues or not supports(self.model, "rollout"):
+            rewards, states, weights = self._step_through(start, actions.shape[1], lambda step, _: actions[:, step])
+            last_state = states[-1]
+        else:
+            rewards, last_state = self.model.rollout(start, actions)  # type: ignore[attr-defined]
+            check_shape("rollout()'s rewards", rewards, actions.shape[:2])
+            rewards, states, weights = rewards.to(self.discounts.dtype), (), self.discounts
+        return Rollout(self.model, batch, particles, actions, rewards, weights, start, last_state, states)
+
+    def _step_through(
+        self, state: State, horizon: int, choose: Callable[[int, State], Tensor]
+    ) -> tuple[Tensor, tuple[State, ...], Tensor]:
+        """Rewards (rows, horizon), the states after each step, and the weights of the steps."""
+        states: list[State] = []
+        rewards, continues = [], []
+        for step in range(horizon):
+            action = choose(step, state)
+            state, reward = take_step(self.model, state, action)
+            check_shape("step()'s reward", reward, action.shape[:1])
+            states.append(state)
+            rewards.append(reward)
+            if self.use_continues:
+                continues.append(self.model.continues(state))  # type: ignore[attr-defined]
+                check_shape("continues()", continues[-1], action.shape[:1])
+        weights = self.discounts
+        if self.use_continues:
+            survival = torch.stack(continues, dim=1).to(weights.dtype).cumprod(dim=1)
+            weights = weights * torch.nn.functional.pad(survival, (1, 0), value=1.0)
+        return torch.stack(rewards, dim=1).to(self.discounts.dtype), tuple(states), weights
+
+    def _judge(self, rollout: Rollout) -> Scores:
+        returns = _per_candidate(self.objective(rollout), rollout, "mean", "the objective")
+        if not self.constraints:
+            return Scores(returns)
+        violations = torch.stack(
+            [
+                _per_candidate(constraint(rollout), rollout, "max", "a constraint").clamp_min(0.0)
+                for constraint in self.constraints
+            ]
+        ).sum(dim=0)
+        if self.penalty is None:
+            return Scores(returns, violations)
+        return Scores(returns - self.penalty * violations, violations, is_ranked=False)
+
+
+def _per_candidate(values: Tensor, rollout: Rollout, over_particles: str, name: str) -> Tensor:
+    """Values (rows,) as (batch, sample) in the precision of the rewards: a candidate is as good as its particles."""
+    check_shape(name, values, rollout.actions.shape[:1])
+    pattern = "(batch sample particle) -> batch sample"
+    sizes = {"batch": rollout.batch, "particle": rollout.num_particles}
+    if rollout.num_particles == 1:
+        return rearrange(values.to(rollout.rewards.dtype), "(batch sample) -> batch sample", batch=rollout.batch)
+    return reduce(values.to(rollout.rewards.dtype), pattern, over_particles, **sizes)
+
+
+def _policy_actions(model: Model, state: State, num: int, generators: Sequence[torch.Generator]) -> Tensor:
+    """The policy's mode for the first row of each environment and samples for the others, (rows, action).
+
+    Args:
+        model: A model with a policy.
+        state: (batch, num, ...).
+        num: Rows per environment.
+        generators: One stream per environment.
+    """
+    mode = model.policy(tree_map(lambda leaf: leaf[:, 0], state), None)  # type: ignore[attr-defined]
+    if num == 1:
+        return mode
+    sampled = [
+        model.policy(tree_map(lambda leaf, index=index: leaf[index, 1:], state), generator)  # type: ignore[attr-defined]
+        for index, generator in enumerate(generators)
+    ]
+    both = torch.cat([mode[:, None], torch.stack(sampled)], dim=1)
+    return rearrange(both, "batch num action -> (batch num) action")

@@ -1,0 +1,1 @@
+"""Experience: a ring of frames and what came with them."""

@@ -1,0 +1,300 @@
+"""Replay: episodes in, sequence batches out.
+
+Each environment writes its own lane, one row per frame. A row holds the frame, the belief's deterministic state
+at that frame, the action taken there, and the reward and continuation that arrived with the next frame; the last
+row of an episode has no action. Alignment is drawn at the top of a batch: observations are one longer than actions.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from pickle import UnpicklingError
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from latentplan.config import UserError
+from latentplan.replay.memory import check_memory
+
+FRAME_SHAPE = (64, 64, 3)
+FRAME_BYTES = 64 * 64 * 3
+SAMPLING_ROUNDS = 1000
+COLUMNS = ("deter", "actions", "rewards", "continues", "labels", "plan")
+LOADED_AT_ONCE = 1024
+
+
+@dataclass
+class Rows:
+    """Consecutive rows of one lane, as collected: arrays of length n, or (n, ...).
+
+    Attributes:
+        frames: uint8 (n, 64, 64, 3).
+        deter: Belief at each frame, float (n, deter).
+        actions: Executed actions in [-1, 1], float32 (n, action); zeros on an episode's last row.
+        rewards: Arriving with the next frame, float32 (n,).
+        continues: 1 unless the episode ended in a terminal state with the next frame, float32 (n,).
+        is_first: Whether an episode starts at this row, bool (n,).
+        labels: True quantities at each frame, float32 (n, label); none of them without a simulator that tells.
+        plan: Mean and std of the planner's first action there, float32 (n, 2 action); zeros where it did not act.
+            None stands for zeros everywhere.
+    """
+
+    frames: np.ndarray
+    deter: np.ndarray
+    actions: np.ndarray
+    rewards: np.ndarray
+    continues: np.ndarray
+    is_first: np.ndarray
+    labels: np.ndarray
+    plan: np.ndarray | None = None
+
+    def __post_init__(self) -> None:
+        if self.plan is None:
+            self.plan = np.zeros((len(self.frames), 2 * self.actions.shape[-1]), np.float32)
+
+
+class Batch(NamedTuple):
+    """Sequences of `time` decisions and `time + 1` frames; what follows a terminal state is of another episode.
+
+    Attributes:
+        frames: uint8 (batch, time + 1, 64, 64, 3).
+        deter: Belief at the first frame, float32 (batch, deter).
+        actions: actions[t] was taken at frames[t], (batch, time, action).
+        rewards: rewards[t] arrived with frames[t + 1], (batch, time).
+        continues: Whether the episode went on at frames[t + 1], (batch, time).
+        labels: True quantities at each frame, (batch, time + 1, label).
+        rows: Where each frame lives in replay, (batch, time + 1), for `Replay.refresh`.
+        plan: Mean and std of the planner's action at frames[t], (batch, time, 2 action); zeros where it did not act.
+    """
+
+    frames: Tensor
+    deter: Tensor
+    actions: Tensor
+    rewards: Tensor
+    continues: Tensor
+    labels: Tensor
+    rows: Tensor
+    plan: Tensor
+
+    @property
+    def within(self) -> Tensor:
+        """1 for each transition of the episode that its sequence begins in, 0 beyond its end, (batch, time)."""
+        before = torch.cat([torch.ones_like(self.continues[:, :1]), self.continues[:, :-1]], 1)
+        return before.cumprod(1)
+
+
+class Replay:
+    """A preallocated ring of rows per environment.
+
+    Args:
+        capacity: Rows in all, split evenly over lanes.
+        action_dim: Size of the action.
+        deter_dim: Size of the stored belief.
+        num_lanes: Environments that write.
+        device: Where the rows live and batches are gathered.
+        num_labels: Quantities that the simulator tells with each frame.
+
+    Raises:
+        UserError: The rows do not fit into nine tenths of the memory that is free.
+    """
+
+    def __init__(
+        self,
+        capacity: int,
+        action_dim: int,
+        deter_dim: int,
+        num_lanes: int,
+        device: torch.device,
+        num_labels: int = 0,
+    ) -> None:
+        self.lane_size = -(-capacity // num_lanes)
+        self.num_lanes, self.device = num_lanes, device
+        total = self.lane_size * num_lanes
+        self.num_bytes = replay_bytes(total, action_dim, deter_dim, num_labels)
+        check_memory(self.num_bytes, device)
+        self.frames = torch.zeros(total, *FRAME_SHAPE, dtype=torch.uint8, device=device)
+        self.deter = torch.zeros(total, deter_dim, dtype=torch.float16, device=device)
+        self.actions = torch.zeros(total, action_dim, device=device)
+        self.rewards = torch.zeros(total, device=device)
+        self.continues = torch.ones(total, device=device)
+        self.labels = torch.zeros(total, num_labels, device=device)
+        self.plan = torch.zeros(total, 2 * action_dim, device=device)
+        self.episode = np.full((num_lanes, self.lane_size), -1, dtype=np.int64)
+        self.is_end = np.zeros((num_lanes, self.lane_size), dtype=bool)  # whose action led to a terminal state
+        self.written = np.zeros(num_lanes, dtype=np.int64)
+        self._saved = np.zeros(num_lanes, dtype=np.int64)
+
+    def __len__(self) -> int:
+        """Rows held."""
+        return int(np.minimum(self.written, self.lane_size).sum())
+
+    def add(self, lane: int, rows: Rows) -> None:
+        """Append consecutive rows to a lane, overwriting its oldest when it is full."""
+        count = len(rows.frames)
+        newest = np.arange(count)[-self.lane_size :]
+        positions = (self.written[lane] + newest) % self.lane_size
+        previous = self.episode[lane, (self.written[lane] - 1) % self.lane_size] if self.written[lane] else -1
+        self.episode[lane, positions] = previous + np.cumsum(rows.is_first)[newest]
+        self.is_end[lane, positions] = rows.continues[newest] == 0.0
+        index = torch.as_tensor(positions + lane * self.lane_size, device=self.device)
+        for name in ("frames", *COLUMNS):
+            store = getattr(self, name)
+            store[index] = torch.as_tensor(getattr(rows, name)[newest], device=self.device).to(store.dtype)
+        self.written[lane] += count
+
+    def draw(self, batch_size: int, sequence_length: int, rng: np.random.Generator) -> Tensor:
+        """Where uniformly drawn sequences live: rows (batch, time + 1).
+
+        Each lies within one episode, or reaches beyond its end if that is a terminal state: else the ends, which are
+        all that there is to learn of ending, would be drawn once for the `sequence_length` times of other rows.
+
+        Raises:
+            UserError: No episode is long enough.
+        """
+        lanes, starts = self._draw_starts(batch_size, sequence_length, rng)
+        steps = np.arange(sequence_length + 1)
+        positions = (starts[:, None] + steps) % self.lane_size + (lanes * self.lane_size)[:, None]
+        return torch.as_tensor(positions, device=self.device)
+
+    def gather(self, rows: Tensor) -> Batch:
+        """The sequences that live at rows (batch, time + 1); reads nothing back from the device."""
+        acted = rows[:, :-1]
+        return Batch(
+            frames=self.frames[rows],
+            deter=self.deter[rows[:, 0]].float(),
+            actions=self.actions[acted],
+            rewards=self.rewards[acted],
+            continues=self.continues[acted],
+            labels=self.labels[rows],
+            rows=rows,
+            plan=self.plan[acted],
+        )
+
+    def refresh(self, rows: Tensor, deter: Tensor, chosen: Tensor) -> None:
+        """Replace the stored beliefs at rows (batch, time) with newer ones (batch, time, deter).
+
+        Only those `chosen`, bool (batch, time), are read. Where a row occurs more than once, the last one counts.
+        """
+        index = rows.flatten().to(self.device)
+        is_chosen = chosen.to(self.device).flatten()
+        # Every occurrence writes the value of the last one chosen: parallel writes to one place have no order.
+        in_order, order = (2 * index + is_chosen).sort(stable=True)
+        last = order[torch.searchsorted(in_order, 2 * index + 1, right=True) - 1]
+        newer = deter.flatten(0, 1).to(self.deter)[last]
+        self.deter[index] = torch.where(is_chosen[last, None], newer, self.deter[index])
+
+    def save(self, folder: Path) -> None:
+        """Write what is new since the last save; `load` restores exactly what the last whole save held.
+
+        Unless the capacity has been exceeded: then a save that is cut off leaves new frames beside the older rows (the
+        first save after a capacity was changed writes all of them).
+        """
+        folder.mkdir(parents=True, exist_ok=True)
+        for lane in range(self.num_lanes):
+            first = max(self._saved[lane], self.written[lane] - self.lane_size)
+            path = folder / f"frames_{lane}.u8"
+            path.touch()
+            with path.open("r+b") as file:
+                for position in range(first, self.written[lane]):
+                    slot = position % self.lane_size
+                    file.seek(slot * FRAME_BYTES)
+                    file.write(self.frames[lane * self.lane_size + slot].cpu().numpy().tobytes())
+        parts = {name: getattr(self, name).cpu() for name in COLUMNS}
+        state = parts | {"episode": torch.from_numpy(self.episode), "written": torch.from_numpy(self.written)}
+        torch.save(state, folder / "rows.pt.part")
+        (folder / "rows.pt.part").replace(folder / "rows.pt")
+        self._saved = self.written.copy()
+
+    def load(self, folder: Path) -> None:
+        """Restore what `save` wrote; where the capacity is smaller now, the newest rows of it.
+
+        Raises:
+            UserError: The folder holds no whole replay, or not one of the same lanes, actions and beliefs.
+        """
+        if not (folder / "rows.pt").exists():
+            raise UserError(f"no replay found in {folder}")
+        state = read_saved(folder / "rows.pt", keys=(*COLUMNS, "episode", "written"))
+        columns = ("actions", "deter", "labels")
+        saved = (len(state["episode"]), *(state[name].shape[1] for name in columns))
+        own = (self.num_lanes, *(getattr(self, name).shape[1] for name in columns))
+        if saved != own:
+            raise UserError(f"the replay in {folder} has (environments, action, deter, labels) {saved}, this run {own}")
+        saved_size = state["episode"].shape[1]
+        for lane, written in enumerate(state["written"].numpy()):
+            held = min(written, saved_size, self.lane_size)
+            old = np.arange(written - held, written) % saved_size
+            new = old if saved_size == self.lane_size else np.arange(held)
+            self.written[lane] = written if saved_size == self.lane_size else held
+            self._saved[lane] = self.written[lane] if np.array_equal(old, new) else 0
+            self.episode[lane, new] = state["episode"].numpy()[lane, old]
+            self.is_end[lane, new] = state["continues"].numpy()[old + lane * saved_size] == 0.0
+            index = torch.from_numpy(new + lane * self.lane_size).to(self.device)
+            for name in COLUMNS:
+                store = getattr(self, name)
+                store[index] = state[name][old + lane * saved_size].to(self.device)
+            self._load_frames(folder / f"frames_{lane}.u8", min(written, saved_size), old, index)
+
+    def _load_frames(self, path: Path, count: int, slots: np.ndarray, index: Tensor) -> None:
+        """Copy frames from slots of a file that holds `count` of them to rows of this replay."""
+        if count == 0:
+            return
+        if not path.exists() or path.stat().st_size < count * FRAME_BYTES:
+            raise UserError(f"{path} is damaged: it must hold {count:,} frames")
+        stored = np.memmap(path, np.uint8, "r", shape=(count, *FRAME_SHAPE))
+        for start in range(0, len(slots), LOADED_AT_ONCE):
+            part = slice(start, start + LOADED_AT_ONCE)
+            self.frames[index[part]] = torch.from_numpy(stored[slots[part]]).to(self.device)
+
+    def _draw_starts(self, count: int, length: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+        held = np.minimum(self.written, self.lane_size)
+        oldest = self.written - held
+        lanes, starts = np.empty(0, np.int64), np.empty(0, np.int64)
+        too_short = f"no episode in replay has sequence_length ({length}) decisions"
+        if self.lane_size <= length:
+            raise UserError(f"{too_short}: raise --replay.capacity")
+        if held.max() <= length:
+            raise UserError(
+                f"{too_short}, of {held.max()} in each environment: raise --collection.prefill_decisions or --frames"
+            )
+        for _ in range(SAMPLING_ROUNDS):
+            lane = rng.choice(self.num_lanes, size=2 * count, p=held / held.sum())
+            offset = rng.integers(0, held[lane])
+            start, left = oldest[lane] + offset, held[lane] - offset
+            steps = (start[:, None] + np.arange(length + 1)) % self.lane_size
+            is_same = self.episode[lane[:, None], steps] == self.episode[lane[:, None], steps[:, :1]]
+            last = is_same.cumprod(1).sum(1) - 1  # steps until the last row of the episode, at most the length
+            ends = self.is_end[lane, steps[np.arange(len(last)), last - 1]] & (last > 0)
+            keep = (last < left) & ((last == length) | ends)
+            lanes, starts = np.concatenate([lanes, lane[keep]]), np.concatenate([starts, start[keep]])
+            if len(starts) >= count:
+                return lanes[:count], starts[:count]
+        raise UserError(f"{too_short}: lower --learning.sequence_length")
+
+
+def read_saved(path: Path, device: torch.device | str = "cpu", keys: Sequence[str] = ()) -> Any:
+    """What `torch.save` wrote.
+
+    Args:
+        path: The file.
+        device: Where its tensors go.
+        keys: Of a dictionary, what it must hold.
+
+    Raises:
+        UserError: The file is damaged, or holds something else.
+    """
+    try:
+        saved = torch.load(path, map_location=device, weights_only=True)
+        if keys and not (isinstance(saved, dict) and set(keys) <= set(saved)):
+            raise ValueError(f"it does not hold {', '.join(keys)}")
+        return saved
+    except (OSError, RuntimeError, EOFError, KeyError, ValueError, UnpicklingError) as error:
+        raise UserError(f"{path} is damaged: {str(error).splitlines()[0]}") from None
+
+
+def replay_bytes(num_rows: int, action_dim: int, deter_dim: int, num_labels: int = 0) -> int:
+    """Memory that a replay of `num_rows` rows takes, in bytes."""
+    return num_rows * (FRAME_BYTES + 2 * deter_dim + 4 * (3 * action_dim + num_labels) + 4 + 4 + 8 + 1)

@@ -1,0 +1,1 @@
+"""How experience is gathered, in this process or beside it."""

@@ -1,0 +1,126 @@
+"""Where collection runs: in this process, or in another beside the learner."""
+
+from __future__ import annotations
+
+import multiprocessing
+import sys
+import traceback
+from collections import deque
+from concurrent.futures import Future, ThreadPoolExecutor
+from multiprocessing.connection import Connection
+from typing import Any
+
+import torch
+from gymnasium.vector.utils import CloudpickleWrapper
+
+from latentplan.config import Config, UserError
+from latentplan.envs import single_threaded_children
+from latentplan.training.collection.collector import CLOSING_SECONDS, Collector, EnvFactory
+from latentplan.training.resources import collector_threads
+
+
+class LocalWorker:
+    """Calls methods of a `Collector` at once, in this process."""
+
+    def __init__(self, config: Config, make_user_env: EnvFactory | None, device: str) -> None:
+        self._collector = Collector(config, make_user_env, device)
+        self._results: list[Any] = []
+
+    def submit(self, method: str, *arguments: Any) -> None:
+        """Run a method; its result waits for `result`."""
+        self._results.append(getattr(self._collector, method)(*arguments))
+
+    def result(self) -> Any:
+        """The oldest result not yet taken."""
+        return self._results.pop(0)
+
+    def close(self) -> None:
+        """Free simulators."""
+        self._collector.close()
+
+
+class RemoteWorker:
+    """Calls methods of a `Collector` in a spawned process, on the CPU, while the caller goes on."""
+
+    def __init__(self, config: Config, make_user_env: EnvFactory | None, threads: int = 1) -> None:
+        context = multiprocessing.get_context("spawn")
+        self._connection, theirs = context.Pipe()
+        arguments = (theirs, make_user_env and CloudpickleWrapper(make_user_env), config, threads)
+        self._process = context.Process(target=_serve, args=arguments, daemon=config.env.num_envs == 1)
+        with single_threaded_children():
+            self._process.start()
+        theirs.close()
+        # A thread waits on the pipe, so that neither side ever blocks on the other's full buffer.
+        self._caller = ThreadPoolExecutor(max_workers=1)
+        self._futures: deque[Future[tuple[str, Any]]] = deque()
+
+    def submit(self, method: str, *arguments: Any) -> None:
+        """Ask for a method; its result arrives through `result`, in order."""
+        self._futures.append(self._caller.submit(self._call, method, arguments))
+
+    def result(self) -> Any:
+        """The oldest result not yet taken; waits for it.
+
+        Raises:
+            UserError: What the method raised for the user.
+            RuntimeError: The method failed, or its process ended.
+        """
+        try:
+            kind, value = self._futures.popleft().result()
+        except (EOFError, OSError):
+            self._process.join(timeout=5.0)
+            code = self._process.exitcode
+            raise RuntimeError(f"the process that collects has ended unexpectedly (exit code {code})") from None
+        if kind == "user_error":
+            raise UserError(value)
+        if kind == "error":
+            raise RuntimeError(f"collection failed:\n{value}")
+        return value
+
+    def close(self) -> None:
+        """End the process, whatever it is doing."""
+        if self._process.is_alive():
+            self._process.terminate()
+        self._process.join(CLOSING_SECONDS)
+        if self._process.is_alive():
+            self._process.kill()
+            self._process.join()
+        self._caller.shutdown(cancel_futures=True)
+        self._connection.close()
+
+    def _call(self, method: str, arguments: tuple[Any, ...]) -> tuple[str, Any]:
+        self._connection.send((method, arguments))
+        answer: tuple[str, Any] = self._connection.recv()
+        return answer
+
+
+Worker = LocalWorker | RemoteWorker
+
+
+def make_worker(config: Config, make_user_env: EnvFactory | None, device: torch.device) -> Worker:
+    """The worker that `collection.overlap` asks for, of a learner on a device."""
+    if config.collection.overlap:
+        return RemoteWorker(config, make_user_env, collector_threads(device))
+    return LocalWorker(config, make_user_env, str(device))
+
+
+def _serve(connection: Connection, factory: EnvFactory | None, config: Config, threads: int) -> None:
+    import signal
+
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit())  # as an exit, so that the environments' processes end too
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches the whole group; the learner decides what follows
+    torch.set_num_threads(threads)
+    collector: Collector | None = None
+    while True:
+        try:
+            method, arguments = connection.recv()
+        except EOFError:
+            return
+        try:
+            if collector is None:
+                collector = Collector(config, factory, "cpu")
+            connection.send(("ok", getattr(collector, method)(*arguments)))
+        except UserError as error:
+            connection.send(("user_error", str(error)))
+        except Exception:
+            connection.send(("error", traceback.format_exc()))

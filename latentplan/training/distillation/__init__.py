@@ -1,0 +1,1 @@
+"""Teaching a trained agent's actor what its planner does."""

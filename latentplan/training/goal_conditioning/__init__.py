@@ -1,0 +1,1 @@
+"""Teaching a trained agent to pursue goals that are named later."""

@@ -1,0 +1,190 @@
+"""A run that learns goals: from a trained agent and what it has seen to an agent that knows goals as well."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import math
+import signal
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from latentplan.agents.checkpoint import load_model, read_info, resolve_checkpoint, save_checkpoint
+from latentplan.config import USER_DOMAIN, Config, GoalsConfig, UserError, derive_seed, to_dict
+from latentplan.models import WorldModel
+from latentplan.replay.buffer import Replay, read_saved
+from latentplan.training.console import StatusLine
+from latentplan.training.folder import GOALS_FILE, claim, refuse_used
+from latentplan.training.goal_conditioning.learner import GoalLearner
+from latentplan.training.goal_conditioning.play import play
+from latentplan.training.state import INTERRUPTED
+from latentplan.training.train import Result
+
+SAVE_SECONDS = 300.0
+PLAYED = "played.json"  # beside a replay: by which agent, and how
+
+
+def learn_goals(
+    checkpoint: Path | str, folder: Path | str, settings: GoalsConfig | None = None, *, device: str = "cpu"
+) -> Result:
+    """Teach a trained agent to pursue goals that are named later.
+
+    Args:
+        checkpoint: Folder of a run, whose replay tells where to begin, or of an agent, which then plays a while.
+        folder: Where the agent goes, and what it takes to resume.
+        settings: Of the learning.
+        device: `cpu` or `cuda`.
+
+    Returns:
+        Where the agent lies, and `worth`: see `GoalLearner.update`.
+
+    Raises:
+        UserError: The agent, its replay or the folder cannot be used.
+    """
+    folder = Path(folder)
+    refuse_used(folder, GOALS_FILE, "--out")
+    with claim(folder):
+        return _learn(Path(checkpoint), folder, settings or GoalsConfig(), device, None)
+
+
+def resume_goals(
+    folder: Path | str, *, updates: int | None = None, minutes: float | None = None, device: str = "cpu"
+) -> Result:
+    """Go on where `learn_goals` was last saved.
+
+    Args:
+        folder: Where its agent goes.
+        updates: New number of updates in all; None keeps the old one.
+        minutes: New budget of minutes in all; None keeps the old one.
+        device: `cpu` or `cuda`.
+
+    Raises:
+        UserError: The folder holds nothing to resume, or the agent it began with has changed.
+    """
+    path = Path(folder) / GOALS_FILE
+    if not path.exists():
+        raise UserError(f"nothing to resume in {folder}: {path} is missing")
+    with claim(Path(folder)):
+        saved = read_saved(path, keys=("run", "source", "sha256", "settings", "minutes", "learner"))
+        if read_info(saved["source"])["sha256"] != saved["sha256"]:
+            raise UserError(f"{saved['source']} is not the agent that {folder} began with")
+        settings = GoalsConfig(**saved["settings"])
+        settings = replace(settings, updates=updates or settings.updates, minutes=minutes or settings.minutes)
+        return _learn(Path(saved["run"]), Path(folder), settings, device, saved)
+
+
+def load_replay(path: Path, model: WorldModel) -> Replay:
+    """The replay in a folder, whole, in main memory.
+
+    Raises:
+        UserError: It is damaged, or of another kind of agent.
+    """
+    num_lanes, lane_size = read_saved(path / "rows.pt", keys=("episode",))["episode"].shape
+    sizes = (model.action_dim, model.config.deter_dim, num_lanes, torch.device("cpu"), len(model.labels))
+    replay = Replay(num_lanes * lane_size, *sizes)
+    replay.load(path)
+    return replay
+
+
+def _begin(
+    agent: Path, sha256: str, folder: Path, model: WorldModel, config: Config, settings: GoalsConfig, line: StatusLine
+) -> Replay:
+    """What the agent has seen: the replay of its run, or what it saw when it played, which a folder keeps."""
+    collected, played, note = agent / "resume" / "replay", folder / "replay", folder / "replay" / PLAYED
+    if (collected / "rows.pt").exists():
+        return load_replay(collected, model)
+    by_whom = {"sha256": sha256, "seed": settings.seed, "play_decisions": settings.play_decisions}
+    if (folder / GOALS_FILE).exists() or (note.exists() and note.read_text() == json.dumps(by_whom)):
+        line.print(f"what was played before is in {played}")
+        return load_replay(played, model)
+    if config.env.domain == USER_DOMAIN:
+        raise UserError(f"{agent} has no replay, and its environment is your own: give the folder of its run")
+    if (played / "rows.pt").exists() and not note.exists():
+        raise UserError(f"{played} holds a replay of something else: choose another --out")
+    line.print(f"no replay in {agent}: playing {settings.play_decisions:,} decisions to begin from")
+
+    def report(done: int) -> None:
+        line.update(f"played {done:,} of {settings.play_decisions:,} decisions")
+
+    replay = play(config, model, settings.play_decisions, settings.seed, report)
+    note.unlink(missing_ok=True)
+    replay.save(played)
+    note.write_text(json.dumps(by_whom))
+    return replay
+
+
+def _learn(run: Path, folder: Path, settings: GoalsConfig, device: str, saved: dict[str, Any] | None) -> Result:
+    source = resolve_checkpoint(run)
+    model, config, info = load_model(source, device)
+    if not model.goal_names:
+        raise UserError(f"the agent of {run} was trained without named quantities, so there are no goals to learn")
+    model.requires_grad_(False)
+    line = StatusLine()
+    try:
+        replay = _begin(run, info["sha256"], folder, model, config, settings, line)
+    except KeyboardInterrupt:
+        line.print("stopped before there was anything to learn from: nothing is kept")
+        return Result(folder, INTERRUPTED, {})
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(derive_seed(settings.seed, "heads"))
+        model.add_goal_heads(settings.hidden_dim)
+    frames_per_step = config.env.action_repeat
+    learner = GoalLearner(model, settings, config.learning, info["discount"], frames_per_step, replay)
+    earlier = 0.0
+    if saved is not None:
+        learner.load_state_dict(saved["learner"])
+        earlier = saved["minutes"]
+    started = last_save = time.monotonic()
+    worth = math.nan
+
+    def minutes() -> float:
+        return earlier + (time.monotonic() - started) / 60.0
+
+    def save() -> None:
+        facts = {"updates": learner.updates, "minutes": round(minutes(), 1), "settings": to_dict(settings)}
+        save_checkpoint(folder, model, config, info | {"goals": facts | {"from_sha256": info["sha256"]}})
+        about = {"run": str(run.resolve()), "source": str(source.resolve()), "sha256": info["sha256"]}
+        state = {"settings": to_dict(settings), "minutes": minutes(), "learner": learner.state_dict()}
+        torch.save(about | state, folder / f"{GOALS_FILE}.part")
+        (folder / f"{GOALS_FILE}.part").replace(folder / GOALS_FILE)
+
+    with line, _asked_to_stop() as is_asked:
+        while learner.updates < settings.updates and not (is_asked() or minutes() >= (settings.minutes or math.inf)):
+            parts = learner.update()
+            worth = parts["worth"] if math.isnan(worth) else 0.99 * worth + 0.01 * parts["worth"]
+            line.update(
+                f"update {learner.updates:,} of {settings.updates:,} | imagined worth {worth:.3f} of 1 | "
+                f"entropy {parts['entropy']:.2f} nats | {minutes():.1f} min"
+            )
+            if time.monotonic() - last_save > SAVE_SECONDS:
+                save()
+                last_save = time.monotonic()
+        save()
+        if is_asked():
+            line.print(f"stopped; to go on: python scripts/goals.py --resume {folder}")
+            return Result(folder, INTERRUPTED, {})
+        line.print(f"agent: {folder}")
+    return Result(folder, 0, {"worth": worth})
+
+
+@contextlib.contextmanager
+def _asked_to_stop() -> Iterator[Callable[[], bool]]:
+    """Takes over Ctrl-C and requests to end: the update in work is finished first; asked again, it ends at once."""
+    asked: list[int] = []
+
+    def note(number: int, frame: Any) -> None:
+        if asked:
+            raise KeyboardInterrupt
+        asked.append(number)
+
+    previous = {number: signal.signal(number, note) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield lambda: bool(asked)
+    finally:
+        for number, handler in previous.items():
+            signal.signal(number, handler)

@@ -1,0 +1,1 @@
+"""What one update learns: losses, optimizers, and the module that applies them."""

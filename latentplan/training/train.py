@@ -1,0 +1,298 @@
+"""A training run from its settings to its final evaluation."""
+
+from __future__ import annotations
+
+import json
+import logging
+import warnings
+from dataclasses import dataclass, replace
+from datetime import datetime
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import lightning
+import numpy as np
+import torch
+from lightning.pytorch.loggers import TensorBoardLogger
+
+from latentplan.agents.checkpoint import load_model
+from latentplan.config import USER_DOMAIN, Config, UserError, derive_seed
+from latentplan.config.files import dump_config, read_config
+from latentplan.envs import default_task
+from latentplan.models import WorldModel
+from latentplan.replay.buffer import Replay
+from latentplan.training.callbacks import Experience, Restore, Save, Stop, weights_of
+from latentplan.training.collection.collector import Description, EnvFactory
+from latentplan.training.collection.process import Worker, make_worker
+from latentplan.training.console import Progress
+from latentplan.training.folder import claim, refuse_used
+from latentplan.training.learner.batches import ReplayBatches, ReplayData
+from latentplan.training.learner.curriculum import Curriculum
+from latentplan.training.learner.graphed import make_learner
+from latentplan.training.record import Record
+from latentplan.training.resources import choose_device, choose_threads, replay_capacity, set_up_torch
+from latentplan.training.state import INTERRUPTED, RunState, load_state, restore
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+
+@dataclass(frozen=True)
+class Result:
+    """How a run ended.
+
+    Attributes:
+        run_dir: Its folder.
+        exit_code: 0, or 130 when the user interrupted it.
+        summary: Mean returns of the final evaluation by mode; empty when interrupted.
+    """
+
+    run_dir: Path
+    exit_code: int
+    summary: Mapping[str, float]
+
+
+def train(config: Config, make_env: EnvFactory | None = None) -> Result:
+    """Learn to control a body from pixels.
+
+    Args:
+        config: Settings of the run.
+        make_env: Makes the user's own `gymnasium.Env` with image observations and a bounded Box of actions;
+            None takes the suite's task that `config.env` names.
+
+    Returns:
+        Where the run lies and how it ended.
+
+    Raises:
+        UserError: Settings, environment or machine cannot carry the run.
+    """
+    if config.run.frames is None and config.run.minutes is None:
+        raise UserError("a run needs an end: give --frames or --minutes")
+    domain, task = config.env.domain, config.env.task
+    if make_env is not None:
+        if config.env.objective is not None:
+            raise UserError("env.objective needs a domain of the suite; an environment of your own pays its own reward")
+        domain, task = USER_DOMAIN, getattr(make_env, "__name__", type(make_env).__name__)
+    config = replace(config, env=replace(config.env, domain=domain, task=task or default_task(domain)))
+    if config.run.run_dir is None:
+        stamp = datetime.now().strftime("%Y%m%d-%H%M%S")
+        name = f"{config.env.domain}-{config.env.task}-seed{config.run.seed}-{stamp}"
+        config = replace(config, run=replace(config.run, run_dir=str(Path("runs") / name)))
+    if config.run.run_dir == "":
+        raise UserError("--run-dir must name a folder, got an empty text")
+    folder = Path(str(config.run.run_dir))
+    refuse_used(folder, "config.yaml", "--run-dir")
+    return _start(config, folder, make_env, resume=False)
+
+
+def resume(
+    run_dir: Path | str,
+    *,
+    frames: int | None = None,
+    minutes: float | None = None,
+    device: str | None = None,
+    make_env: EnvFactory | None = None,
+) -> Result:
+    """Continue a run where it was last saved: weights, optimizers, replay, clocks and random streams.
+
+    Args:
+        run_dir: Folder of the run.
+        frames: New budget of frames in all; with None for both, the old budget stays. A new one is the run's from now
+            on, so that it goes on to it after an interruption too.
+        minutes: New budget of minutes in all.
+        device: New device, from now on; None keeps the old one.
+        make_env: As given to `train`.
+
+    Raises:
+        UserError: The folder holds no run that can be resumed.
+    """
+    folder = Path(run_dir)
+    if not (folder / "config.yaml").exists():
+        raise UserError(f"nothing to resume in {folder}: config.yaml is missing")
+    config = read_config(folder / "config.yaml")
+    if config.env.task is None:  # a run has written down which
+        raise UserError(f"{folder / 'config.yaml'} is damaged: it does not say what the task is")
+    if config.env.domain == USER_DOMAIN and make_env is None:
+        raise UserError("this run learns in an environment of your own: resume it from Python, with make_env")
+    run = config.run
+    if frames is not None or minutes is not None:
+        run = replace(run, frames=frames, minutes=minutes)
+    if device is not None:
+        run = replace(run, device=device)
+    return _start(replace(config, run=run), folder, make_env, resume=True)
+
+
+def _start(config: Config, folder: Path, make_env: EnvFactory | None, *, resume: bool) -> Result:
+    with claim(folder):
+        run = _Run(config, folder, make_env, resume=resume)
+        dump_config(config, folder / "config.yaml")
+        return run.execute()
+
+
+class _Run:
+    """Everything a run is made of, put together once."""
+
+    def __init__(self, config: Config, folder: Path, make_env: EnvFactory | None, *, resume: bool) -> None:
+        self.config, self.folder = config, folder
+        self.device = choose_device(config.run)
+        self.console = Progress(config.run)
+        set_up_torch(config.run.threads or choose_threads(config.collection.overlap), self.device)
+        self.worker: Worker = make_worker(config, make_env, self.device)
+        try:
+            self.worker.submit("describe")
+            self.description: Description = self.worker.result()
+            self._build(resume=resume)
+        except BaseException:
+            self.worker.close()
+            raise
+
+    def _build(self, *, resume: bool) -> None:
+        config = self.config
+        with torch.random.fork_rng(devices=[]):
+            torch.manual_seed(derive_seed(config.run.seed, "weights"))
+            model = WorldModel(config.model, self.description.action_dim, self.description.labels).to(self.device)
+        on = self.device if config.replay.on_device else torch.device("cpu")
+        kept = self.folder / "resume" / "replay"
+        capacity, num_labels = replay_capacity(config, kept), len(model.labels)
+        self.replay = Replay(capacity, model.action_dim, config.model.deter_dim, config.env.num_envs, on, num_labels)
+        self.state, saved = RunState(), None
+        self._saved_optimizers: list[Any] = []
+        if resume:
+            self.state, saved, self._saved_optimizers = load_state(self.folder / "resume", self.device)
+            self.replay.load(kept)
+        self.curriculum = Curriculum(config, model.labels, self.state)
+        self.learner = make_learner(model, config, self.description.discount, self.replay, self.curriculum)
+        if saved is not None:
+            restore(self.learner, saved, self.folder)
+
+    def execute(self) -> Result:
+        """Learn until the budget is spent, then evaluate."""
+        try:
+            return self._execute()
+        finally:
+            self.worker.close()
+
+    def _execute(self) -> Result:
+        config = self.config
+        self._announce()
+        videos = self.folder / "videos"
+        videos.mkdir(exist_ok=True)
+        experience = Experience(config, self.replay, self.state, self.worker, videos)
+        save = Save(self.folder, config, experience, self.state, self._facts(), self._saved_optimizers)
+        stop = Stop(config, self.state)
+        record = Record(self.folder / "metrics.csv", self.state, experience, self.console)
+        trainer = self._trainer([experience, self.curriculum, record, save, stop])
+        batches = ReplayBatches(self.replay, config, self.curriculum, self.learner)
+        if not self._saved_optimizers:
+            save.save_run(trainer, self.learner)  # so that what ends before the first save can be resumed too
+        if not stop.is_spent():
+            self.console.start(self.learner.updates)
+            try:
+                trainer.fit(self.learner, datamodule=ReplayData(batches))
+            finally:
+                self.console.stop()
+            if not self.state.interrupted:
+                experience.take()
+                record.write_evaluations(trainer)
+                save.keep_best(self.learner)
+            save.save(trainer, self.learner)
+        if self.state.interrupted:
+            command = f"python scripts/train.py --resume {self.folder}"
+            if config.env.domain == USER_DOMAIN:
+                command = f'latentplan.training.resume("{self.folder}", make_env=...)'
+            self.console.console.print(f"stopped; to go on: {command}", soft_wrap=True)
+            return Result(self.folder, INTERRUPTED, {})
+        return Result(self.folder, 0, self._finish(trainer, save, videos / "final.webm"))
+
+    def _trainer(self, callbacks: list[lightning.Callback]) -> lightning.Trainer:
+        logging.getLogger("lightning.pytorch").setLevel(logging.ERROR)
+        warnings.filterwarnings("ignore", module="lightning")
+        return lightning.Trainer(
+            accelerator="gpu" if self.device.type == "cuda" else "cpu",
+            devices=1,
+            max_epochs=-1,
+            callbacks=[Restore(self._saved_optimizers), *callbacks],
+            logger=TensorBoardLogger(self.folder, name="tensorboard", version=""),
+            enable_checkpointing=False,
+            enable_progress_bar=False,
+            enable_model_summary=False,
+            log_every_n_steps=10**9,
+        )
+
+    def _finish(self, trainer: lightning.Trainer, save: Save, film: Path) -> dict[str, float]:
+        clocks = save.clocks(self.learner)
+        episodes = self.config.evaluation.final_episodes
+        self.console.console.print(f"final evaluation: {episodes} episodes each of planner and actor")
+        returns = self._judge(self.learner.averaged, film if self.config.evaluation.video else None)
+        summary = {mode: float(np.mean(values)) for mode, values in returns.items()}
+        info = clocks | {"final_evaluation": returns}
+        (self.folder / "final.json").write_text(json.dumps(info | summary, indent=1))
+        save.save_agent("last", self.learner.averaged, info)
+        self.console.console.print(
+            f"trained {clocks['env_frames']:,} frames in {clocks['minutes']:.1f} min: planner "
+            f"{summary['planner']:.1f}, actor {summary['actor']:.1f} ({episodes} episodes)"
+        )
+        best = self.state.best_return
+        if summary["planner"] < best:
+            best = self._judge_best()
+        if summary["planner"] >= best:
+            save.save_agent("best", self.learner.averaged, info)
+        self.state.best_return = max(best, summary["planner"])
+        self.state.stand(clocks["minutes"])
+        save.save_run(trainer, self.learner)
+        self.console.console.print(f"run folder: {self.folder}")
+        return summary
+
+    def _judge(self, model: WorldModel, film: Path | None = None, actor: bool = True) -> dict[str, list[float]]:
+        self.worker.submit("evaluate", self.config.evaluation.final_episodes, film, weights_of(model), actor)
+        return self.worker.result()  # type: ignore[no-any-return]
+
+    def _judge_best(self) -> float:
+        """What the planner of the best agent kept earns on the starts that judged the last one; -inf without one.
+
+        The best mean of many evaluations of few episodes is high by chance too.
+        """
+        folder = self.folder / "checkpoints" / "best"
+        if not (folder / "info.json").exists():
+            return float("-inf")
+        try:
+            model, _, info = load_model(folder, str(self.device))
+        except UserError as error:
+            self.console.console.print(f"warning: the best agent so far is lost: {error}", soft_wrap=True)
+            return float("-inf")
+        self.console.console.print(f"the same starts for the best agent so far, of {info['env_frames']:,} frames")
+        earned = float(np.mean(self._judge(model, actor=False)["planner"]))
+        self.console.console.print(f"its planner earned {earned:.1f}; checkpoints/best is the better of the two")
+        return earned
+
+    def _announce(self) -> None:
+        config, description, run, env = self.config, self.description, self.config.run, self.config.env
+        parameters = sum(parameter.numel() for parameter in self.learner.model.parameters())
+        budget = [f"{run.frames:,} frames"] if run.frames else []
+        budget += [f"{run.minutes:g} minutes"] if run.minutes else []
+        renderer = ", ".join(f"{name} {value}" for name, value in description.renderer.items())
+        rows = self.replay.lane_size * self.replay.num_lanes
+        lines = {
+            "task": f"{env.domain}-{env.task}, action repeat {env.action_repeat}{self.curriculum.note}",
+            **({} if config.env.objective is None else {"objective": config.env.objective}),
+            "device": f"{self.device}, {torch.get_num_threads()} threads",
+            "renderer": f"{renderer}; {description.render_ms:.1f} ms per frame, quality {config.env.render_quality}",
+            "parameters": f"{parameters:,}; discount {description.discount:g}",
+            "replay": f"{self.replay.num_bytes / 2**20:,.0f} MiB for {rows:,} frames",
+            "budget": " or ".join(budget),
+            "run folder": str(self.folder),
+        }
+        for name, line in lines.items():
+            self.console.console.print(f"{name:<12}{line}", soft_wrap=True)
+
+    def _facts(self) -> dict[str, Any]:
+        from latentplan import __version__
+
+        return {
+            "format": 1,
+            "version": __version__,
+            "domain": self.config.env.domain,
+            "task": self.config.env.task,
+            "discount": self.description.discount,
+            "renderer": self.description.renderer,
+        }

@@ -1,0 +1,185 @@
+"""The exported actor: the agent's own actions, from a file alone."""
+
+import json
+import sys
+
+import numpy as np
+import pytest
+import torch
+
+from latentplan.agents.actor import ActorAgent
+from latentplan.agents.checkpoint import load_agent, save_checkpoint
+from latentplan.agents.export import export_actor
+from latentplan.commands.main import main
+from latentplan.config import Config, ModelConfig, UserError
+from latentplan.models import WorldModel
+
+CONFIG = Config(
+    model=ModelConfig(deter_dim=16, hidden_dim=16, encoder_channels=(8, 8), decoder_channels=2, num_bins=15)
+)
+RUNNER = """
+import json, sys
+sys.modules["latentplan"] = None  # importing it is an error from here on
+import numpy as np, torch
+path, film = sys.argv[1:]
+facts = {"actor.json": ""}
+program = torch.export.load(path, extra_files=facts).module()
+sizes = json.loads(facts["actor.json"])
+frames = torch.from_numpy(np.load(film))  # (time, batch, 64, 64, 3)
+batch = frames.shape[1]
+deter, stoch, action = (torch.full((batch, sizes[name]), 7.0) for name in ("deter", "stoch", "action"))
+actions = []
+for time, frame in enumerate(frames):
+    is_first = torch.full((batch,), time in (0, 5))
+    action, deter, stoch = program(frame, deter, stoch, action, is_first)
+    actions.append(action.detach().numpy())
+np.save(film, np.stack(actions))
+"""
+
+
+@pytest.fixture(scope="module")
+def checkpoint(tmp_path_factory):
+    torch.manual_seed(0)
+    model = WorldModel(CONFIG.model, action_dim=2)
+    with torch.no_grad():
+        model.actor.mlp.output.weight.normal_(std=0.5)
+    folder = tmp_path_factory.mktemp("agent")
+    save_checkpoint(folder, model, CONFIG, {"domain": "cartpole", "task": "swingup", "env_frames": 1, "discount": 0.9})
+    return folder
+
+
+@pytest.fixture(scope="module")
+def program(checkpoint, tmp_path_factory):
+    path = tmp_path_factory.mktemp("program") / "actor.pt2"
+    assert main(["export", "--checkpoint", str(checkpoint), "--out", str(path)]) == 0
+    return path
+
+
+def test_a_process_without_the_package_gets_the_agents_actions(checkpoint, program, run_python, tmp_path):
+    film = np.random.default_rng(3).integers(0, 256, (8, 3, 64, 64, 3), dtype=np.uint8)
+    np.save(tmp_path / "film.npy", film)
+    result = run_python("-c", RUNNER, program, tmp_path / "film.npy", cwd=tmp_path)
+    assert result.returncode == 0, result.stderr
+    agent, expected = load_agent(checkpoint, mode="actor"), []
+    for time, frames in enumerate(film):
+        if time == 5:
+            agent.reset()
+        expected.append(agent.act(frames))
+    actions = np.load(tmp_path / "film.npy")
+    assert np.ptp(expected) > 0.1
+    assert np.allclose(actions, np.stack(expected), atol=1e-4)
+
+
+def test_the_documented_runner_gets_the_agents_actions(checkpoint, program, run_python, tmp_path, root):
+    text = (root / "docs" / "distillation.md").read_text()
+    runner = next(part for part in text.split("```python\n")[1:] if "torch.export.load" in part).split("```")[0]
+    film = np.random.default_rng(0).integers(0, 256, (6, 64, 64, 3), dtype=np.uint8)
+    np.save(program.parent / "film.npy", film)
+    before = (
+        "import sys; sys.modules['latentplan'] = None\nimport numpy as np\nactions = []\n"
+        "def play():\n"
+        "    for frame in np.load('film.npy'):\n        yield frame\n        actions.append(action.detach().numpy())\n"
+        "frames = play()\n"
+    )
+    result = run_python("-c", f"{before}{runner}np.save('actions.npy', actions)", cwd=program.parent)
+    assert result.returncode == 0, result.stderr
+    agent = load_agent(checkpoint, mode="actor")
+    expected = np.stack([agent.act(frame) for frame in film])
+    assert np.allclose(np.load(program.parent / "actions.npy")[:, 0], expected, atol=1e-4)
+
+
+def test_an_episode_begins_alone(program):
+    module = torch.export.load(program).module()
+    frames = torch.randint(0, 256, (2, 64, 64, 3), dtype=torch.uint8, generator=torch.Generator().manual_seed(0))
+    past = torch.full((2, 16), 0.3), torch.full((2, 32), -0.2), torch.full((2, 2), 0.5)
+    mixed, first, later = (
+        module(frames, *past, torch.tensor(flags)) for flags in ([True, False], [True, True], [False, False])
+    )
+    for ours, firsts, laters in zip(mixed, first, later, strict=True):
+        assert torch.allclose(ours[0], firsts[0], atol=1e-5) and torch.allclose(ours[1], laters[1], atol=1e-5)
+        assert not torch.allclose(firsts[1], laters[1], atol=1e-5)
+
+
+def test_the_file_names_its_sizes_and_holds_no_more_than_the_actor_needs(program, checkpoint):
+    facts = {"actor.json": ""}
+    exported = torch.export.load(program, extra_files=facts)
+    assert json.loads(facts["actor.json"]) == {"deter": 16, "stoch": 32, "action": 2}
+    held = sum(tensor.numel() for tensor in exported.state_dict.values())
+    model = load_agent(checkpoint, mode="actor").model
+    parts = (model.encoder, model.dynamics, model.actor)
+    assert 0 < held <= sum(parameter.numel() for part in parts for parameter in part.parameters())
+
+
+def test_an_agent_in_memory_is_exported_as_it_is(tmp_path, program):
+    torch.manual_seed(1)
+    agent = ActorAgent(WorldModel(CONFIG.model, action_dim=2), CONFIG)
+    path = export_actor(agent, tmp_path / "mine.pt2")
+    frame = np.zeros((1, 64, 64, 3), np.uint8)
+    nothing = torch.zeros(1, 16), torch.zeros(1, 32), torch.zeros(1, 2)
+    ours, other = (
+        torch.export.load(file).module()(torch.from_numpy(frame), *nothing, torch.ones(1, dtype=torch.bool))[0]
+        for file in (path, program)
+    )
+    assert np.allclose(ours.detach().numpy(), agent.act(frame), atol=1e-4)
+    assert not torch.allclose(ours, other)
+
+
+@pytest.mark.parametrize(
+    ("flags", "words"),
+    [
+        (["--out", "actor.pt2"], ["--checkpoint"]),
+        (["--checkpoint", "{checkpoint}"], ["--out"]),
+        (["--checkpoint", "{checkpoint}", "--out", "a.pt2", "--format", "onx"], ["'onx'", "'onnx'"]),
+        (["--checkpoint", "{checkpoint}", "--out", "nowhere/a.pt2"], ["'nowhere'"]),
+        (["--checkpoint", "nothing", "--out", "a.pt2"], ["nothing"]),
+        (["--checkpoint", "{checkpoint}", "--out", "a.onnx"], ["--format onnx"]),
+        (["--chekpoint", "nothing", "--out", "a.pt2"], ["'--chekpoint'", "'--checkpoint'"]),
+    ],
+)
+def test_mistakes_are_one_line(flags, words, checkpoint, capsys, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert main(["export", *[flag.format(checkpoint=checkpoint) for flag in flags]]) == 2
+    captured = capsys.readouterr()
+    assert captured.err.count("\n") == 1 and all(word in captured.err for word in words), captured.err
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_onnx_without_its_packages_says_what_to_install(checkpoint, tmp_path, monkeypatch):
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
+    with pytest.raises(UserError, match="pip install onnx onnxscript"):
+        export_actor(checkpoint, tmp_path / "actor.onnx", "onnx")
+
+
+def test_onnx_gives_the_agents_actions(checkpoint, tmp_path):
+    pytest.importorskip("onnxscript")
+    runtime = pytest.importorskip("onnxruntime")
+    session = runtime.InferenceSession(export_actor(checkpoint, tmp_path / "actor.onnx", "onnx"))
+    agent = load_agent(checkpoint, mode="actor")
+    film = np.random.default_rng(0).integers(0, 256, (4, 1, 64, 64, 3), dtype=np.uint8)
+    action, deter, stoch = (np.zeros((1, size), np.float32) for size in (2, 16, 32))
+    for time, frame in enumerate(film):
+        inputs = {"frame": frame, "deter": deter, "stoch": stoch, "action": action, "is_first": np.array([time == 0])}
+        action, deter, stoch = session.run(None, inputs)
+        assert np.allclose(action, agent.act(frame), atol=1e-4)
+
+
+def test_help_needs_no_torch(run_python):
+    code = (
+        "import sys\nfrom latentplan.commands.main import main\n"
+        "print(main(['export', '--help']), 'torch' in sys.modules, 'jsonargparse' in sys.modules)"
+    )
+    result = run_python("-c", code)
+    assert result.stdout.endswith("0 False False\n") and "--checkpoint" in result.stdout, result.stderr
+
+
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="limits the size of files")
+def test_a_disk_that_is_full_is_one_line(checkpoint, run_python, tmp_path):
+    code = (
+        "import resource, sys\n"
+        "from latentplan.commands.main import main\n"
+        "resource.setrlimit(resource.RLIMIT_FSIZE, (1000, 1000))\n"
+        f"sys.exit(main(['export', '--checkpoint', {str(checkpoint)!r}, '--out', {str(tmp_path / 'a.pt2')!r}]))\n"
+    )
+    finished = run_python("-c", code)
+    assert finished.returncode == 2 and "error: cannot write" in finished.stderr
+    assert list(tmp_path.iterdir()) == []

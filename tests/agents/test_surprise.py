@@ -1,0 +1,70 @@
+"""Where a frame surprises the model, its plans are not trusted."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+import torch
+
+from latentplan.agents.actor import ActorAgent
+from latentplan.agents.planning import PlanningAgent
+from latentplan.models import State, WorldModel
+from latentplan.models.symmetry import TurnedModel
+from tests.agents.small_agents import CONFIG, make_model
+
+
+def cautious(rollout):
+    """A constraint: small first actions."""
+    return rollout.actions[:, 0].abs().sum(-1) - 0.1
+
+
+ASKED = [{"objective": lambda rollout: rollout.actions[:, 0, 0]}, {"constraints": [cautious]}]
+
+
+@pytest.fixture(scope="module")
+def model():
+    return make_model()
+
+
+@pytest.fixture
+def frames():
+    """Of two environments."""
+    return np.random.default_rng(0).integers(0, 256, (2, 64, 64, 3), dtype=np.uint8)
+
+
+def make_planner(model, **settings):
+    return PlanningAgent(model, CONFIG, 0.9, planner=dataclasses.replace(CONFIG.planner, **settings))
+
+
+def test_surprise_counts_standard_deviations_from_what_was_predicted(model):
+    deter = torch.randn(2, 16, generator=torch.Generator().manual_seed(0))
+    prior = model.dynamics.prior(deter)
+    away = prior.std * torch.tensor([[0.0], [2.0]]) * (torch.arange(32) == 5)
+    assert torch.allclose(model.surprise(State(deter, prior.mean + away)), torch.tensor([0.0, 2.0]), atol=1e-4)
+    turned = State(deter[None].repeat(1, 2, 1), (prior.mean + away)[None].repeat(1, 2, 1))
+    assert torch.allclose(TurnedModel(model).surprise(turned), torch.tensor([1.0]), atol=1e-4)
+
+
+@pytest.mark.parametrize("limit", [5.0, 1.0, 0.5])
+def test_where_a_frame_surprises_the_model_the_actor_acts(model, frames, monkeypatch, limit):
+    surprise = torch.tensor([3.0, 0.7])
+    monkeypatch.setattr(WorldModel, "surprise", lambda self, state: surprise)
+    planner, actor = make_planner(model), ActorAgent(model, CONFIG)
+    limited = make_planner(model, surprise_limit=limit)
+    planned, acted, action = (agent.act(frames) for agent in (planner, actor, limited))
+    assert not np.allclose(planned, acted, atol=0.05)
+    for row in range(2):
+        expected = acted if surprise[row] > limit else planned
+        assert np.allclose(action[row], expected[row], atol=0.02)
+    is_surprised = bool(surprise[0] > limit)
+    assert (limited.imagine() is None) == is_surprised
+    assert limited.last_source == ("actor" if is_surprised else "plan") and limited.was_surprised == is_surprised
+
+
+@pytest.mark.parametrize("asked", ASKED)
+def test_what_the_actor_knows_nothing_of_is_planned_for_whatever_surprises(model, frames, asked):
+    planner = make_planner(model)
+    limited = make_planner(model, surprise_limit=1e-6)
+    for agent in (planner, limited):
+        agent.set_objective(**asked)
+    assert np.array_equal(planner.act(frames[0]), limited.act(frames[0])) and limited.last_source == "plan"

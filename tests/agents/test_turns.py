@@ -1,0 +1,149 @@
+"""Agents that look at every frame from four sides: what they do does not depend on which side is up."""
+
+import copy
+import dataclasses
+
+import numpy as np
+import pytest
+import torch
+
+from latentplan.agents.actor import ActorAgent
+from latentplan.agents.background import BackgroundAgent
+from latentplan.agents.checkpoint import load_agent, save_checkpoint
+from latentplan.agents.export import export_actor
+from latentplan.agents.gated import GatedAgent
+from latentplan.agents.planning import PlanningAgent
+from latentplan.config import Config, LearningConfig, ModelConfig, PlannerConfig, UserError
+from latentplan.models import WorldModel
+
+SIZES = ModelConfig(deter_dim=16, hidden_dim=16, encoder_channels=(8, 8), decoder_channels=2, num_bins=15, turns=4)
+PLANNER = PlannerConfig(horizon=3, num_samples=24, num_elites=6, num_iterations=2, num_policy_samples=4)
+CONFIG = Config(model=SIZES, planner=PLANNER, learning=LearningConfig(turned_share=0.5))
+INFO = {"domain": "reacher", "task": "easy", "env_frames": 1, "discount": 0.9}
+MAKERS = {
+    "planner": lambda model: PlanningAgent(model, CONFIG, 0.9),
+    "actor": lambda model: ActorAgent(model, CONFIG),
+    "gated": lambda model: GatedAgent(model, CONFIG, 0.9),
+    "background": lambda model: BackgroundAgent(model, CONFIG, 0.9, worker="thread"),
+}
+
+
+@pytest.fixture(scope="module")
+def model():
+    torch.manual_seed(0)
+    model = WorldModel(SIZES, action_dim=2, labels={"distance": 0.1})
+    with torch.no_grad():
+        for head in (model.reward_head, model.value_head, model.actor):
+            head.mlp.output.weight.normal_(std=0.3)
+    return model
+
+
+@pytest.fixture(params=list(MAKERS))
+def make(request):
+    made = []
+
+    def build(model):
+        made.append(MAKERS[request.param](model))
+        return made[-1]
+
+    yield build
+    for agent in made:
+        if isinstance(agent, BackgroundAgent):
+            agent.close()
+
+
+@pytest.fixture
+def film():
+    """Five frames of three environments, (time, environment, 64, 64, 3)."""
+    return np.random.default_rng(0).integers(0, 256, (5, 3, 64, 64, 3), dtype=np.uint8)
+
+
+def test_frames_become_one_action_each(make, model, film):
+    agent = make(model)
+    actions = np.stack([agent.act(frames) for frames in film])
+    assert actions.shape == (5, 3, 2) and np.abs(actions).max() <= 1.0 and np.ptp(actions[0], axis=0).min() > 0.0
+    assert agent.state.deter.shape == (3, 4, 16) and agent.state.stoch.shape == (3, 4, 32)
+    agent.reset()
+    assert agent.act(film[0, 0]).shape == (2,)
+
+
+def seen_upright(model):
+    """An actor with the same weights that looks at frames as they are."""
+    alone = copy.deepcopy(model)
+    alone.config = dataclasses.replace(SIZES, turns=1)
+    return ActorAgent(alone, CONFIG)
+
+
+def turn(frames, quarters):
+    return np.ascontiguousarray(np.rot90(frames, quarters, (1, 2)))
+
+
+def test_an_actor_does_the_same_whichever_side_is_up(model, film):
+    agent, turned, plain = ActorAgent(model, CONFIG), ActorAgent(model, CONFIG), seen_upright(model)
+    for frames in film:
+        expected = agent.act(frames)
+        assert np.allclose(turned.act(turn(frames, 1)), expected, atol=1e-5)
+        assert not np.allclose(plain.act(turn(frames, 1)), plain.act(frames), atol=1e-2)
+        plain.reset()
+
+
+def test_an_action_is_the_mean_of_what_one_would_do_from_each_side(model, film):
+    sides = [seen_upright(model).act(turn(film[0], side)) for side in range(4)]
+    assert np.allclose(ActorAgent(model, CONFIG).act(film[0]), np.mean(sides, axis=0), atol=1e-5)
+
+
+@pytest.mark.parametrize("make", ["planner", "actor"], indirect=True)  # the others share searches or a threshold
+def test_environments_of_a_batch_do_not_feel_each_other(make, model, film):
+    together, alone = make(model), make(model)
+    for frames in film:
+        assert np.allclose(together.act(frames)[1], alone.act(frames[1]), atol=0.1)
+
+
+def test_an_episode_that_ends_is_forgotten_from_every_side(model, film):
+    agent, fresh = (ActorAgent(model, CONFIG) for _ in range(2))
+    for frames in film[:3]:
+        agent.act(frames)
+    agent.reset(np.array([False, True, False]))
+    assert np.allclose(agent.act(film[3])[1], fresh.act(film[3])[1], atol=1e-5)
+
+
+def test_a_goal_is_planned_for_from_every_side(model, film):
+    agent = PlanningAgent(model, CONFIG, 0.9)
+    agent.set_objective("distance -> 0.0", "distance < 0.5")
+    assert agent.act(film[0]).shape == (3, 2)
+
+
+def test_a_goal_that_was_learned_is_pursued_from_every_side(model, film):
+    learned = copy.deepcopy(model)
+    learned.add_goal_heads(16)
+    for agent in (PlanningAgent(learned, CONFIG, 0.9), GatedAgent(learned, CONFIG, 0.9, planning_budget=0.5)):
+        agent.set_objective("distance < 0.05")
+        assert all(agent.act(frames).shape == (3, 2) for frames in film)
+
+
+def test_a_picture_is_reached_for_from_every_side(model, film, tmp_path):
+    import cv2
+
+    cv2.imwrite(str(tmp_path / "goal.png"), film[0, 0])
+    agent = PlanningAgent(model, CONFIG, 0.9)
+    agent.set_objective(f"goal:{tmp_path / 'goal.png'}")
+    assert agent.act(film[1]).shape == (3, 2) and agent.imagine().shape == (32, 32, 3)
+
+
+def test_an_exported_actor_turns_its_frames_itself(model, film, tmp_path):
+    for parameter in model.parameters():
+        parameter.data = parameter.data.half().float()
+    save_checkpoint(tmp_path / "agent", model, CONFIG, INFO)
+    program = torch.export.load(export_actor(tmp_path / "agent", tmp_path / "actor.pt2")).module()
+    agent = load_agent(tmp_path / "agent", mode="actor")
+    action, deter, stoch = torch.zeros(3, 2), torch.full((3, 64), 7.0), torch.full((3, 128), 7.0)
+    for time, frames in enumerate(film):
+        action, deter, stoch = program(torch.from_numpy(frames), deter, stoch, action, torch.full((3,), time == 0))
+        assert np.allclose(action.detach().numpy(), agent.act(frames), atol=1e-4)
+
+
+def test_it_is_refused_where_nothing_was_learned_from_turned_frames():
+    with pytest.raises(UserError, match="turned_share"):
+        Config(model=SIZES)
+    with pytest.raises(ValueError, match="turns must be 1 or 4"):
+        dataclasses.replace(SIZES, turns=2)

@@ -1,0 +1,120 @@
+import subprocess
+import sys
+
+import pytest
+import torch
+
+from latentplan.models.fast import library as kernels
+
+DTYPES = [torch.bfloat16, torch.float32]
+ROWS, SIZE = 37, 45  # neither is a multiple of what a vector holds
+COMPILED = kernels.load()
+compiled = pytest.mark.skipif(COMPILED is None, reason="no C compiler")
+
+
+def draw(*shape, dtype=torch.float32, seed=0):
+    return torch.randn(*shape, generator=torch.Generator().manual_seed(seed)).to(dtype)
+
+
+def norm(size):
+    return 1.0 + 0.3 * draw(size, seed=1), 0.3 * draw(size, seed=2)
+
+
+def asked(name, dtype):
+    """One call of each kernel: what it makes of the same input whenever it is asked."""
+    if name == "norm_silu":
+        return lambda row=slice(None): (kernels.norm_silu(4.0 * draw(ROWS, SIZE, dtype=dtype)[row] + 1.0, norm(SIZE)),)
+    if name == "gates":
+        product, deter = draw(ROWS, 3 * SIZE, dtype=dtype), draw(ROWS, SIZE, seed=3)
+        return lambda row=slice(None): kernels.gates(product[row], norm(3 * SIZE), deter[row])
+    logits = 5.0 * draw(ROWS, SIZE)
+    return lambda row=slice(None): (kernels.expectation(logits[row], 10.0 * draw(SIZE, seed=4)),)
+
+
+CASES = [(name, dtype) for name in ("norm_silu", "gates") for dtype in DTYPES] + [("expectation", torch.float32)]
+
+
+@compiled
+@pytest.mark.parametrize(("name", "dtype"), CASES)
+def test_the_compiled_kernel_does_what_torch_does(name, dtype, monkeypatch):
+    ask = asked(name, dtype)
+    fused = ask()
+    monkeypatch.setattr(kernels, "load", lambda: None)
+    for left, right in zip(fused, ask(), strict=True):
+        assert left.dtype == right.dtype and left.shape == right.shape
+        precision = 2e-2 if left.dtype == torch.bfloat16 else 2e-5
+        assert torch.allclose(left.float(), right.float(), rtol=precision, atol=precision)
+
+
+@pytest.mark.parametrize(("name", "dtype"), CASES)
+def test_rows_do_not_depend_on_each_other(name, dtype):
+    ask = asked(name, dtype)
+    for whole, part in zip(ask(), ask(slice(5, 6)), strict=True):
+        # Torch takes the end of a tensor another way than its middle, which shows in the last bit.
+        assert torch.equal(whole[5:6], part) if COMPILED else torch.allclose(whole[5:6], part, rtol=1e-2, atol=1e-6)
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+def test_nan_stays_nan_and_stays_in_its_row(dtype):
+    product, wide, logits = draw(3, SIZE, dtype=dtype), draw(3, 3 * SIZE, dtype=dtype), draw(3, SIZE)
+    for rows in (product, wide, logits):
+        rows[1, 7] = float("nan")
+    results = (
+        kernels.norm_silu(product, norm(SIZE)),
+        *kernels.gates(wide, norm(3 * SIZE), draw(3, SIZE)),
+        kernels.expectation(logits, draw(SIZE)).unsqueeze(-1),
+    )
+    for result in results:
+        assert result[1].isnan().all()
+        assert result[[0, 2]].isfinite().all()
+
+
+def test_extreme_inputs_saturate():
+    far = torch.tensor([[3e38, -3e38, 0.0], [200.0, -200.0, 0.0]])
+    assert kernels.expectation(far, torch.tensor([1.0, 2.0, 3.0])).tolist() == [1.0, 1.0]
+    following, _ = kernels.gates(draw(4, 6) * 1e4, (torch.full((6,), 1e4), torch.zeros(6)), draw(4, 2))
+    assert following.isfinite().all()
+
+
+def test_only_float32_logits_reach_the_compiled_expectation():
+    logits, values = draw(3, 5, dtype=torch.bfloat16), draw(5, dtype=torch.bfloat16)
+    assert torch.equal(kernels.expectation(logits, values), logits.softmax(-1) @ values)
+    with pytest.raises(RuntimeError):
+        kernels.expectation(logits, values.float())  # as torch has it; the kernel would read beyond the end
+
+
+def test_gradients_pass_where_they_are_asked_for():
+    product, deter = draw(4, 6).requires_grad_(), draw(4, 2).requires_grad_()
+    before = product.detach().clone()
+    following, _ = kernels.gates(product, norm(6), deter)
+    (following.sum() + kernels.norm_silu(product, norm(6)).sum()).backward()
+    assert product.grad.abs().sum() > 0.0 and deter.grad.abs().sum() > 0.0
+    assert torch.equal(product, before)
+
+
+@compiled
+def test_a_machine_without_a_compiler_or_with_a_broken_one_goes_on_in_torch(tmp_path):
+    program = "from latentplan.models import kernels; print(kernels.load())"
+    for settings in ({"CC": "false"}, {"CC": "/nowhere/cc"}, {"LATENTPLAN_KERNELS": "0"}):
+        environment = {"XDG_CACHE_HOME": str(tmp_path), "PYTHONPATH": ".", **settings}
+        done = subprocess.run([sys.executable, "-c", program], env=environment, capture_output=True, text=True)
+        assert done.stdout.strip() == "None", done.stderr
+
+
+@compiled
+def test_without_a_home_torch_does_it(monkeypatch):
+    def nobodys():
+        raise RuntimeError("Could not determine home directory.")
+
+    monkeypatch.delenv("XDG_CACHE_HOME", raising=False)
+    monkeypatch.setattr(kernels.Path, "home", nobodys)
+    assert kernels.load.__wrapped__() is None
+
+
+@compiled
+def test_kernels_are_compiled_once_and_kept(tmp_path, monkeypatch):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    first = kernels._compiled()
+    made = first.stat().st_mtime_ns
+    assert kernels._compiled() == first and first.stat().st_mtime_ns == made
+    assert [path.name for path in (tmp_path / "latentplan").iterdir()] == [first.name]

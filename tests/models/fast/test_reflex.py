@@ -1,0 +1,71 @@
+"""The fast path from frame to action says what the model itself says."""
+
+import numpy as np
+import pytest
+import torch
+
+from latentplan.agents.actor import ActorAgent
+from latentplan.config import Config, ModelConfig
+from latentplan.models import State, WorldModel
+from latentplan.models.fast import reflex
+
+
+def make_model(channels=(8, 12, 16), seed=0):
+    torch.manual_seed(seed)
+    config = ModelConfig(deter_dim=24, hidden_dim=20, encoder_channels=channels, decoder_channels=2, num_bins=15)
+    model = WorldModel(config, action_dim=3).eval()
+    with torch.no_grad():
+        for parameter in model.parameters():  # norms and shifts away from ones and zeros
+            parameter.add_(0.1 * torch.randn(parameter.shape))
+    return model
+
+
+def frames_of(rows, seed=0):
+    return torch.from_numpy(np.random.default_rng(seed).integers(0, 256, (rows, 64, 64, 3), dtype=np.uint8))
+
+
+@pytest.mark.parametrize("channels", [(8,), (8, 12), (8, 12, 16), (4, 6, 8, 10, 12)])
+@pytest.mark.parametrize("rows", [1, 5])
+def test_belief_and_action_are_those_of_the_model(channels, rows):
+    model = make_model(channels)
+    weights = reflex.lay_out(model)
+    state, action = State(torch.randn(rows, 24), torch.randn(rows, 32)), torch.rand(rows, 3) * 2 - 1
+    frames = frames_of(rows)
+    with torch.no_grad():
+        expected = model.infer(state, action, frames)
+        believed = reflex.see(weights, reflex.advance(weights, state, action), frames)
+        assert torch.allclose(believed.deter, expected.deter, atol=1e-5)
+        assert torch.allclose(believed.stoch, expected.stoch, atol=1e-4)
+        for ours, models in zip(reflex.act(weights, expected), model.actor(expected.features), strict=True):
+            assert torch.allclose(ours, models, atol=1e-5)
+
+
+def load_others(model):
+    model.load_state_dict(make_model(seed=1).state_dict())
+
+
+def descend(model):
+    optimizer = torch.optim.Adam(model.parameters(), lr=0.1, fused=True)
+    state = model.see(torch.zeros(2, 24), frames_of(2))
+    sum(part.sum() for part in model.actor(state.features)).backward()
+    optimizer.step()
+
+
+@pytest.mark.parametrize("change", [load_others, descend])
+def test_an_agent_follows_a_model_that_changes_between_two_frames(change):
+    model = make_model()
+    agent, frames = ActorAgent(model, Config()), frames_of(2)
+    action = torch.from_numpy(agent.act(frames.numpy()))
+    before = agent.state
+    change(model)
+    after = agent.act(frames.numpy())
+    with torch.no_grad():
+        expected = model.infer(before, action, frames)
+        assert torch.allclose(agent.state.stoch, expected.stoch, atol=1e-4)
+        assert np.allclose(after, model.actor(expected.features)[0].numpy(), atol=1e-4)
+
+
+def test_laying_out_changes_no_weight():
+    model, same = make_model(), make_model()
+    reflex.lay_out(model)
+    assert all(torch.equal(ours, theirs) for ours, theirs in zip(model.parameters(), same.parameters(), strict=True))

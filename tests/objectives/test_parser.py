@@ -1,0 +1,158 @@
+"""Expressions mean what they look like, and what is wrong with one is said with its place."""
+
+import math
+
+import pytest
+
+from latentplan.config import UserError
+from latentplan.config.quantities import scales
+from latentplan.objectives.expression import Clause, evaluate, shortfall
+from latentplan.objectives.parser import parse_constraints, parse_objective, parse_schedule
+
+WALKER = scales("walker")
+VALUES = {"height": 1.0, "speed": -0.5, "upright": 0.9, "task.stand": 0.8, "task.walk": 0.3}
+
+
+def degree(missing):
+    return 1.0 if missing <= 0 else math.exp(-missing)
+
+
+def worth(text):
+    expression = parse_objective(text, WALKER)
+    return sum(weight * evaluate(term, VALUES.__getitem__, degree) for weight, term in expression.terms)
+
+
+@pytest.mark.parametrize(
+    ("text", "value"),
+    [
+        ("speed", -0.5),
+        ("1 + 2 * 3 - 4", 3.0),
+        ("-speed * 2", 1.0),
+        ("2 - -speed", 1.5),
+        ("(1 + 1) * (height - speed)", 3.0),
+        ("abs(speed) * abs(-2)", 1.0),
+        ("1.5e1 * .5", 7.5),
+        ("task(stand)", 0.8),
+        ("task.stand - task.walk", 0.5),
+        ("height > 0.9", 1.0),
+        ("height<0.9", math.exp(-0.1 / 0.6)),
+        ("height > 1.6", math.exp(-1.0)),
+        ("speed -> -1.0", math.exp(-0.5)),
+        ("speed->-0.5", math.exp(0.0)),
+        ("abs(speed) < 0.2 and height > 1.3", math.exp(-0.3 - 0.5)),
+        ("speed > 0 and height > 1.3 and upright > 1.4", math.exp(-0.5 - 0.5 - 1.0)),
+        ("task(stand) and speed -> 0.5", 0.8 * math.exp(-1.0)),
+        ("0.7 * task(stand) + 0.3 * (speed -> 0.5)", 0.56 + 0.3 * math.exp(-1.0)),
+        ("-(speed > 0) + (height > 0.5) * 3", 3.0 - math.exp(-0.5)),
+    ],
+)
+def test_expressions_follow_the_rules_of_arithmetic(text, value):
+    assert worth(text) == pytest.approx(value)
+
+
+@pytest.mark.parametrize(
+    ("text", "margin"),
+    [
+        ("speed -> 2", 1.0),
+        ("abs(speed) < 0.2", 1.0),
+        ("height > 1.2", 0.6),
+        ("1.2 < 2 * height", 1.2),
+        ("height - 0.5 * speed > 1", 1.1),
+        ("speed * height -> 0", 0.6),
+        ("-3 * speed < 1", 3.0),
+    ],
+)
+def test_the_margin_is_the_scale_of_what_is_compared(text, margin):
+    (clause,) = parse_objective(text, WALKER).clauses
+    assert clause.margin == pytest.approx(margin)
+
+
+@pytest.mark.parametrize(
+    ("text", "position", "reason"),
+    [
+        ("", 1, "got 'the end'"),
+        ("hight > 1", 1, "unknown quantity 'hight'; available: height, speed"),
+        ("hight > 1", 1, "Did you mean 'height'?"),
+        ("height > 1 and sped -> 2", 16, "Did you mean 'speed'?"),
+        ("task(wlak)", 6, "Did you mean 'task.walk'?"),
+        ("sin(speed) > 0", 1, "unknown function 'sin'; available: abs"),
+        ("height > ", 9, "got 'the end'"),
+        ("height >> 1", 9, "expected a quantity"),
+        ("0 < speed < 1", 11, "a comparison has two sides"),
+        ("1 < 2", 3, "needs a quantity"),
+        ("(height > 1) > 0.5", 14, "not a clause"),
+        ("speed and height > 1", 7, "'and' joins clauses"),
+        ("2 * (speed > 1) and height > 1", 17, "write weights around parentheses"),
+        ("0.7 * task(stand) + 0.3 * speed -> 1", 33, "put the clause in parentheses"),
+        ("(height > 1", 12, "expected ')'"),
+        ("height > 1)", 11, "expected an operator or the end"),
+        ("height > 1 or speed > 1", 12, "expected an operator or the end, got 'or'"),
+        ("height = 1", 8, "'=' means nothing here"),
+        ("__import__('os')", 12, "means nothing here"),
+        ("speed > 1e999", 9, "no finite number"),
+        ("10 * speed * 1e308", 1, "a weight beyond every number"),
+        ("return > 5", 1, "return can only be weighted and added"),
+        ("speed * return", 9, "return can only be weighted and added"),
+        ("abs(goal:a.png)", 5, "a goal image can only be weighted and added"),
+        ("(" * 60 + "speed" + ")" * 60, 51, "levels"),
+        ("speed" + " + speed" * 300, 801, "at most 200"),
+    ],
+)
+def test_what_is_wrong_is_named_with_its_position(text, position, reason):
+    with pytest.raises(UserError) as error:
+        parse_objective(text, WALKER)
+    assert f"position {position}: " in str(error.value)
+    assert reason in str(error.value)
+
+
+def test_a_body_without_quantities_says_so():
+    with pytest.raises(UserError, match="no named quantities"):
+        parse_objective("speed > 1", {})
+
+
+def test_return_and_goal_images_are_weighted_terms():
+    expression = parse_objective('0.5 * return - 2 * (goal:"my goal.png" + height)', WALKER)
+    found = [(weight, type(term).__name__) for weight, term in expression.terms]
+    assert found == [(0.5, "LearnedReturn"), (-2.0, "GoalImage"), (-2.0, "Name")]
+    assert expression.terms[1][1].path == "my goal.png"
+    assert parse_objective("goal:a-b/c.png", WALKER).terms[0][1].path == "a-b/c.png"
+
+
+def test_objectives_follow_each_other_at_env_frames():
+    phases = parse_schedule("abs(speed) < 0.2; 500: speed -> 1.0;750:goal:end.png", WALKER)
+    assert [(phase.start, phase.objective.text) for phase in phases] == [
+        (0, "abs(speed) < 0.2"),
+        (500, "speed -> 1.0"),
+        (750, "goal:end.png"),
+    ]
+    named = parse_schedule('goal:"im/a;b.png"; 500: speed', WALKER)
+    assert [phase.start for phase in named] == [0, 500] and named[0].objective.terms[0][1].path == "im/a;b.png"
+    assert parse_schedule("0: speed", WALKER) == parse_schedule("speed", WALKER)
+
+
+LONG = f"speed; {'9' * 5000}: height"
+
+
+@pytest.mark.parametrize(
+    "text", ["10: speed", "speed; 5: height; 5: speed", "speed; height", "speed; 0: height", LONG], ids=range(5)
+)
+def test_a_schedule_out_of_order_is_refused(text):
+    with pytest.raises(UserError, match="env frame"):
+        parse_schedule(text, WALKER)
+
+
+def test_clauses_remember_how_they_were_written():
+    clauses = parse_objective("2 * (abs(speed)  < 0.2) + (height > 1.2 and upright > 0)", WALKER).clauses
+    assert [clause.text for clause in clauses] == ["abs(speed)  < 0.2", "height > 1.2", "upright > 0"]
+
+
+def test_constraints_are_inequalities():
+    clauses = parse_constraints("abs(speed) < 0.2; height > 1 and upright > 0", WALKER)
+    assert [(type(clause), clause.relation) for clause in clauses] == [(Clause, "<"), (Clause, ">"), (Clause, ">")]
+    assert [shortfall(clause, VALUES.__getitem__) for clause in clauses] == pytest.approx([0.3, 0.0, -1.8])
+
+
+@pytest.mark.parametrize("text", ["speed -> 1", "speed", "0.5 * (speed < 1)", "return", "speed < 1 and task(stand)"])
+def test_what_is_no_inequality_cannot_be_a_constraint(text):
+    with pytest.raises(UserError, match="a constraint is an inequality"):
+        parse_constraints(text, WALKER)

@@ -1,0 +1,300 @@
+"""Every option changes the plan, and does what it says."""
+
+import pytest
+import torch
+
+from latentplan.planning import CEMPlanner, FunctionModel, icem_planner, learned_return, mppi_planner, refit
+from latentplan.planning.search.sampling import Streams
+
+CHANGES = [
+    {"horizon": 5},
+    {"num_samples": 50},
+    {"num_elites": 5},
+    {"num_iterations": 2},
+    {"smoothing": 0.5},
+    {"action_low": -0.2},
+    {"action_high": [0.1, 1.0]},
+    {"init_std": 0.3},
+    {"min_std": 0.9},
+    {"discount": 0.5},
+    {"num_policy_samples": 8},
+    {"num_policy_samples": 8, "start": "policy"},
+    {"num_policy_samples": 8, "start": "both"},
+    {"terminal_value": False},
+    {"use_continues": True},
+    {"noise_beta": 2.0},
+    {"keep_elite_fraction": 0.5},
+    {"stop_std": 0.9},
+    {"temperature": 0.5},
+    {"adapt_std": False},
+]
+CHANGES_OF_THE_CHOICE = [{"final": "best"}, {"gradient_steps": 2}]
+CHANGES_WHEN_WARM = [
+    {"warm_start_iterations": 1},
+    {"warm_start": False},
+    {"tail": "hold"},
+    {"tail": "policy"},
+    {"warm_start_variance": "keep"},
+    {"warm_start_variance": "inflate"},
+]
+
+
+@pytest.fixture
+def model(point):
+    point.continues = lambda state: torch.sigmoid(2.0 - state[:, 0])
+    return point
+
+
+@pytest.mark.parametrize("options", CHANGES, ids=str)
+def test_option_changes_a_cold_plan(model, states, make_planner, seeded, options):
+    plain = make_planner().plan(model, states, generator=seeded())
+    changed = make_planner(**options).plan(model, states, generator=seeded())
+    assert plain.mean.shape != changed.mean.shape or not torch.equal(plain.mean, changed.mean)
+
+
+def test_the_goal_horizon_changes_plans_for_objectives_alone(model, states, make_planner, seeded):
+    plain, changed = make_planner(), make_planner(goal_horizon=9)
+    own, same = (planner.plan(model, states, generator=seeded()) for planner in (plain, changed))
+    assert torch.equal(own.mean, same.mean)
+    given = {"objective": learned_return(), "generator": seeded()}
+    assert changed.plan(model, states, **given).actions.shape[1] == 9 != plain.horizon
+
+
+@pytest.mark.parametrize("options", CHANGES_OF_THE_CHOICE, ids=str)
+def test_option_changes_what_is_executed_and_not_the_search(model, states, make_planner, seeded, options):
+    plain = make_planner().plan(model, states, generator=seeded())
+    changed = make_planner(**options).plan(model, states, generator=seeded())
+    assert not torch.equal(plain.actions, changed.actions)
+
+
+@pytest.mark.parametrize("options", CHANGES_WHEN_WARM, ids=str)
+def test_option_changes_a_warm_plan_and_no_cold_one(model, states, make_planner, seeded, options):
+    plain, changed = make_planner(), make_planner(**options)
+    last = plain.plan(model, states, generator=seeded())
+    assert torch.equal(last.mean, changed.plan(model, states, generator=seeded()).mean)
+    warm, other = (planner.plan(model, states, last, generator=seeded(1)) for planner in (plain, changed))
+    assert not torch.equal(warm.mean, other.mean)
+
+
+def test_every_option_is_covered_here(make_planner):
+    import dataclasses
+
+    named = {name for options in CHANGES + CHANGES_OF_THE_CHOICE + CHANGES_WHEN_WARM for name in options}
+    named |= {"goal_horizon"}  # changes nothing but plans that are given an objective
+    elsewhere = {"action_dim", "constraint_penalty", "gradient_step_size", "deadline_ms", "clock"}
+    assert {field.name for field in dataclasses.fields(make_planner())} == named | elsewhere
+
+
+def frozen(make_planner, **options):
+    """A planner that samples nothing but its start: what it plans is where the search began."""
+    return make_planner(init_std=0.0, num_iterations=1, **options)
+
+
+@pytest.mark.parametrize(
+    ("tail", "expected"),
+    [("zero", 0.0), ("hold", "last"), ("policy", "policy")],
+)
+def test_the_tail_is_filled_as_asked(point, states, make_planner, seeded, tail, expected):
+    last = make_planner().plan(point, states, generator=seeded())
+    plan = frozen(make_planner, tail=tail).plan(point, states, last, generator=seeded())
+    torch.testing.assert_close(plan.mean[:, :-1], last.actions[:, 1:])
+    end = plan.mean[:, -1]
+    if expected == "last":
+        torch.testing.assert_close(end, last.actions[:, -1])
+    elif expected == "policy":
+        state = states
+        for action in last.actions[:, 1:].unbind(1):
+            state = point.dynamics(state, action)
+        torch.testing.assert_close(end, point.policy(state, None).clamp(-1, 1))
+    else:
+        assert (end == 0).all()
+
+
+@pytest.mark.parametrize(("choice", "share"), [("reset", 1.0), ("keep", 0.0), ("inflate", 0.5)])
+def test_the_variance_of_a_warm_start(point, states, make_planner, seeded, choice, share):
+    last = make_planner().plan(point, states, generator=seeded())
+    planner = make_planner(warm_start_variance=choice, num_iterations=1, smoothing=1e-9)
+    plan = planner.plan(point, states, last, generator=seeded())
+    torch.testing.assert_close(plan.var[:, :-1], share + (1 - share) * last.var[:, 1:])
+    torch.testing.assert_close(plan.var[:, -1], torch.ones_like(plan.var[:, -1]))
+
+
+def test_a_search_from_the_policy_begins_at_its_mode_sequence(point, states, make_planner, seeded):
+    plan = frozen(make_planner, start="policy", num_policy_samples=1, num_elites=1, smoothing=1e-9).plan(
+        point, 0.3 * states, generator=seeded()
+    )
+    state = 0.3 * states
+    for step in range(6):
+        action = point.policy(state, None).clamp(-1, 1)
+        torch.testing.assert_close(plan.mean[:, step], action)
+        state = point.dynamics(state, action)
+
+
+def test_without_policy_samples_the_policy_is_never_asked(point, states, make_planner, seeded):
+    def forbidden(state, generator):
+        raise AssertionError("the policy was asked")
+
+    model = FunctionModel(point.dynamics, point.reward, policy=forbidden)
+    make_planner(num_policy_samples=0, start="policy").plan(model, states, generator=seeded())
+
+
+def test_a_search_stops_early_where_its_distribution_is_narrow(states, make_planner, seeded):
+    """The first environment's return falls steeply away from its optimum, the second's hardly varies."""
+    model = FunctionModel(
+        lambda state, action: state,
+        lambda state, action: -(state[:, 0] * action.square().sum(dim=1)),
+    )
+    planner = make_planner(num_iterations=10, stop_std=0.3, num_samples=256)
+    plan = planner.plan(model, torch.tensor([[1.0], [0.0]]), generator=seeded())
+    iterations = plan.info["iterations"]
+    assert iterations[0] < 10 and iterations[1] >= iterations[0]
+    alone = planner.plan(model, torch.ones(1, 1), generator=seeded())
+    torch.testing.assert_close(alone.mean, plan.mean[:1], atol=1e-5, rtol=0)
+
+
+def test_warm_and_cold_environments_get_their_own_iterations(point, states, make_planner, seeded):
+    planner = make_planner(num_iterations=5, warm_start_iterations=2)
+    last = planner.plan(point, states, generator=seeded()).forget(torch.tensor([1, 0, 0, 1, 0]).bool())
+    assert planner.plan(point, states, last, generator=seeded()).info["iterations"].tolist() == [5, 2, 2, 5, 2]
+
+
+@pytest.mark.parametrize("beta", [0.0, 1.0, 3.0])
+def test_coloured_noise_has_unit_variance_and_more_likeness_between_steps(beta):
+    streams = Streams(torch.Generator().manual_seed(0), 1, torch.device("cpu"))
+    noise = streams.noise(20_000, 12, 1, beta, torch.float64)[0, :, :, 0]
+    torch.testing.assert_close(noise.var(dim=0), torch.ones(12, dtype=torch.float64), atol=0.05, rtol=0)
+    likeness = (noise[:, 1:] * noise[:, :-1]).mean().item()
+    ends = (noise[:, 0] * noise[:, -1]).mean().item()
+    assert likeness == pytest.approx({0.0: 0.0, 1.0: 0.42, 3.0: 0.9}[beta], abs=0.15)
+    assert ends < likeness + 0.02  # the end of a sequence is not tied to its start
+
+
+def test_mppi_equals_its_formula(point, states, seeded):
+    planner = mppi_planner(action_dim=2, horizon=4, num_samples=128, temperature=0.5, init_std=0.4)
+    plan = planner.plan(point, states[:1], generator=seeded())
+    streams = Streams(seeded(), 1, torch.device("cpu"))
+    candidates = (0.4 * streams.noise(128, 4, 2, 0.0, torch.float32)[0]).clamp(-1, 1)
+    candidates[0] = 0.0
+    returns = []
+    for sequence in candidates:
+        state, total = states[:1], 0.0
+        for action in sequence:
+            total = total + point.reward(state, action[None])
+            state = point.dynamics(state, action[None])
+        returns.append(total + point.value(state))
+    weights = torch.softmax(torch.cat(returns) / 0.5, dim=0)
+    torch.testing.assert_close(plan.mean[0], torch.einsum("s,sha->ha", weights, candidates), atol=1e-4, rtol=0)
+    torch.testing.assert_close(plan.var, torch.full_like(plan.var, 0.16))
+
+
+def test_a_lower_temperature_trusts_the_best_more(point, states, seeded):
+    values = [
+        mppi_planner(action_dim=2, horizon=4, temperature=temperature).plan(point, states, generator=seeded())
+        for temperature in (0.1, 1.0, 10.0)
+    ]
+    returns = torch.stack([plan.expected_return for plan in values])
+    assert (returns[0] > returns[1]).all() and (returns[1] > returns[2]).all()
+
+
+def test_icem_beats_plain_cem_on_a_sluggish_system(seeded):
+    """Slow dynamics need sustained actions, which white noise averages away."""
+
+    def dynamics(state, action):
+        return torch.cat([state[:, :1] + 0.05 * state[:, 1:], state[:, 1:] + 0.05 * action], dim=1)
+
+    model = FunctionModel(dynamics, lambda state, action: state[:, 0] - 0.0 * action[:, 0])
+    settings = {"action_dim": 1, "horizon": 25, "num_samples": 48, "num_elites": 6, "num_iterations": 2}
+    plain = mppi_planner(**settings | {"temperature": None, "num_elites": 6, "adapt_std": True, "final": "best"})
+    better = 0
+    for seed in range(5):
+        start = torch.zeros(1, 2)
+        icem_return = icem_planner(**settings).plan(model, start, generator=seeded(seed)).expected_return
+        better += int(icem_return > plain.plan(model, start, generator=seeded(seed)).expected_return)
+    assert better >= 4
+
+
+def test_gradient_steps_improve_the_plan_and_none_gets_worse(point, states, make_planner, seeded):
+    def worth(plan):
+        state, total = states, 0.0
+        for action in plan.actions.unbind(1):
+            total = total + point.reward(state, action)
+            state = point.dynamics(state, action)
+        return total + point.value(state)
+
+    plain, refined = (make_planner(gradient_steps=n).plan(point, states, generator=seeded()) for n in (0, 10))
+    assert (worth(refined) >= worth(plain) - 1e-5).all() and (worth(refined) > worth(plain) + 0.01).any()
+    torch.testing.assert_close(refined.expected_return, worth(refined))
+    tiny = make_planner(gradient_steps=10, gradient_step_size=1e-4).plan(point, states, generator=seeded())
+    assert (tiny.actions - plain.actions).abs().max() < 2e-3 < (refined.actions - plain.actions).abs().max()
+
+
+def test_gradient_steps_that_overshoot_are_halved(make_planner, seeded):
+    """The optimum is a narrow ridge at 0.37; the first step of 0.5 jumps over it."""
+    model = FunctionModel(lambda state, action: state, lambda state, action: -(action - 0.37).abs().sum(dim=1))
+    planner = make_planner(init_std=0.0, horizon=1, gradient_steps=25, gradient_step_size=0.5)
+    plan = planner.plan(model, torch.zeros(1, 1), generator=seeded())
+    torch.testing.assert_close(plan.action, torch.full((1, 2), 0.37), atol=1e-3, rtol=0)
+
+
+def test_gradient_steps_work_under_inference_mode_and_refuse_what_cannot_be_differentiated(
+    point, states, make_planner, seeded
+):
+    planner = make_planner(gradient_steps=2)
+    with torch.inference_mode():
+        inside = planner.plan(point, states + 0.0, generator=seeded())
+    torch.testing.assert_close(inside.actions, planner.plan(point, states, generator=seeded()).actions)
+    blind = FunctionModel(point.dynamics, lambda state, action: torch.ones(len(state)))
+    with pytest.raises(ValueError, match="differentiable"):
+        planner.plan(blind, states, generator=seeded())
+
+
+def test_refits_of_a_plan_are_the_public_equation(seeded):
+    """One iteration of the planner is `refit` of the candidates it drew."""
+    seen = []
+
+    def reward(state, action):
+        seen.append(action.clone())
+        return -(action - 0.3).square().sum(dim=1)
+
+    model = FunctionModel(lambda state, action: state, reward)
+    planner = mppi_planner(
+        action_dim=2, horizon=1, num_samples=32, num_elites=4, temperature=None, smoothing=0.7, adapt_std=True
+    )
+    plan = planner.plan(model, torch.zeros(1, 1), generator=seeded())
+    candidates = seen[0][:, None]
+    returns = -(seen[0] - 0.3).square().sum(dim=1)
+    mean, var = refit(candidates, returns, torch.zeros(1, 2), torch.ones(1, 2), num_elites=4, smoothing=0.7)
+    torch.testing.assert_close((plan.mean[0], plan.var[0]), (mean, var))
+
+
+def test_nothing_leaves_the_bounds_not_even_by_rounding(seeded):
+    options = {"final": "best", "num_iterations": 6, "temperature": 1.0, "smoothing": 1.0}
+    planner = CEMPlanner(
+        action_dim=1, horizon=3, num_samples=100, num_elites=10, action_low=1.2, action_high=1.7, **options
+    )
+    model = FunctionModel(lambda state, action: state, lambda state, action: -action[:, 0])
+    for seed in range(5):
+        plan = planner.plan(model, torch.zeros(1, 1), generator=seeded(seed))
+        assert plan.actions.min() >= torch.tensor(1.2) and plan.actions.max() <= torch.tensor(1.7)
+
+
+def test_a_refinement_that_finds_nothing_leaves_what_was_found(seeded):
+    model = FunctionModel(
+        lambda state, action: state,
+        lambda state, action: torch.where((action[:, 0] > 0.5) | (action[:, 0] < -0.5), action[:, 0].abs(), torch.nan),
+    )
+    planner = CEMPlanner(action_dim=1, horizon=1, num_samples=64, num_elites=32, num_iterations=1, gradient_steps=2)
+    plan = planner.plan(model, torch.zeros(1, 1), generator=seeded(0))
+    assert not plan.failures().any() and torch.isfinite(plan.expected_return).all()
+
+
+@pytest.mark.parametrize("name", ["horizon", "num_samples", "action_dim"])
+def test_sizes_are_whole_numbers(name):
+    sizes = {"action_dim": 2, "horizon": 3, "num_samples": 16, "num_elites": 4}
+    with pytest.raises(ValueError, match=f"{name} must be a whole number"):
+        CEMPlanner(**sizes | {name: float(sizes[name])})
+
+
+def test_a_state_without_rows_is_refused(point, make_planner):
+    with pytest.raises(ValueError, match="at least one row"):
+        make_planner().plan(point, torch.zeros(0, 4))

@@ -1,0 +1,259 @@
+"""Replay, fed by environments whose frames tell the time: nothing is misaligned, torn or lost."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from latentplan.config import UserError
+from latentplan.replay.buffer import Replay, memory, replay_bytes
+from tests.replay.replay_clock import CPU, Clock, filled, make_replay, sample, told
+
+
+def assert_aligned(batch):
+    time, episode, lane = told(batch)
+    assert (time.diff(dim=1) == 1.0).all()
+    assert (episode == episode[:, :1]).all() and (lane == lane[:, :1]).all()
+    assert torch.allclose(batch.actions[..., 0], (time[:, :-1] + 0.5) / 256)
+    assert torch.equal(batch.rewards, time[:, 1:])
+    assert torch.equal(batch.deter[:, 0], time[:, 0])
+
+
+RINGS = [
+    pytest.param({}, id="one lane"),
+    pytest.param({"capacity": 120, "lanes": 3}, id="three lanes"),
+    pytest.param({"capacity": 17, "lengths": (7, 4, 9, 6, 8)}, id="overwritten"),
+    pytest.param({"capacity": 40, "lanes": 3, "lengths": (7, 4, 9, 6, 8), "chunk": 11}, id="lanes overwritten"),
+    pytest.param({"capacity": 12, "lengths": (7, 4, 9), "chunk": 23}, id="more at once than fits"),
+]
+
+
+@pytest.mark.parametrize("ring", RINGS)
+@pytest.mark.parametrize("length", [1, 3, 6])
+def test_sequences_are_aligned_and_never_cross_episodes(ring, length):
+    batch = sample(filled(**ring), length=length)
+    assert batch.frames.shape == (64, length + 1, 64, 64, 3) and batch.frames.dtype == torch.uint8
+    assert batch.deter.shape == (64, 2) and batch.deter.dtype == torch.float32
+    assert_aligned(batch)
+
+
+@pytest.mark.parametrize("ring", RINGS)
+def test_every_sequence_that_is_held_is_drawn(ring):
+    replay, length = filled(**ring), 3
+    drawn = {tuple(start) for start in torch.stack(told(sample(replay, 1000, length)), -1)[:, 0].tolist()}
+    rows = replay.frames[:, 0, 0].float()
+    held = {tuple(row) for row in rows.tolist()} if len(replay) == len(rows) else None
+    lanes, lengths = ring.get("lanes", 1), ring.get("lengths", (7, 4, 9))
+    for lane in range(lanes):
+        for episode, decisions in enumerate(lengths):
+            for start in range(decisions - length + 1):
+                first = (start, episode, lane)
+                is_held = held is None or {(start + ahead, episode, lane) for ahead in range(length + 1)} <= held
+                assert (first in drawn) == is_held, first
+
+
+def test_an_interrupted_episode_ends_where_the_next_begins():
+    replay, clock = make_replay(), Clock(0, (9,))
+    replay.add(0, clock.rows(0, 4))  # the run stopped here; a resumed one begins a new episode
+    replay.add(0, clock.rows(0, 6))
+    for seed in range(5):
+        assert_aligned(sample(replay, seed=seed))
+
+
+def test_each_frame_is_stored_once():
+    replay = filled(lengths=(7, 4, 9))
+    assert len(replay) == 8 + 5 + 10
+    stored = {tuple(frame) for frame in replay.frames[: len(replay), 0, 0].tolist()}
+    assert len(stored) == len(replay)
+    assert replay.frames.numel() == 60 * 64 * 64 * 3
+
+
+def test_a_ring_keeps_the_newest_rows():
+    replay = filled(capacity=12, lengths=(7, 4, 9))
+    newest = [entry[2::-1] for entry in Clock(0, (7, 4, 9)).entries[-12:]]
+    assert sorted(map(tuple, replay.frames[:, 0, 0].tolist())) == sorted(newest)
+    assert len(replay) == 12
+
+
+def test_batches_follow_from_the_random_stream():
+    replay = filled()
+    first, again, other = (sample(replay, seed=seed) for seed in (0, 0, 1))
+    assert all(torch.equal(left, right) for left, right in zip(first, again, strict=True))
+    assert not torch.equal(first.rows, other.rows)
+
+
+def test_refreshed_beliefs_go_back_to_where_the_batch_came_from():
+    replay = filled(capacity=40, lanes=2, lengths=(7, 4, 9, 6))
+    batch = sample(replay)
+    time, episode, lane = told(batch)
+    replay.refresh(
+        batch.rows, torch.stack([time * 2.0, episode + 100.0 * lane], -1), torch.ones_like(batch.rows, dtype=torch.bool)
+    )
+    again = sample(replay, seed=1)
+    time, episode, lane = (part[:, 0] for part in told(again))
+    refreshed = torch.isin(again.rows[:, 0], batch.rows)
+    assert refreshed.any()
+    expected = torch.stack([time * 2.0, episode + 100.0 * lane], -1)
+    untouched = torch.stack([time, time + 1000.0], -1)
+    assert torch.equal(again.deter, torch.where(refreshed[:, None], expected, untouched))
+
+
+def test_where_a_row_is_refreshed_twice_the_last_counts():
+    replay = filled()
+    deter = torch.arange(12.0).reshape(2, 3, 2)
+    replay.refresh(torch.tensor([[4, 5, 4], [6, 4, 5]]), deter, torch.ones(2, 3, dtype=torch.bool))
+    assert replay.deter[4:7].tolist() == [[8.0, 9.0], [10.0, 11.0], [6.0, 7.0]]
+
+
+@pytest.mark.parametrize("chosen", [((1, 1, 1), (0, 0, 0)), ((0, 0, 0), (1, 1, 1)), ((0, 1, 0), (0, 0, 1))])
+def test_what_is_not_chosen_is_not_refreshed_even_where_it_comes_last(chosen):
+    replay = filled()
+    before = replay.deter.clone()
+    rows, deter = torch.tensor([[4, 5, 6], [5, 6, 7]]), torch.arange(12.0).reshape(2, 3, 2)
+    replay.refresh(rows, deter, torch.tensor(chosen) == 1)
+    for row in range(len(before)):
+        written = [deter[s, t] for s in range(2) for t in range(3) if chosen[s][t] and rows[s, t] == row]
+        assert torch.equal(replay.deter[row].float(), written[-1] if written else before[row].float())
+
+
+def assert_same(left, right):
+    assert len(left) == len(right)
+    for seed in range(3):
+        pairs = zip(sample(left, seed=seed), sample(right, seed=seed), strict=True)
+        assert all(torch.equal(first, second) for first, second in pairs)
+
+
+@pytest.mark.parametrize("ring", RINGS)
+def test_a_saved_replay_is_the_same_when_loaded(ring, tmp_path):
+    replay = filled(**ring)
+    replay.save(tmp_path)
+    loaded = make_replay(ring.get("capacity", 60), ring.get("lanes", 1))
+    loaded.load(tmp_path)
+    assert_same(replay, loaded)
+
+
+@pytest.mark.parametrize("capacity", [60, 12])
+def test_saving_now_and_then_equals_saving_once(capacity, tmp_path):
+    replay, clock = make_replay(capacity), Clock(0, (7, 4, 9))
+    for start in range(0, len(clock.entries), 4):
+        replay.add(0, clock.rows(start, start + 4))
+        replay.save(tmp_path)
+        if start == 8:  # go on from disk halfway
+            replay = make_replay(capacity)
+            replay.load(tmp_path)
+    loaded = make_replay(capacity)
+    loaded.load(tmp_path)
+    assert_same(replay, loaded)
+    assert_same(filled(capacity=capacity), loaded)
+
+
+def test_saving_again_writes_new_frames_only(tmp_path):
+    replay, clock = make_replay(), Clock(0, (7, 4, 9))
+    replay.add(0, clock.rows(0, 8))
+    replay.save(tmp_path)
+    (tmp_path / "frames_0.u8").write_bytes(bytes(8 * 64 * 64 * 3))
+    replay.add(0, clock.rows(8, 13))
+    replay.save(tmp_path)
+    stored = np.fromfile(tmp_path / "frames_0.u8", np.uint8).reshape(-1, 64, 64, 3)
+    assert len(stored) == 13
+    assert (stored[:8] == 0).all() and (stored[8:, 0, 0, 1] == 1).all()
+
+
+@pytest.mark.parametrize(("before", "after"), [(60, 100), (12, 60), (60, 14), (12, 8)])
+def test_a_replay_can_be_loaded_into_another_capacity(before, after, tmp_path):
+    replay = filled(capacity=before)
+    replay.save(tmp_path)
+    loaded = make_replay(after)
+    loaded.load(tmp_path)
+    assert len(loaded) == min(len(replay), after)
+    assert_aligned(sample(loaded))
+    newest = [entry[2::-1] for entry in Clock(0, (7, 4, 9)).entries[-len(loaded) :]]
+    held = loaded.frames[torch.from_numpy(loaded.episode[0] >= 0)]
+    assert sorted(map(tuple, held[:, 0, 0].tolist())) == sorted(newest)
+    loaded.add(0, Clock(0, (5,)).rows())
+    loaded.save(tmp_path)
+    again = make_replay(after)
+    again.load(tmp_path)
+    assert_same(loaded, again)
+
+
+def test_what_is_no_replay_of_this_run_is_refused(tmp_path):
+    with pytest.raises(UserError, match="no replay found"):
+        make_replay().load(tmp_path)
+    filled().save(tmp_path)
+    for other in (
+        make_replay(lanes=2),
+        Replay(60, 2, 2, 1, CPU, 2),
+        Replay(60, 1, 3, 1, CPU, 2),
+        Replay(60, 1, 2, 1, CPU),
+    ):
+        with pytest.raises(UserError, match="this run"):
+            other.load(tmp_path)
+
+
+def test_missing_frames_are_noticed(tmp_path):
+    filled().save(tmp_path)
+    with (tmp_path / "frames_0.u8").open("r+b") as file:
+        file.truncate(10 * 64 * 64 * 3)
+    with pytest.raises(UserError, match="must hold 23 frames"):
+        make_replay().load(tmp_path)
+
+
+@pytest.mark.parametrize("lengths", [(), (2,), (4, 4, 4)])
+def test_too_short_episodes_are_named(lengths):
+    replay = filled(lengths=lengths)
+    with pytest.raises(UserError, match=r"sequence_length \(5\)"):
+        sample(replay, length=5)
+
+
+def test_a_replay_too_small_for_a_sequence_says_so():
+    with pytest.raises(UserError, match="raise --replay.capacity"):
+        sample(filled(lengths=(9,), capacity=4), length=5)
+
+
+@pytest.mark.parametrize(
+    ("lengths", "advice"), [((4, 4, 4), "lower --learning.sequence_length"), ((2,), "raise --collection.prefill")]
+)
+def test_what_is_too_short_decides_what_is_advised(lengths, advice):
+    with pytest.raises(UserError, match=advice):
+        sample(filled(lengths=lengths), length=5)
+
+
+def test_an_episode_of_the_sequence_length_is_long_enough():
+    assert_aligned(sample(filled(lengths=(2, 5, 3)), length=5))
+
+
+def test_a_replay_beyond_the_free_memory_is_refused(monkeypatch):
+    monkeypatch.setattr(memory, "free_memory", lambda: replay_bytes(100, 1, 2, 2))
+    make_replay(capacity=90)
+    with pytest.raises(UserError, match=r"lower --replay\.capacity"):
+        make_replay(capacity=91)
+
+
+def test_the_memory_a_replay_takes_is_what_its_arrays_hold():
+    replay = make_replay(capacity=10, lanes=3)
+    arrays = [replay.frames, replay.deter, replay.actions, replay.rewards, replay.continues, replay.labels, replay.plan]
+    held = sum(array.numel() * array.element_size() for array in arrays) + replay.episode.nbytes + replay.is_end.nbytes
+    assert held == replay.num_bytes
+
+
+def test_free_memory_is_known_or_unlimited_without_proc(monkeypatch):
+    monkeypatch.setattr(memory, "MEMORY_FACTS", Path("/nowhere"))
+    monkeypatch.setattr(memory, "LIMIT_FACTS", Path("/nowhere"))
+    assert memory.free_memory() > 2**28
+
+
+@pytest.mark.parametrize(("limit", "left"), [("4096", 4096 - 3000 + 500), ("2000", 0)])
+def test_free_memory_is_what_a_containers_limit_leaves(tmp_path, monkeypatch, limit, left):
+    for name, text in {"max": limit, "current": "3000", "stat": "anon 2000\ninactive_file 500"}.items():
+        (tmp_path / f"memory.{name}").write_text(f"{text}\n")
+    monkeypatch.setattr(memory, "LIMIT_FACTS", tmp_path)
+    assert memory.free_memory() == left
+
+
+def test_a_container_without_a_limit_has_what_the_machine_has(tmp_path, monkeypatch):
+    for name, text in {"max": "max", "current": "3000", "stat": "anon 2000"}.items():
+        (tmp_path / f"memory.{name}").write_text(f"{text}\n")
+    monkeypatch.setattr(memory, "LIMIT_FACTS", tmp_path)
+    assert memory.free_memory() > 2**28

@@ -1,0 +1,252 @@
+"""Collection: what replay is handed is what the environment did."""
+
+import numpy as np
+import pytest
+import torch
+
+from latentplan.config import CollectionConfig, UserError
+from latentplan.models import WorldModel
+from latentplan.training.callbacks import turn
+from latentplan.training.collection.collector import Collector
+
+
+def weights_of(config, seed=0):
+    torch.manual_seed(seed)
+    model = WorldModel(config.model, action_dim=1)
+    return {name: value.numpy() for name, value in model.state_dict().items()}
+
+
+@pytest.fixture
+def make_collector(tiny, dot):
+    collectors = []
+
+    def make(env=dot, /, **changes):
+        collectors.append(Collector(tiny("", **changes), env, "cpu"))
+        return collectors[-1]
+
+    yield make
+    for collector in collectors:
+        collector.close()
+
+
+def place_of(frames):
+    """Where the dot is, in [-1, 1], from frames (n, 64, 64, 3) of a picture of 16 columns."""
+    columns = frames[:, 0, :, 0].astype(float)
+    return ((columns * np.arange(64)).sum(1) / columns.sum(1) / 4.0 - 0.375 - 7.5) / 7.0
+
+
+def test_rows_follow_the_dynamics_of_the_environment(make_collector):
+    collected = make_collector().collect(None, "random", 45, 0)
+    (rows,) = collected.rows
+    assert len(rows.frames) == 47  # every frame once, and the last one of two episodes without an action
+    assert (collected.decisions, collected.env_frames, len(collected.episode_returns)) == (45, 45, 2)
+    assert np.flatnonzero(rows.is_first).tolist() == [0, 21, 42]
+    place = place_of(rows.frames)
+    goes_on = ~rows.is_first[1:]
+    expected = np.clip(place[:-1] + 0.2 * rows.actions[:-1, 0], -1.0, 1.0)
+    half_a_column = 1.0 / 7.0
+    assert np.abs(place[1:] - expected)[goes_on].max() <= half_a_column
+    assert np.abs(1.0 - np.abs(place[1:]) - rows.rewards[:-1])[goes_on].max() <= half_a_column
+    assert (rows.actions[[20, 41]] == 0.0).all() and (rows.rewards[[20, 41]] == 0.0).all()
+    assert collected.episode_returns == pytest.approx([rows.rewards[:20].sum(), rows.rewards[21:41].sum()], rel=1e-5)
+
+
+def test_rounds_continue_the_episode(make_collector):
+    whole, parts = make_collector(), make_collector()
+    (expected,) = whole.collect(None, "random", 30, 0).rows
+    first, second = (parts.collect(None, "random", 15, counter).rows[0] for counter in (0, 1))
+    joined = np.concatenate([first.is_first, second.is_first])
+    assert np.array_equal(joined, expected.is_first)
+    place = place_of(np.concatenate([first.frames[-1:], second.frames[:1]]))
+    assert place[1] == pytest.approx(np.clip(place[0] + 0.2 * first.actions[-1, 0], -1, 1), abs=1.0 / 7.0)
+
+
+def test_an_end_of_the_task_is_told_from_the_time_limit(make_collector, dot):
+    class Ending(dot):
+        def step(self, action):
+            picture, reward, _, truncated, info = super().step(action)
+            return picture, reward, self.steps == 4, truncated, info
+
+    (ending,) = make_collector(Ending).collect(None, "random", 8, 0).rows
+    assert ending.continues.tolist() == [1, 1, 1, 0, 1, 1, 1, 1, 0, 1]
+    (limited,) = make_collector().collect(None, "random", 45, 0).rows
+    assert (limited.continues == 1.0).all()
+
+
+def test_episodes_cut_short_restart_and_do_not_count_as_ends_of_the_task(make_collector):
+    collector = make_collector(collection={"episode_decisions": 8})
+    first, second = (collector.collect(None, "random", count, counter) for counter, count in enumerate((20, 10)))
+    (rows,), (later,) = first.rows, second.rows
+    assert np.flatnonzero(rows.is_first).tolist() == [0, 9, 18]
+    assert np.flatnonzero(later.is_first).tolist() == [5]  # the third episode goes on through the round's end
+    assert (rows.continues == 1.0).all() and (len(first.episode_returns), len(second.episode_returns)) == (2, 1)
+    assert first.episode_returns == pytest.approx([rows.rewards[:8].sum(), rows.rewards[9:17].sum()], rel=1e-5)
+
+
+def test_an_evaluation_goes_on_without_a_film_that_cannot_be_made(make_collector, tmp_path):
+    with pytest.warns(RuntimeWarning, match="no film at"):
+        returns = make_collector().evaluate(2, film=tmp_path / "missing" / "film.webm")
+    assert [len(returns[mode]) for mode in ("planner", "actor")] == [2, 2]
+
+
+def test_evaluations_are_whole_where_collection_is_cut_short(make_collector, tiny):
+    weights = weights_of(tiny(""))
+    cut, whole = make_collector(collection={"episode_decisions": 8}), make_collector()
+    assert cut.evaluate(2, weights=weights) == whole.evaluate(2, weights=weights)
+
+
+def test_beliefs_are_stored_beside_their_frames(make_collector, tiny):
+    collector = make_collector()
+    (rows,) = collector.collect(weights_of(tiny("")), "actor", 25, 0).rows
+    assert rows.deter.shape == (26, 16)
+    assert (rows.deter[[0, 21]] == 0.0).all()
+    assert (np.abs(rows.deter[1:20]).sum(1) > 0.0).all()
+
+
+@pytest.mark.parametrize("behaviour", ["planner", "actor"])
+def test_what_is_stored_of_an_agent_that_turns_its_frames_is_the_belief_of_those_stored(
+    make_collector, tiny, behaviour
+):
+    turns = {"model": {"turns": 4}, "learning": {"turned_share": 0.5}}
+    config, collector = tiny("", **turns), make_collector(**turns)
+    (rows,) = collector.collect(weights_of(config), behaviour, 10, 0).rows
+    frames, actions = torch.from_numpy(rows.frames), torch.from_numpy(rows.actions)
+    state = collector.model.see(torch.zeros(1, 16), frames[:1])
+    for time in range(1, 10):
+        state = collector.model.infer(state, actions[time - 1 : time], frames[time : time + 1])
+        assert np.allclose(rows.deter[time], state.deter.detach().numpy(), atol=1e-4)
+
+
+@pytest.mark.parametrize("behaviour", ["planner", "actor"])
+def test_collection_follows_from_seed_round_and_weights(make_collector, tiny, behaviour):
+    weights = weights_of(tiny(""))
+    one, same, other = (make_collector().collect(weights, behaviour, 12, counter).rows[0] for counter in (3, 3, 4))
+    assert np.array_equal(one.actions, same.actions) and np.array_equal(one.frames, same.frames)
+    assert not np.array_equal(one.actions, other.actions)
+    assert np.abs(one.actions).max() <= 1.0
+
+
+@pytest.mark.parametrize("behaviour", ["planner", "actor"])
+def test_a_round_without_noise_acts_as_agents_are_judged(make_collector, tiny, behaviour):
+    """Noise or none, nothing else differs: the noiseless round is that of an agent that has no noise to add."""
+    weights = weights_of(tiny(""))
+    noiseless, explored = (
+        make_collector().collect(weights, behaviour, 12, 3, noisy).rows[0] for noisy in (False, True)
+    )
+    assert not np.array_equal(noiseless.actions, explored.actions)
+    if behaviour == "planner":
+        (expected,) = make_collector(collection={"noise_std": 0.0}).collect(weights, behaviour, 12, 3).rows
+        assert np.array_equal(noiseless.actions, expected.actions)
+    else:  # the mode of the actor is a function of the frame and the past alone
+        (other,) = make_collector().collect(weights, behaviour, 12, 3, False).rows
+        assert np.array_equal(noiseless.actions, other.actions) and (np.abs(noiseless.actions) < 0.1).all()
+
+
+def _turns(count, **settings):
+    return [turn(CollectionConfig(**settings), rounds, 100 * rounds)[:2] for rounds in range(count)]
+
+
+def test_goals_take_their_share_in_turn_and_leave_the_rest_as_it_was():
+    settings = CollectionConfig(behaviour="both", noise_share=0.5, goals=("a", "b"), goal_share=0.2, goals_after=1000)
+    turns = [turn(settings, rounds, 100 * rounds) for rounds in range(60)]
+    assert all(goal is None for _, _, goal in turns[:10])
+    pursued = [entry for entry in turns[10:] if entry[2] is not None]
+    assert [goal for _, _, goal in pursued] == ["a", "b"] * 5
+    assert {who for who, _, _ in pursued} == {"planner"} and sum(noisy for _, noisy, _ in pursued) == 5
+    others = [entry[:2] for entry in turns[10:] if entry[2] is None]
+    assert {entry: others.count(entry) for entry in others} == {
+        (who, noisy): 10 for who in ("planner", "actor") for noisy in (True, False)
+    }
+
+
+def test_a_share_of_no_goals_is_refused():
+    with pytest.raises(ValueError, match="goal_share needs goals"):
+        CollectionConfig(goal_share=0.1)
+    with pytest.raises(ValueError, match="need a goal_share"):
+        CollectionConfig(goals=("upright",))
+
+
+def test_planner_and_actor_share_the_noise_evenly():
+    assert _turns(4, behaviour="actor") == [("actor", True)] * 4
+    assert _turns(4, behaviour="planner", noise_share=0.0) == [("planner", False)] * 4
+    turns = _turns(40, behaviour="both", noise_share=0.25)
+    assert {name: [who for who, _ in turns].count(name) for name in ("planner", "actor")} == {
+        "planner": 20,
+        "actor": 20,
+    }
+    assert [sum(noisy for who, noisy in turns if who == name) for name in ("planner", "actor")] == [5, 5]
+
+
+@pytest.fixture
+def make_cart(tiny):
+    collectors = []
+
+    def make(**collection):
+        config = tiny("", env={"domain": "cartpole", "task": "swingup"}, collection=collection)
+        collectors.append(Collector(config, None, "cpu"))
+        return collectors[-1]
+
+    yield make
+    for collector in collectors:
+        collector.close()
+
+
+def test_a_round_for_a_goal_plans_for_it_and_leaves_nothing_to_imitate(make_cart):
+    goals = ("cart -> 0.8", "cart -> -0.8")
+    both = make_cart(goals=goals, goal_share=0.5, noise_std=0.0)
+    weights = {name: value.numpy().copy() for name, value in both.model.state_dict().items()}
+    plain, *pursued = (
+        make_cart(goals=goals, goal_share=0.5, noise_std=0.0).collect(weights, "planner", 8, 0, True, goal).rows[0]
+        for goal in (None, *goals)
+    )
+    assert (plain.plan != 0.0).any() and all((rows.plan == 0.0).all() for rows in pursued)
+    assert not np.array_equal(plain.actions, pursued[0].actions)
+    assert not np.array_equal(pursued[0].actions, pursued[1].actions)
+    both.collect(weights, "planner", 8, 0, True, goals[0])
+    (after,) = both.collect(weights, "planner", 8, 1).rows
+    assert (after.plan != 0.0).any()
+
+
+@pytest.mark.parametrize(("goal", "said"), [("cart -> ", "expected"), ("height > 1.0", "height")])
+def test_goals_that_cannot_be_pursued_are_refused_before_anything_is_collected(make_cart, goal, said):
+    with pytest.raises(UserError, match=said):
+        make_cart(goals=("cart -> 0.5", goal), goal_share=0.5)
+
+
+def test_judging_neither_explores_nor_disturbs_the_collection(make_collector, tiny):
+    weights = weights_of(tiny(""))
+    judged, plain = make_collector(), make_collector()
+    for collector in (judged, plain):
+        collector.collect(weights, "planner", 7, 0)
+    first, again = judged.evaluate(2), judged.evaluate(2)
+    assert first == again and first.keys() == {"planner", "actor"}
+    assert all(len(returns) == 2 for returns in first.values())
+    following = [collector.collect(weights, "planner", 7, 1).rows[0] for collector in (judged, plain)]
+    assert np.array_equal(following[0].actions, following[1].actions)
+    assert np.array_equal(following[0].frames, following[1].frames)
+
+
+def test_the_last_frame_of_an_episode_has_labels_of_its_own(make_cart):
+    alone, followed = (make_cart(episode_decisions=5).collect(None, "random", n, 0).rows[0] for n in (5, 10))
+    assert followed.is_first[6] and np.array_equal(followed.labels[:6], alone.labels)
+    assert not np.array_equal(followed.labels[5], followed.labels[6])
+
+
+def test_several_environments_may_tell_lists_of_any_length(make_collector, dot):
+    class Telling(dot):
+        def step(self, action):
+            *rest, _ = super().step(action)
+            return *rest, {"trace": np.zeros(self.steps + int(10 * abs(self.place)))}
+
+    (first, second) = make_collector(Telling, env={"num_envs": 2}).collect(None, "random", 12, 0).rows
+    assert len(first.frames) == len(second.frames) == 6
+
+
+def test_a_step_that_failed_is_not_waited_for(make_collector, monkeypatch):
+    monkeypatch.setattr("latentplan.training.collection.collector.CLOSING_SECONDS", 0.2)
+    collector = make_collector(env={"num_envs": 2})
+    collector.collect(None, "random", 4, 0)
+    monkeypatch.setattr(collector.envs, "_add_info", lambda *_: 1 / 0)
+    with pytest.raises(ZeroDivisionError):
+        collector.collect(None, "random", 4, 1)
+    collector.close()

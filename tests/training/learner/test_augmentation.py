@@ -1,0 +1,105 @@
+"""Random shifts and quarter turns: one per sequence, as a whole."""
+
+import pytest
+import torch
+
+from latentplan.models import WorldModel
+from latentplan.training.learner.augmentation import (
+    quarter_turns,
+    random_shift,
+    shift_by_index,
+    shift_by_slices,
+    turn_by_index,
+    turn_by_slices,
+)
+from latentplan.training.learner.losses import world_model_loss
+
+
+def _frames() -> torch.Tensor:
+    """Pictures whose pixels tell their own row and column."""
+    rows, columns = torch.meshgrid(torch.arange(64), torch.arange(64), indexing="ij")
+    picture = torch.stack([rows, columns, torch.zeros_like(rows)], -1).to(torch.uint8)
+    return picture.expand(32, 3, 64, 64, 3)
+
+
+def _shifted(pixels: int, seed: int = 0) -> torch.Tensor:
+    return random_shift(_frames(), pixels, torch.Generator().manual_seed(seed))
+
+
+def test_no_pixels_change_nothing() -> None:
+    assert torch.equal(_shifted(0), _frames())
+
+
+@pytest.mark.parametrize("pixels", [1, 4])
+def test_every_sequence_moves_as_a_whole_and_repeats_its_border(pixels: int) -> None:
+    seen = set()
+    for sequence in _shifted(pixels):
+        down, right = (int(x) for x in sequence[0, 32, 32, :2].int() - torch.tensor([32, 32]))
+        expected = torch.stack(
+            [
+                (torch.arange(64) + down).clamp(0, 63).unsqueeze(1).expand(64, 64),
+                (torch.arange(64) + right).clamp(0, 63).expand(64, 64),
+            ],
+            -1,
+        )
+        assert (sequence[..., :2] == expected.to(torch.uint8)).all()
+        seen.add((down, right))
+    assert max(abs(move) for both in seen for move in both) == pixels
+    assert len(seen) > 2 * pixels
+
+
+def test_the_moves_are_those_of_the_generator() -> None:
+    assert torch.equal(_shifted(4), _shifted(4))
+    assert not torch.equal(_shifted(4), _shifted(4, seed=1))
+
+
+def test_the_encoder_sees_moved_frames_and_the_decoder_paints_them_unmoved(batch, tiny) -> None:
+    config = tiny("", learning={"random_shift": 4})
+    model = WorldModel(config.model, 1)
+    seen, painted = [], []
+    model.encoder.register_forward_pre_hook(lambda _, arguments: seen.append(arguments[0]))
+    loss = model.decoder.loss
+    model.decoder.loss = lambda patches, frames: painted.append(frames) or loss(patches, frames)
+    world_model_loss(model, batch, config.learning, torch.Generator().manual_seed(3))
+    moved = random_shift(batch.frames, 4, torch.Generator().manual_seed(3))
+    assert torch.equal(seen[0], moved.flatten(0, 1)) and not torch.equal(moved, batch.frames)
+    assert torch.equal(painted[0], batch.frames.flatten(0, 1))
+
+
+def _turned(batch, share, seed=0):
+    return quarter_turns(batch, share, torch.Generator().manual_seed(seed))
+
+
+def test_sequences_turn_as_a_whole_and_forget_their_belief(batch):
+    batch = batch._replace(deter=torch.ones_like(batch.deter))
+    seen = set()
+    for seed in range(8):
+        turned, is_same = _turned(batch, 0.5, seed)
+        for index, same in enumerate(is_same.tolist()):
+            fitting = [
+                amount
+                for amount in range(4)
+                if torch.equal(turned.frames[index], torch.rot90(batch.frames[index], amount, (1, 2)))
+            ]
+            assert len(fitting) == 1 and (fitting[0] == 0) == same
+            assert (turned.deter[index] == float(same)).all()
+            seen.add(fitting[0])
+        others = turned._replace(frames=batch.frames, deter=batch.deter)
+        assert all(torch.equal(one, other) for one, other in zip(others, batch, strict=True))
+    assert seen == {0, 1, 2, 3}
+
+
+def test_a_share_of_nothing_turns_nothing_and_draws_nothing(batch):
+    generator = torch.Generator().manual_seed(1)
+    turned, unturned = quarter_turns(batch, 0.0, generator)
+    assert turned is batch and unturned.all()
+    assert generator.get_state().equal(torch.Generator().manual_seed(1).get_state())
+    assert not _turned(batch, 1.0)[1].any()
+
+
+def test_what_a_gpu_does_and_what_a_cpu_does_are_the_same(batch):
+    frames, generator = batch.frames, torch.Generator().manual_seed(2)
+    offsets = torch.randint(9, (len(frames), 2), generator=generator)
+    assert torch.equal(shift_by_index(frames, offsets, 4), shift_by_slices(frames, offsets, 4))
+    amounts = torch.arange(len(frames)) % 4
+    assert torch.equal(turn_by_index(frames, amounts), turn_by_slices(frames, amounts))

@@ -1,0 +1,211 @@
+"""The whole update of a GPU: the same as one after the other, with nothing read back."""
+
+import copy
+
+import numpy as np
+import pytest
+import torch
+from torch.utils._python_dispatch import TorchDispatchMode
+
+from latentplan.config import Config, LearningConfig, ReplayConfig, UserError
+from latentplan.models import WorldModel
+from latentplan.replay.buffer import Replay, Rows
+from latentplan.training.learner import augmentation
+from latentplan.training.learner.graphed import WARM_UP_UPDATES, GraphedLearner
+from latentplan.training.learner.module import Learner
+from latentplan.training.learner.optimization import take_up
+
+SETTINGS = {"turned_share": 0.5, "random_shift": 2, "imitation_scale": 0.1}
+LABELS = {"height": 0.5, "task.stand": 0.5}
+
+
+class OwnOptimizers:
+    """Holds the optimizers, so that it updates without a Trainer."""
+
+    def optimizers(self, use_pl_optimizer=True):
+        self.__dict__.setdefault("own", self.configure_optimizers())
+        return self.own
+
+
+class Plain(OwnOptimizers, Learner):
+    """One after the other, from batches."""
+
+
+class Graphed(OwnOptimizers, GraphedLearner):
+    """All at once, from rows."""
+
+
+def prepared(batch):
+    """Rewards that are not the stored ones."""
+    return batch._replace(rewards=batch.rewards + 1.0)
+
+
+def filled(device):
+    replay = Replay(40, 1, 16, 1, torch.device(device), num_labels=2)
+    rng = np.random.default_rng(0)
+    rows = Rows(
+        frames=rng.integers(0, 256, (40, 64, 64, 3), dtype=np.uint8),
+        deter=rng.normal(size=(40, 16)),
+        actions=rng.uniform(-1, 1, (40, 1)).astype(np.float32),
+        rewards=rng.uniform(-1, 1, 40).astype(np.float32),
+        continues=np.ones(40, np.float32),
+        is_first=np.arange(40) % 20 == 0,
+        labels=rng.normal(size=(40, 2)).astype(np.float32),
+        plan=rng.uniform(0.1, 0.5, (40, 2)).astype(np.float32),
+    )
+    replay.add(0, rows)
+    return replay
+
+
+def learner_of(kind, tiny, device="cpu", **more):
+    torch.manual_seed(0)
+    config = tiny("", learning=SETTINGS)
+    model = WorldModel(config.model, 1, LABELS)
+    return kind(model.to(device), config.learning, 0.9, filled(device), seed=0, **more).to(device)
+
+
+def graphed(tiny, device="cpu"):
+    return learner_of(Graphed, tiny, device, prepare=prepared)
+
+
+def draws(replay, count):
+    rng = np.random.default_rng(1)
+    return [replay.draw(4, 5, rng) for _ in range(count)]
+
+
+def assert_same(left, right):
+    pairs = zip(left.state_dict().items(), right.state_dict().items(), strict=True)
+    assert all(name == other and torch.equal(one, two) for (name, one), (other, two) in pairs)
+    assert torch.equal(left.replay.deter, right.replay.deter)
+
+
+def test_it_learns_what_the_two_halves_learn_one_after_the_other(tiny):
+    plain, whole = learner_of(Plain, tiny), graphed(tiny)
+    for rows in draws(plain.replay, 5):
+        plain.training_step(prepared(plain.replay.gather(rows)), 0)
+        plain.catch_up()
+        whole.training_step(rows, 0)
+        whole.catch_up()
+    assert_same(plain, whole)
+    assert plain.updates == whole.updates == 5
+    assert all(torch.equal(whole.metrics[name], value) for name, value in plain.metrics.items())
+
+
+def test_what_is_not_finite_changes_no_weights_and_is_told(tiny):
+    whole = graphed(tiny)
+    good, bad = draws(whole.replay, 2)
+    whole.training_step(good, 0)
+    before, rewards = copy.deepcopy(whole.state_dict()), whole.replay.rewards.clone()
+    beliefs = whole.replay.deter.clone()
+    whole.replay.rewards[bad[0, 2]] = float("nan")
+    whole.training_step(bad, 0)
+    weights = {name: value for name, value in whole.state_dict().items() if name.startswith("model.")}
+    assert weights and all(torch.equal(before[name], value) for name, value in weights.items())
+    assert all(value.isfinite().all() for value in whole.state_dict().values())
+    assert torch.equal(whole.replay.deter, beliefs)
+    with pytest.warns(RuntimeWarning, match="1 of the last 2 updates, up to update 2, .* were skipped"):
+        whole.catch_up()
+    whole.replay.rewards.copy_(rewards)
+    whole.training_step(good, 0)
+    whole.catch_up()
+    assert not torch.equal(before["model.actor.mlp.output.bias"], whole.model.actor.mlp.output.bias)
+    whole.replay.rewards.fill_(float("nan"))
+    whole.training_step(bad, 0)
+    with pytest.raises(FloatingPointError, match="1 of the last 1 updates, up to update 4"):
+        whole.catch_up()
+
+
+class NothingRead(TorchDispatchMode):
+    """Refuses what a graph cannot record: values that the host reads, and results whose size depends on values.
+
+    Not what `torch.quantile` reads of its own argument: torch 2.11 does on a CPU, and no torch on a GPU.
+    """
+
+    in_quantile = False
+
+    def __torch_dispatch__(self, func, types, args=(), kwargs=None):
+        if func is torch.ops.aten.index.Tensor:
+            refused = any(index is not None and index.dtype == torch.bool for index in args[1])
+        elif func is torch.ops.aten.equal.default and NothingRead.in_quantile:
+            refused = False
+        else:
+            refused = {torch.Tag.data_dependent_output, torch.Tag.dynamic_output_shape} & set(func.tags)
+        if refused:
+            raise AssertionError(f"{func} reads a value")
+        return func(*args, **(kwargs or {}))
+
+
+@pytest.fixture
+def watched(tiny, monkeypatch):
+    """A learner whose pictures move as they do on a GPU, after an update."""
+    for name in ("shift", "turn"):
+        monkeypatch.setattr(augmentation, f"{name}_by_slices", getattr(augmentation, f"{name}_by_index"))
+    quantile = torch.quantile
+
+    def marked(*arguments):
+        NothingRead.in_quantile = True
+        try:
+            return quantile(*arguments)
+        finally:
+            NothingRead.in_quantile = False
+
+    monkeypatch.setattr(torch, "quantile", marked)
+    learner = graphed(tiny)
+    learner.training_step(*draws(learner.replay, 1), 0)
+    return learner
+
+
+def test_nothing_is_read_back_from_the_gpu(watched):
+    with NothingRead():
+        outputs = watched.update(torch.Generator())
+    assert {"reconstruction", "probe", "actor", "imitation", "model_grad_norm", "behaviour_grad_norm"} <= set(outputs)
+
+
+@pytest.mark.parametrize("part", ["descent", "number", "choice"])
+def test_a_reading_would_be_found(watched, monkeypatch, part):
+    if part == "descent":
+        monkeypatch.setattr(Graphed, "_descend", Learner._descend)
+    elif part == "number":
+        monkeypatch.setattr(
+            watched, "prepare", lambda batch: batch._replace(rewards=batch.rewards * batch.rows.max().item())
+        )
+    else:
+        monkeypatch.setattr(
+            watched, "prepare", lambda batch: batch._replace(deter=batch.deter[batch.deter[:, 0] > -9.0])
+        )
+    with NothingRead(), pytest.raises(AssertionError, match="reads a value"):
+        watched.update(torch.Generator())
+
+
+def test_a_graph_needs_replay_where_it_runs():
+    with pytest.raises(UserError, match="cuda_graph needs replay.on_device"):
+        Config(learning=LearningConfig(cuda_graph=True))
+    Config(learning=LearningConfig(cuda_graph=True), replay=ReplayConfig(on_device=True))
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
+def test_what_is_replayed_is_what_is_run(tiny):
+    """Recorded once and again, where values begin anew, the graph learns what the same update learns without it."""
+    plain, whole = learner_of(Plain, tiny, "cuda"), graphed(tiny, "cuda")
+    for number, rows in enumerate(draws(plain.replay, 4 * WARM_UP_UPDATES)):
+        if number == 2 * WARM_UP_UPDATES:
+            plain.forget_values()
+            whole.forget_values()
+        plain.training_step(prepared(plain.replay.gather(rows)), 0)
+        plain.catch_up()
+        whole.training_step(rows, 0)
+    whole.catch_up()
+    for (name, one), (_, two) in zip(plain.state_dict().items(), whole.state_dict().items(), strict=True):
+        torch.testing.assert_close(one, two, rtol=1e-3, atol=1e-4, msg=name)
+
+
+def test_an_optimizer_goes_on_on_another_device_as_that_device_wants_it():
+    weight = torch.nn.Parameter(torch.ones(2))
+    saved, goes_on = (torch.optim.Adam([weight], lr=1e-3, fused=True) for _ in range(2))
+    weight.grad = torch.ones(2)
+    saved.step()
+    state = saved.state_dict()
+    state["param_groups"][0]["capturable"] = True
+    take_up(goes_on, state)
+    assert goes_on.param_groups[0]["capturable"] is False
+    assert torch.equal(goes_on.state[weight]["exp_avg"], saved.state[weight]["exp_avg"])

@@ -1,0 +1,130 @@
+"""The learner: model and behaviour side by side, as if one after the other."""
+
+from pathlib import Path
+
+import pytest
+import torch
+
+from latentplan.models import WorldModel
+from latentplan.replay.buffer import Replay
+from latentplan.training.learner.module import Learner
+from latentplan.training.state import restore
+
+
+class Standalone(Learner):
+    """A learner that holds its own optimizers, so that it updates without a Trainer."""
+
+    def optimizers(self, use_pl_optimizer=True):
+        self.__dict__.setdefault("own", self.configure_optimizers())
+        return self.own
+
+
+def standalone(tiny, **learning):
+    torch.manual_seed(0)
+    config = tiny("", learning=learning)
+    model = WorldModel(config.model, action_dim=1)
+    return Standalone(model, config.learning, 0.9, Replay(24, 1, 16, 1, torch.device("cpu")), seed=0)
+
+
+def test_behaviour_learns_each_batch_from_the_model_as_the_same_batch_left_it(batch, tiny):
+    """Side by side the two halves give exactly what they give one after the other."""
+    overlapped, in_turn = standalone(tiny), standalone(tiny)
+    for _ in range(4):
+        overlapped.training_step(batch, 0)
+        in_turn.training_step(batch, 0)
+        in_turn.catch_up()
+    overlapped.catch_up()
+    weights, expected = overlapped.model.state_dict(), in_turn.model.state_dict()
+    assert all(torch.equal(weights[name], expected[name]) for name in expected)
+    assert overlapped.metrics.keys() == in_turn.metrics.keys() >= {"actor", "reconstruction"}
+
+
+def test_an_update_changes_model_and_behaviour_and_their_snapshot(batch, tiny):
+    learner = standalone(tiny)
+    before = {name: value.clone() for name, value in learner.model.state_dict().items()}
+    learner.training_step(batch, 0)
+    moved = {name for name, value in learner.model.state_dict().items() if not torch.equal(value, before[name])}
+    assert any(name.startswith("dynamics") for name in moved)
+    assert not any(name.startswith(("actor", "value_head")) for name in moved)
+    learner.catch_up()
+    assert not torch.equal(learner.model.actor.mlp.output.weight, before["actor.mlp.output.weight"])
+    frozen, own = learner.snapshot.model, learner.model
+    assert torch.equal(frozen.dynamics.gates.weight, own.dynamics.gates.weight.bfloat16())
+    assert torch.equal(frozen.reward_head.mlp.output.weight, own.reward_head.mlp.output.weight)
+    assert frozen.actor is own.actor and not frozen.dynamics.gates.weight.requires_grad
+
+
+def test_what_fails_in_behaviour_is_raised_in_the_update(batch, tiny):
+    learner = standalone(tiny)
+    learner.training_step(batch, 0)
+    with torch.no_grad():
+        learner.model.value_head.mlp.output.bias.fill_(float("nan"))
+    with pytest.raises(FloatingPointError, match="not finite"):
+        learner.catch_up()
+
+
+@pytest.mark.parametrize("share", [0.0, 1.0])
+def test_beliefs_of_turned_sequences_are_not_kept(batch, tiny, share):
+    learner = standalone(tiny, turned_share=share)
+    learner.training_step(batch, 0)
+    assert (learner.replay.deter[batch.rows] == 0.0).all() == (share == 1.0)
+
+
+def test_a_value_that_is_forgotten_begins_anew_and_nothing_else_does(batch, tiny):
+    learner = standalone(tiny)
+    for _ in range(3):
+        learner.training_step(batch, 0)
+        learner.catch_up()
+    before = {name: value.clone() for name, value in learner.model.state_dict().items()}
+    learner.forget_values()
+    fresh = learner.model.value_head.mlp.output.bias.clone()
+    assert torch.equal(learner.averaged.value_head.mlp.output.bias, fresh)
+    changed = {name for name, value in learner.model.state_dict().items() if not torch.equal(value, before[name])}
+    assert changed and all(name.startswith("value_head") for name in changed)
+    twin = learner.model.value_head.state_dict()
+    assert all(torch.equal(value, twin[name]) for name, value in learner.target_value.state_dict().items())
+    held = set(learner.optimizers()[1].state)
+    assert held == set(learner.model.actor.parameters())
+    assert learner.model.value_head.mean(learner.model.value_head(torch.ones(1, 48))).abs() < 1e-3
+    learner.training_step(batch, 0)
+    learner.catch_up()
+    assert set(learner.optimizers()[1].state) > held
+
+
+def averages_of(learner, batch, updates):
+    """The weights of all updates, oldest first, and what they were on average after each."""
+    seen = []
+    for _ in range(updates):
+        learner.training_step(batch, 0)
+        learner.catch_up()
+        seen.append(
+            [{name: value.clone() for name, value in m.state_dict().items()} for m in (learner.model, learner.averaged)]
+        )
+    return seen
+
+
+def test_what_is_kept_is_the_average_of_the_latest_weights(batch, tiny):
+    seen = averages_of(standalone(tiny, average_rate=0.4), batch, 30)
+    for name in ("dynamics.gates.weight", "actor.mlp.output.weight", "value_head.mlp.output.bias"):
+        weights, averages = ([pair[which][name] for pair in seen] for which in (0, 1))
+        assert torch.equal(averages[9], weights[9])  # the last tenth of ten is one
+        torch.testing.assert_close(averages[19], averages[18] + 0.5 * (weights[19] - averages[18]))
+        torch.testing.assert_close(averages[29], averages[28] + 0.4 * (weights[29] - averages[28]))
+
+
+def test_without_averaging_the_latest_is_kept(batch, tiny):
+    latest, averaged = averages_of(standalone(tiny, average_rate=1.0), batch, 12)[-1]
+    assert all(torch.equal(averaged[name], value) for name, value in latest.items())
+
+
+def test_a_run_saved_before_weights_were_averaged_begins_its_average_where_it_is(batch, tiny):
+    learner, resumed = standalone(tiny), standalone(tiny)
+    averages_of(learner, batch, 12)
+    saved = {name: value for name, value in learner.state_dict().items() if not name.startswith("averaged")}
+    restore(resumed, {"weights": saved, "updates": 12}, Path("run"))
+    assert resumed.averaged_updates.tolist() == [0.0, 0.0]
+    latest = learner.model.state_dict()
+    assert all(torch.equal(value, latest[name]) for name, value in resumed.averaged.state_dict().items())
+    restore(resumed, {"weights": learner.state_dict(), "updates": 12}, Path("run"))
+    kept = learner.averaged.state_dict()
+    assert all(torch.equal(value, kept[name]) for name, value in resumed.averaged.state_dict().items())
