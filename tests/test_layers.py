@@ -29,7 +29,7 @@ ROOMS = {
     ),
     "commands": (
         (*BELOW_AGENTS, "envs", "agents", "evaluation", "reporting", "training"),
-        {"torch", "numpy", "rich", "jsonargparse", "shtab", "yaml", *SIMULATION, "cv2", "lightning", "docstring_parser"},
+        {"torch", "numpy", "rich", "jsonargparse", "shtab", *SIMULATION, "cv2", "lightning"},
     ),
     "__init__": (("agents",), set()),
     "__main__": (("commands",), set()),

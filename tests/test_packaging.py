@@ -57,7 +57,7 @@ def test_new_pythons_get_all_that_dm_control_needs_but_labmaze():
 
 def test_every_subpackage_is_packaged():
     listed = set(PROJECT["tool"]["setuptools"]["packages"])
-    found = {f"latentplan.{path.parent.name}" for path in (ROOT / "latentplan").glob("*/*.py")}
+    found = {".".join(path.relative_to(ROOT).parent.parts) for path in (ROOT / "latentplan").rglob("*.py")}
     assert {"latentplan", "latentplan.configs", *found} == listed
 
 

@@ -9,8 +9,8 @@ import pytest
 import torch
 from safetensors.torch import load_file, save_file
 
-import latentplan
 from latentplan.agents.checkpoint import load_agent, load_model, read_info, resolve_checkpoint, save_checkpoint
+from latentplan.agents.planning import PlanningAgent
 from latentplan.config import Config, EnvConfig, ModelConfig, PlannerConfig, UserError
 from latentplan.models import WorldModel
 
@@ -75,7 +75,7 @@ def test_an_agent_acts_the_same_each_time_it_is_loaded(folder, mode):
 
 
 def test_an_agent_acts_as_before_it_was_saved(model, folder):
-    before = latentplan.agents.base.PlanningAgent(model, CONFIG, 0.9)
+    before = PlanningAgent(model, CONFIG, 0.9)
     assert np.array_equal(history(before), history(load_agent(folder)))
     assert load_agent(folder).encode(FRAMES[0]).shape == (32,)
 

@@ -17,6 +17,7 @@ from latentplan.agents.random import RandomAgent
 from latentplan.commands import evaluate, evaluation_request
 from latentplan.config import USER_DOMAIN, Config, EnvConfig, ModelConfig, PlannerConfig, UserError
 from latentplan.envs import make_env
+from latentplan.evaluation import evaluate_agent
 from latentplan.models import WorldModel
 
 ENV = EnvConfig(domain="cartpole", task="swingup", action_repeat=100, render_quality="fastest")
@@ -142,7 +143,7 @@ def test_filming_changes_no_return(tmp_path, checkpoint):
 def test_evaluate_agent_pairs_agents_by_episode():
     env = make_env(ENV)
     try:
-        first, again = (evaluate.evaluate_agent(RandomAgent(1), env, seed=3, episodes=3) for _ in range(2))
+        first, again = (evaluate_agent(RandomAgent(1), env, seed=3, episodes=3) for _ in range(2))
     finally:
         env.close()
     assert first["returns"] == again["returns"]

@@ -7,7 +7,8 @@ import pytest
 import torch
 
 from latentplan.config import UserError
-from latentplan.replay.buffer import Replay, memory, replay_bytes
+from latentplan.replay import memory
+from latentplan.replay.buffer import Replay, replay_bytes
 from tests.replay.replay_clock import CPU, Clock, filled, make_replay, sample, told
 
 

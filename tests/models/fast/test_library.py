@@ -94,7 +94,7 @@ def test_gradients_pass_where_they_are_asked_for():
 
 @compiled
 def test_a_machine_without_a_compiler_or_with_a_broken_one_goes_on_in_torch(tmp_path):
-    program = "from latentplan.models import kernels; print(kernels.load())"
+    program = "from latentplan.models.fast import library; print(library.load())"
     for settings in ({"CC": "false"}, {"CC": "/nowhere/cc"}, {"LATENTPLAN_KERNELS": "0"}):
         environment = {"XDG_CACHE_HOME": str(tmp_path), "PYTHONPATH": ".", **settings}
         done = subprocess.run([sys.executable, "-c", program], env=environment, capture_output=True, text=True)

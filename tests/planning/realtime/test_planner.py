@@ -134,7 +134,7 @@ def test_what_the_search_raises_surfaces_with_type_message_and_place(running):
         assert running.request(THROWS, 0)
         with pytest.raises(KeyError, match="no such plan") as caught:
             wait_for_plan(running)
-        assert "test_realtime.py" in str(caught.value.__cause__)
+        assert "test_planner.py" in str(caught.value.__cause__)
 
 
 def test_an_error_that_cannot_travel_keeps_its_name_and_message(running):
@@ -234,7 +234,7 @@ def test_the_program_ends_though_nobody_closed_and_leaves_no_process(run_python,
     (tmp_path / "program.py").write_text(
         "import torch\n"
         "from latentplan.planning import BackgroundPlanner\n"
-        "from tests.planning.test_realtime import HANGS, MODEL, Scripted\n"
+        "from tests.planning.realtime.test_planner import HANGS, MODEL, Scripted\n"
         "if __name__ == '__main__':\n"
         "    background = BackgroundPlanner(Scripted(), MODEL)\n"
         "    background.wait_until_ready(60.0)\n"

@@ -10,8 +10,7 @@ from latentplan.agents.checkpoint import load_agent, load_model, read_info, save
 from latentplan.agents.planning import PlanningAgent
 from latentplan.config import DistillConfig, PlannerConfig, UserError
 from latentplan.models import Gaussian, State, WorldModel
-from latentplan.training import resume_distillation
-from latentplan.training.distillation import run as distill
+from latentplan.training import distill, resume_distillation
 from latentplan.training.distillation.comparison import Comparison
 from latentplan.training.distillation.labels import Demonstrations, plan_actions
 from latentplan.training.distillation.standing import STATE_FILE

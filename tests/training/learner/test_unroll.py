@@ -4,13 +4,13 @@ from types import SimpleNamespace
 
 import pytest
 import torch
-from tests.training.learner.test_graphed import draws, graphed
 
 from latentplan.models import State, WorldModel
 from latentplan.models.dynamics import Rssm
 from latentplan.models.fast import unroll
 from latentplan.models.heads import Actor
 from latentplan.training.learner import losses
+from tests.training.learner.test_graphed import draws, graphed
 
 ROWS, TIME = 4, 6
 SIZES = {"latent_dim": 5, "deter_dim": 12, "hidden_dim": 10, "action_dim": 3}
