@@ -14,8 +14,7 @@ from latentplan.models import State, WorldModel
 from latentplan.models.fast import reflex
 from latentplan.models.symmetry import TurnedModel, flat, folded, per_turn, turned, unturned
 from latentplan.objectives.expression import Expression
-from latentplan.objectives.image import read_goal
-from latentplan.objectives.objective import plan_goals
+from latentplan.objectives.objective import plan_goals, read_goal_image
 from latentplan.planning import CEMPlanner
 from latentplan.planning.objectives import Constraint, Term
 
@@ -132,7 +131,7 @@ class ModelAgent:
 
     def _encode_goal(self, path: str) -> Tensor:
         """The latents of a picture's turns, (turn, latent)."""
-        return self._glance(turned(self._check(read_goal(path)[None]), self._turns))
+        return self._glance(turned(self._check(read_goal_image(path)[None]), self._turns))
 
     def _glance(self, frames: Tensor) -> Tensor:
         """Latents (batch, latent) of frames seen without a past."""

@@ -26,7 +26,7 @@ from latentplan.objectives.expression import (
     evaluate,
     shortfall,
 )
-from latentplan.objectives.image import read_goal
+from latentplan.objectives.objective import read_goal_image
 from latentplan.objectives.parser import parse_constraints, parse_schedule
 
 if TYPE_CHECKING:
@@ -89,7 +89,7 @@ def read_goals(objective: str | None, constraint: str | None, domain: str) -> Go
     phases = () if objective is None else parse_schedule(objective, known)
     constraints = () if constraint is None else parse_constraints(constraint, known)
     for path in {path for phase in phases for path in _goal_paths(phase.objective)}:
-        read_goal(path)
+        read_goal_image(path)
     return Goals(phases, constraints, objective, constraint)
 
 
@@ -120,7 +120,9 @@ class ScoredEnv(gymnasium.Wrapper[Any, Any, Any, Any]):
         self.clauses: list[tuple[str, bool]] = []
         self._on_objective = on_objective
         self._names = quantity_names(env.domain, "")
-        self._pictures = {path: read_goal(path) for phase in goals.phases for path in _goal_paths(phase.objective)}
+        self._pictures = {
+            path: read_goal_image(path) for phase in goals.phases for path in _goal_paths(phase.objective)
+        }
         self._present: Phase | None = None
         self._num_frames = self._num_violated = 0
         self._totals = np.zeros(len(self._names))

@@ -1,1 +1,1 @@
-"""Goals named after training: a small language, and what a search maximises for it."""
+"""Objectives and constraints chosen after training: the language, its parser, and what a planner maximises for them."""

@@ -1,8 +1,8 @@
-"""Boxes: goals that ask quantities to lie within intervals, which an agent can learn to pursue before it is asked.
+"""Boxes: goals that ask quantities to lie within intervals, and the world model as it looks for one such goal.
 
-Most expressions are one: `speed -> -1.0 and height > 1.1` asks `speed` into [-1, -1] and `height` into [1.1, inf).
-What such a goal is worth is predicted from the latent, its value and its actor are those that were learned for boxes
-drawn at random (universal value functions, Schaul et al. 2015).
+Most objectives are boxes: `speed -> -1.0 and height > 1.1` asks for `speed` in [-1, -1] and `height` in [1.1, inf). A
+goal-conditioned agent learns a value and an actor for boxes drawn at random (universal value functions, Schaul et al.
+2015), so it can pursue any box without more training. The reward of a box is computed from predicted quantities.
 """
 
 from __future__ import annotations
@@ -21,48 +21,51 @@ from latentplan.planning.model import repeat_rows, take_step
 Interval = tuple[float, float]
 
 
-def paid_degree(shortfalls: Tensor) -> Tensor:
-    """How far a clause is met, in [0, 1], as the simulator scores it: 1 where it is, 0.1 where one margin is missing.
+def scoring_degree(shortfalls: Tensor) -> Tensor:
+    """Degree to which a clause is met, in [0, 1], as the simulator scores it: 1 if met, 0.1 at a shortfall of 1 margin.
 
     Args:
-        shortfalls: In margins, any shape; 0 and below is met.
+        shortfalls: Shortfalls in margins, any shape; a clause is met at 0 and below.
     """
     return torch.exp(math.log(0.1) * shortfalls.clamp_min(0.0).square())
 
 
-def plan_degree(shortfalls: Tensor) -> Tensor:
-    """How far a clause is met, in (0, 1], with a slope wherever it is not.
+def planning_degree(shortfalls: Tensor) -> Tensor:
+    """Degree to which a clause is met, in (0, 1], with a slope wherever the clause is not met.
 
-    The mean of the Gaussian that scores and of 1 / (1 + x), which falls slowly.
+    The degree is the mean of `scoring_degree` and of 1 / (1 + shortfall), which falls slowly, so that a search far from
+    the goal still finds the direction.
 
     Args:
-        shortfalls: In margins, any shape; 0 and below is met.
+        shortfalls: Shortfalls in margins, any shape; a clause is met at 0 and below.
     """
-    return 0.5 * (paid_degree(shortfalls) + 1.0 / (1.0 + shortfalls.clamp_min(0.0)))
+    return 0.5 * (scoring_degree(shortfalls) + 1.0 / (1.0 + shortfalls.clamp_min(0.0)))
 
 
 def box_degree(low: Tensor, high: Tensor, values: Tensor, scales: Tensor) -> Tensor:
-    """How far quantities lie in a box, in (0, 1]: the product of the degrees of its intervals.
+    """Degree to which quantities lie in a box, in (0, 1]: the product of the degrees of its intervals.
 
     Args:
-        low: Lower ends, -inf where open, (..., quantity), as all of these broadcast.
-        high: Upper ends, inf where open.
-        values: Of the quantities.
-        scales: What counts as one margin, (quantity,).
+        low: Lower ends of the intervals, -inf where open, (..., quantity); broadcasts with `high` and `values`.
+        high: Upper ends of the intervals, inf where open, (..., quantity).
+        values: Values of the quantities, (..., quantity).
+        scales: Margin of each quantity, (quantity,).
 
     Returns:
         Degrees, (...).
     """
-    return plan_degree(torch.maximum(low - values, values - high) / scales).prod(-1)
+    return planning_degree(torch.maximum(low - values, values - high) / scales).prod(-1)
 
 
 def box_of(expression: Expression, quantities: Sequence[str]) -> dict[str, Interval] | None:
-    """The box that an expression asks for, its intervals by quantity; None where it asks for something else.
+    """The box that an expression asks for, as intervals by quantity; None if the expression is not a box.
+
+    An expression is a box if it is one term of clauses joined by `and`, each between a quantity, or its absolute value,
+    and a number. A positive weight of the only term does not change the best plan and is ignored.
 
     Args:
-        expression: Clauses between one of the quantities, or its absolute value, and a number, joined by `and`. A
-            weight makes no difference to who pursues nothing else.
-        quantities: Those that a box can hold.
+        expression: The objective.
+        quantities: Names of the quantities that a box can hold.
     """
     if len(expression.terms) != 1 or expression.terms[0][0] <= 0.0:
         return None
@@ -72,28 +75,28 @@ def box_of(expression: Expression, quantities: Sequence[str]) -> dict[str, Inter
         if found is None:
             return None
         name, (low, high) = found
-        least, most = box.get(name, (-math.inf, math.inf))
-        low, high = max(low, least), min(high, most)
+        earlier_low, earlier_high = box.get(name, (-math.inf, math.inf))
+        low, high = max(low, earlier_low), min(high, earlier_high)
         if low > high:
-            return None  # no value of the quantity is in both
+            return None  # the two intervals of this quantity do not meet
         box[name] = low, high
     return box
 
 
 @dataclass(frozen=True)
 class BoxView:
-    """Shows a world model with heads for goals as one that is paid for lying in a box; see `conditioned`.
+    """Turns a world model with goal heads into a model whose reward is the degree of a box; for `conditioned`.
 
     Attributes:
-        intervals: By quantity.
-        frames_per_step: Env frames that one imagined step stands for.
+        intervals: Lower and upper end by quantity; quantities without an interval are open.
+        frames_per_step: Env frames per model step.
     """
 
     intervals: Mapping[str, Interval]
     frames_per_step: int
 
     def __call__(self, model: Any) -> BoxModel:
-        """The model as seen by one who pursues the box."""
+        """The model with reward, value and policy of the box."""
         open_ends = (-math.inf, math.inf)
         ends = [self.intervals.get(name, open_ends) for name in model.goal_names]
         low, high = torch.tensor(ends, device=model.device).unbind(-1)
@@ -101,13 +104,13 @@ class BoxView:
 
 
 class BoxModel:
-    """A world model whose reward is the worth of a box, with the value and the actor that were learned for boxes.
+    """A world model whose reward is the degree of a box, with the value and the actor that were learned for boxes.
 
     Args:
-        model: With `goal_heads`, `goal_names` and `probe`.
+        model: World model with `goal_heads`, `goal_names` and `probe`.
         low: Lower ends of the intervals, (quantity,).
-        high: Upper ends.
-        frames_per_step: Env frames that one step stands for.
+        high: Upper ends of the intervals, (quantity,).
+        frames_per_step: Env frames per model step.
     """
 
     def __init__(self, model: Any, low: Tensor, high: Tensor, frames_per_step: int) -> None:
@@ -121,31 +124,31 @@ class BoxModel:
         return predicted
 
     def step(self, state: Any, action: Tensor) -> tuple[Any, Tensor]:
-        """The next state, and what it is worth in the box, (rows,)."""
-        following, _ = self.model.step(state, action)
-        return following, self._worth(following.features)
+        """The next state, and the reward of the box in that state, (rows,)."""
+        next_state, _ = self.model.step(state, action)
+        return next_state, self._reward(next_state.features)
 
     def fast_step(self, state: Any, action: Tensor) -> tuple[Any, Tensor]:
-        """`step`, compiled where that can be, without gradients."""
-        following, _ = self.model.fast_step(state, action)
-        return following, self._worth(following.features)
+        """`step` without gradients, on the fast path of the model where it has one."""
+        next_state, _ = self.model.fast_step(state, action)
+        return next_state, self._reward(next_state.features)
 
     def rollout(self, state: Any, actions: Tensor) -> tuple[Tensor, Any]:
-        """Worth (rows, time) along actions (rows, time, action), and the last state; quantities are read at once."""
+        """Rewards (rows, time) along actions (rows, time, action), and the last state."""
         features = []
         for action in actions.unbind(1):
             state, _ = take_step(self.model, state, action)
             features.append(state.features)
-        return self._worth(torch.stack(features, 1)), state
+        return self._reward(torch.stack(features, 1)), state  # one call of the goal heads for all steps
 
     def value(self, state: Any) -> Tensor:
-        """Expected discounted worth from a state on, under the actor for the box, (rows,)."""
+        """Expected discounted reward of the box from a state on under the actor for the box, (rows,)."""
         with self.model.trunk_precision():
             value: Tensor = self.model.goal_heads.value(state.features, self._code)
         return value
 
     def policy(self, state: Any, generator: torch.Generator | None = None) -> Tensor:
-        """The action for the box (rows, action): a sample when a generator is given, else the mode."""
+        """Actions of the actor for the box, (rows, action): samples if a generator is given, else the mode."""
         with self.model.trunk_precision():
             mean, std = self.model.goal_action(state.features, self._code)
         if generator is None:
@@ -154,37 +157,39 @@ class BoxModel:
         return (mean + std * noise).clamp(-1.0, 1.0)  # type: ignore[no-any-return]
 
     def propose(self, state: Any, num: int, horizon: int, generators: Sequence[torch.Generator]) -> Tensor:
-        """What the actor for the box does from each state, its mode first, (batch num, horizon, action)."""
+        """Action sequences of the actor for the box from each state, the mode first, (batch num, horizon, action)."""
         size = (num, horizon, self.model.action_dim)
         noise = torch.stack([torch.randn(size, generator=each, device=self.model.device) for each in generators])
         noise[:, 0] = 0.0
-        rows, chosen = repeat_rows(state, num), []
+        rows, actions = repeat_rows(state, num), []
         for draw in noise.flatten(0, 1).unbind(1):
-            with torch.autocast(draw.device.type, enabled=False):  # for few rows converting costs more than it saves
+            with torch.autocast(
+                draw.device.type, enabled=False
+            ):  # float32: for few rows, casting costs more than bfloat16 saves
                 mean, std = self.model.goal_action(rows.features.float(), self._code)
-            chosen.append((mean + std * draw).clamp(-1.0, 1.0))
-            rows, _ = self.model.fast_step(rows, chosen[-1])
-        return torch.stack(chosen, 1)
+            actions.append((mean + std * draw).clamp(-1.0, 1.0))
+            rows, _ = self.model.fast_step(rows, actions[-1])
+        return torch.stack(actions, 1)
 
     def continues(self, state: Any) -> Tensor:
         """See `WorldModel.continues`."""
-        going_on: Tensor = self.model.continues(state)
-        return going_on
+        continues: Tensor = self.model.continues(state)
+        return continues
 
-    def _worth(self, features: Tensor) -> Tensor:
+    def _reward(self, features: Tensor) -> Tensor:
         values = self.model.goal_quantities(features)
         return self._frames_per_step * box_degree(self._low, self._high, values, self.model.goal_scales)
 
 
 def _clauses(node: Node) -> list[Clause | None]:
-    """The clauses that a node joins by `and`, None for what is no clause."""
+    """The clauses that a node joins by `and`, with None for every part that is not a clause."""
     if isinstance(node, Both):
         return _clauses(node.left) + _clauses(node.right)
     return [node if isinstance(node, Clause) else None]
 
 
 def _interval(clause: Clause, quantities: Sequence[str]) -> tuple[str, Interval] | None:
-    """The quantity that a clause is about and where it wants it; None where that is no interval of one quantity."""
+    """The quantity and the interval that a clause asks for; None if the clause is not an interval of one quantity."""
     left, right, relation = clause.left, clause.right, clause.relation
     if isinstance(left, Number):
         left, right, relation = right, left, {"<": ">", ">": "<"}.get(relation, relation)

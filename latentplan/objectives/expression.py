@@ -1,20 +1,18 @@
-"""What expressions over named quantities mean, whoever knows the values: the simulator or a model.
+"""Expressions over named quantities, and their values from true quantities (simulator) or predicted ones (model).
 
-A clause compares two quantities. What is missing for it to hold, in units of its margin, is its shortfall; a degree
-function turns that into a number in [0, 1]. `and` multiplies degrees. The margin of a clause is the scale of what it
-compares: scales add in sums and differences, and multiply in products, where a number counts as itself.
+A clause compares two quantities. The shortfall of a clause is the distance by which it does not hold, in units of its
+margin; a degree function turns the shortfall into a number in [0, 1]. `and` multiplies degrees. The margin of a clause
+is the scale of its two sides together: scales add in sums and differences and multiply in products, where a number
+counts as its size.
 """
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Any
 
-from latentplan.config import UserError
-
-# An array or a tensor of any shape; numbers broadcast with both.
+# An array or a tensor of any shape, or a number.
 Values = Any
 Lookup = Callable[[str], Values]
 Degree = Callable[[Values], Values]
@@ -36,7 +34,7 @@ class Name:
 
 @dataclass(frozen=True)
 class Absolute:
-    """The size of a quantity, without its sign."""
+    """The absolute value of a quantity."""
 
     inner: Node
 
@@ -55,11 +53,11 @@ class Clause:
     """A comparison of two quantities.
 
     Attributes:
-        relation: `<`, `>`, or `->`: as near as possible.
-        left: One side.
-        right: The other.
-        margin: Shortfall that counts as 1, above 0.
-        text: How it was written.
+        relation: `<`, `>`, or `->` (the two sides should be as near as possible).
+        left: Side before the relation.
+        right: Side after the relation.
+        margin: Difference that counts as a shortfall of 1, above 0.
+        text: The clause as the user wrote it.
     """
 
     relation: str
@@ -71,7 +69,7 @@ class Clause:
 
 @dataclass(frozen=True)
 class Both:
-    """Two clauses that must hold at once."""
+    """Two clauses joined by `and`."""
 
     left: Node
     right: Node
@@ -79,12 +77,12 @@ class Both:
 
 @dataclass(frozen=True)
 class LearnedReturn:
-    """The return that the agent was trained for: reward, and the value of what comes after."""
+    """The return that the agent was trained for: predicted reward plus the value of the last state."""
 
 
 @dataclass(frozen=True)
 class GoalImage:
-    """Closeness to a picture of the goal."""
+    """Closeness to a goal image."""
 
     path: str
 
@@ -94,11 +92,11 @@ Node = Number | Name | Absolute | Arithmetic | Clause | Both | LearnedReturn | G
 
 @dataclass(frozen=True)
 class Expression:
-    """A weighted sum, to be maximised.
+    """A weighted sum that a planner maximises.
 
     Attributes:
-        text: How it was written.
-        terms: Weight and content of each part.
+        text: The expression as the user wrote it.
+        terms: Weight and node of each term.
     """
 
     text: str
@@ -106,28 +104,28 @@ class Expression:
 
     @property
     def is_return(self) -> bool:
-        """Whether nothing but the learned return is wanted, which is what agents pursue without an objective."""
+        """Whether the expression is the learned return alone, which agents maximise without an objective."""
         return len(self.terms) == 1 and self.terms[0][0] > 0.0 and isinstance(self.terms[0][1], LearnedReturn)
 
     @property
     def clauses(self) -> tuple[Clause, ...]:
-        """Every clause, in the order of the text."""
+        """All clauses, in the order of the text."""
         return tuple(part for _, term in self.terms for part in walk(term) if isinstance(part, Clause))
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Every quantity that is looked up, each once."""
+        """Names of all quantities, each once, in the order of the text."""
         parts = (part for _, term in self.terms for part in walk(term))
         return tuple(dict.fromkeys(part.name for part in parts if isinstance(part, Name)))
 
 
 @dataclass(frozen=True)
 class Phase:
-    """An objective and when it begins to hold.
+    """An objective and the time at which it begins.
 
     Attributes:
-        start: Env frame of the episode.
-        objective: What is maximised from then on.
+        start: Env frame of the episode at which the objective begins.
+        objective: Expression to maximise from then on.
     """
 
     start: int
@@ -135,7 +133,7 @@ class Phase:
 
 
 def walk(node: Node) -> Iterator[Node]:
-    """The node and everything in it, left to right."""
+    """Yields a node and all nodes inside it, left to right."""
     yield node
     match node:
         case Absolute(inner):
@@ -146,25 +144,25 @@ def walk(node: Node) -> Iterator[Node]:
 
 
 def combine(operator: str, left: Node, right: Node) -> Node:
-    """Two nodes joined by `+`, `-` or `*`; two numbers become one, so that a weight may be written as `-0.5`."""
+    """Two nodes joined by `+`, `-` or `*`; two numbers become one number, so that a weight may be written as `-0.5`."""
     if isinstance(left, Number) and isinstance(right, Number):
-        value = _OPERATIONS[operator](left.value, right.value)
-        if not math.isfinite(value):
-            raise UserError(f"{left.value:g} {operator} {right.value:g} is not finite")
-        return Number(value)
+        return Number(_OPERATIONS[operator](left.value, right.value))
     return Arithmetic(operator, left, right)
 
 
 def evaluate(node: Node, values: Lookup, degree: Degree) -> Values:
-    """What a term of an expression is worth.
+    """The value of a term of an expression.
 
     Args:
-        node: Without learned return or goal image, which are no functions of quantities.
-        values: Gives the values of a quantity, all of one shape.
+        node: A node without learned return or goal image, which are not functions of quantities.
+        values: Returns the values of a quantity by its name; all quantities have the same shape.
         degree: Turns shortfalls in margins, positive where a clause does not hold, into degrees in [0, 1].
 
     Returns:
-        Values of that shape; a plain number where the node holds no name.
+        Values of the shape of the quantities; a plain number if the node names no quantity.
+
+    Raises:
+        TypeError: The node holds a learned return or a goal image.
     """
     match node:
         case Number(value):
@@ -179,18 +177,18 @@ def evaluate(node: Node, values: Lookup, degree: Degree) -> Values:
             return degree(shortfall(node, values))
         case Both(left, right):
             return evaluate(left, values, degree) * evaluate(right, values, degree)
-    raise TypeError(f"{type(node).__name__} is no function of quantities")
+    raise TypeError(f"{type(node).__name__} is not a function of quantities")
 
 
 def shortfall(clause: Clause, values: Lookup) -> Values:
-    """What is missing for a clause to hold, in units of its margin; below 0 where an inequality holds."""
+    """The distance by which a clause does not hold, in units of its margin; negative where an inequality holds."""
     left, right = (evaluate(side, values, _no_degree) for side in (clause.left, clause.right))
     missing = {"<": left - right, ">": right - left, "->": abs(left - right)}[clause.relation]
     return missing / clause.margin
 
 
 def _no_degree(shortfalls: Values) -> Values:
-    raise AssertionError("the parser lets no clause into another")
+    raise AssertionError("the parser refuses a clause inside another clause")
 
 
 _OPERATIONS: dict[str, Callable[[Any, Any], Any]] = {

@@ -1,24 +1,26 @@
-"""What a search maximises for an expression, and keeps for a constraint, by the quantities that a model predicts.
+"""Objectives and constraints of the planner, made from expressions over quantities that the world model predicts.
 
 The model has `label_names`, states with `features` (rows, feature), and `probe(features)`, the predicted quantities.
-What is planned for differs from what is scored in two points, both because a prediction is not the truth: degrees
-fall off more slowly, so that a clause far from holding still tells the search where to go, and inequalities that must
-hold are kept with some distance.
+Planning differs from scoring in two points, because a prediction is not the truth: degrees fall more slowly, so that a
+search far from the goal still finds the direction, and the plan keeps a distance from the limit of each constraint.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from functools import cache, partial
+from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 from einops import rearrange, reduce, repeat
+from numpy.typing import NDArray
 from torch import Tensor
 
 from latentplan.config import EnvConfig, UserError
 from latentplan.config.quantities import scales
-from latentplan.objectives.box import BoxView, Interval, box_of, plan_degree
+from latentplan.objectives.box import BoxView, Interval, box_of, planning_degree
 from latentplan.objectives.expression import (
     Clause,
     Expression,
@@ -37,9 +39,10 @@ from latentplan.planning.model import supports
 from latentplan.planning.objectives import Constraint, Objective, Rollout, Term, predicted_return, terminal_value
 from latentplan.planning.search.cem import CEMPlanner
 
-CAUTION = 0.1  # margins that a plan stays away from where a constraint would break
-GUIDANCE = 0.25  # what the end of a plan counts, of what the plan would earn at the learned rate of reward
+CAUTION = 0.1  # distance that a plan keeps from the limit of a constraint, in margins
+GUIDANCE = 0.25  # weight of the terminal value, as a share of what the plan would earn at the value's rate of reward
 GOAL_DISTANCE = 1.0  # root mean square distance of latents that counts as one margin
+GOAL_IMAGE_SIZE = 64  # pixels, as camera frames
 
 
 def plan_goals(
@@ -51,40 +54,29 @@ def plan_goals(
     planner: CEMPlanner,
     encode_goal: Callable[[str], Tensor],
 ) -> tuple[Term | None, Sequence[Constraint]]:
-    """What a planner is given for goals written as text.
+    """The planner's objective and constraints for goals written as text.
 
     Args:
-        objective: A text or what the parser made of it; a term, or None for what the agent was trained for, stays.
-        constraints: Inequalities separated by `;`; functions of imagined rollouts stay.
+        objective: Text, or a parsed expression; a function of rollouts, or None for the objective of the training, is
+            returned as it is.
+        constraints: Inequalities separated by `;`; functions of rollouts are returned as they are.
         model: The world model, with `labels` and `label_names`.
         env: Settings of the environment.
-        planner: Who searches: its horizon for goals, its discount, and whether rollouts have a value at their end.
+        planner: The planner; its horizon, its discount and its use of the terminal value set the weight of the guide.
         encode_goal: See `plan_objective`.
 
     Raises:
-        UserError: A text is no expression, or is about what this agent does not predict.
+        UserError: A text is not an expression, or names a quantity that this model does not predict.
     """
     known = model.labels or scales(env.domain)
     if objective is not None and not isinstance(objective, str | Expression) and not callable(objective):
-        raise UserError(f"an objective is an expression or a function of rollouts, got {objective!r}")
+        raise UserError(f"an objective must be an expression or a function of rollouts, got {objective!r}")
     if not isinstance(constraints, str) and any(isinstance(constraint, str) for constraint in constraints):
-        raise UserError("constraints are one text, inequalities separated by ';', or functions of rollouts")
+        raise UserError("constraints must be one text, with inequalities separated by ';', or functions of rollouts")
     if isinstance(objective, str):
         objective = parse_objective(objective, known)
     if isinstance(objective, Expression):
-        require_labels([node for _, node in objective.terms], model.label_names)
-        wanted, learned = objective, predicted_return(model, planner.terminal_value)
-        has_value = supports(model, "value") if planner.terminal_value is None else planner.terminal_value
-        # A value of v is a reward of v (1 - discount) in every step there will ever be; the plan has `horizon` of them.
-        horizon = planner.goal_horizon or planner.horizon
-        guide = GUIDANCE * horizon * (1.0 - planner.discount) * terminal_value() if has_value else None
-        box = learned_box(wanted, model) if has_value else None
-        if box is not None:
-            objective = conditioned(BoxView(box, env.action_repeat))
-        elif wanted.is_return:
-            objective = None
-        else:
-            objective = plan_objective(wanted, env.action_repeat, learned, guide, encode_goal)
+        objective = _plan_expression(objective, model, env, planner, encode_goal)
     if isinstance(constraints, str):
         clauses = parse_constraints(constraints, known)
         require_labels(clauses, model.label_names)
@@ -93,7 +85,7 @@ def plan_goals(
 
 
 def learned_box(expression: Expression, model: Any) -> dict[str, Interval] | None:
-    """The box that an expression asks for, if it is one and the model has learned to pursue boxes."""
+    """The box that an expression asks for; None if the expression is not a box or the model has no goal heads."""
     return box_of(expression, model.goal_names) if getattr(model, "goal_dim", 0) else None
 
 
@@ -104,18 +96,18 @@ def plan_objective(
     guide: Objective | None,
     encode_goal: Callable[[str], Tensor],
 ) -> Objective:
-    """The predicted worth of an expression, summed over the env frames of each imagined rollout with its weights.
+    """The predicted score of an expression, summed over the env frames of each rollout with the rollout's weights.
 
-    Nothing tells what an expression is worth beyond the rollout. Where a body can do what it was trained for, though,
-    it has not fallen, and can do most other things as well: a guide of little weight tells those ends from others.
+    No model predicts the score of an expression beyond the rollout. The guide stands in for that terminal value: states
+    with a high value for the training task, in which the body has not fallen, allow most other tasks too.
 
     Args:
-        expression: What to maximise.
-        frames_per_step: Env frames that one imagined step stands for.
-        learned: What `return` stands for.
-        guide: Added once where the expression holds no `return`.
-        encode_goal: Gives the latent (latent,) of a picture's path, or one for each turn that beliefs have (turn,
-            latent); called once per goal.
+        expression: Expression to maximise.
+        frames_per_step: Env frames per model step.
+        learned: Objective that `return` stands for.
+        guide: Added once if the expression does not contain `return`; None adds nothing.
+        encode_goal: Returns the latent (latent,) of the image at a path, or one latent per orientation of the beliefs
+            (turn, latent); called once per goal image.
     """
     objectives: list[Objective] = []
     quantities: list[tuple[float, Node]] = []
@@ -131,20 +123,24 @@ def plan_objective(
         objectives.append(guide)
     if quantities:
         needs = ("probe",) if expression.names else ()
-        objectives.append(Objective(partial(_worth, tuple(quantities)), needs_states=True, needs=needs))
+        objectives.append(Objective(partial(_score, tuple(quantities)), needs_states=True, needs=needs))
     return sum(objectives[1:], objectives[0])
 
 
 def plan_constraint(clauses: Sequence[Clause]) -> Objective:
-    """By how many margins predicted quantities break the clauses, summed over steps; 0 where all hold with distance."""
+    """Predicted violation of the clauses in margins, summed over steps; 0 where all hold by at least `CAUTION`."""
     return Objective(partial(_violation, tuple(clauses)), needs_states=True, needs=("probe",))
 
 
 def require_labels(nodes: Sequence[Node], labels: Sequence[str]) -> None:
     """Refuses expressions about quantities that a model does not predict.
 
+    Args:
+        nodes: The expressions.
+        labels: Names of the quantities that the model predicts.
+
     Raises:
-        UserError: Names the first such quantity.
+        UserError: A quantity is not among the labels; the message names the first one.
     """
     for name in [part.name for node in nodes for part in walk(node) if isinstance(part, Name)]:
         if name not in labels:
@@ -152,20 +148,58 @@ def require_labels(nodes: Sequence[Node], labels: Sequence[str]) -> None:
             raise UserError(f"this agent cannot plan for {name!r}: {known}")
 
 
-def predicted_quantities(rollout: Rollout) -> Lookup:
-    """The quantities predicted after every imagined step; each is (step, rows), float32.
+def read_goal_image(path: str, size: int = GOAL_IMAGE_SIZE) -> NDArray[np.uint8]:
+    """The image in a file, resized to a camera frame, RGB uint8 (size, size, 3).
 
-    Returns:
-        A function from a quantity's name to its values.
+    Raises:
+        UserError: The file is missing, is not an image, or is not square.
     """
+    import cv2  # only a goal image needs OpenCV
+
+    try:
+        if not Path(path).is_file():
+            reason = "is a folder" if Path(path).is_dir() else "does not exist"
+            raise UserError(f"goal image {path!r} {reason}; give a square image such as a frame of the camera")
+        image = cv2.imread(path, cv2.IMREAD_COLOR)
+    except (OSError, cv2.error) as error:  # a file name or an image that is too large
+        raise UserError(f"goal image {path!r} cannot be read: {' '.join(str(error).split())}") from None
+    if image is None:
+        raise UserError(f"goal image {path!r} is not an image that can be read; give a .png")
+    if image.shape[0] != image.shape[1]:
+        raise UserError(f"goal image {path!r} must be square, got {image.shape[1]} x {image.shape[0]} pixels")
+    shrinks = image.shape[0] > size
+    resized = cv2.resize(image, (size, size), interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR)
+    return np.asarray(cv2.cvtColor(resized, cv2.COLOR_BGR2RGB), np.uint8)
+
+
+def predicted_quantities(rollout: Rollout) -> Lookup:
+    """A function from the name of a quantity to its predicted values after every step, (step, rows), float32."""
 
     @cache
-    def labels() -> Tensor:  # once there is something to look up: not every model has a probe
+    def labels() -> Tensor:  # called on the first look-up only: not every model has a probe
         features = torch.stack([state.features for state in rollout.states])
         flat = rollout.model.probe(rearrange(features, "step rows feature -> (step rows) feature")).float()
         return rearrange(flat, "(step rows) label -> label step rows", step=len(features))
 
     return lambda name: labels()[list(rollout.model.label_names).index(name)]
+
+
+def _plan_expression(
+    expression: Expression, model: Any, env: EnvConfig, planner: CEMPlanner, encode_goal: Callable[[str], Tensor]
+) -> Term | None:
+    """The planner's objective for an expression; None if the expression is the learned return."""
+    require_labels([node for _, node in expression.terms], model.label_names)
+    has_value = supports(model, "value") if planner.terminal_value is None else planner.terminal_value
+    box = learned_box(expression, model) if has_value else None
+    if box is not None:
+        return conditioned(BoxView(box, env.action_repeat))
+    if expression.is_return:
+        return None
+    # A value of v stands for a reward of v (1 - discount) in every future step; the plan has `horizon` steps.
+    horizon = planner.goal_horizon or planner.horizon
+    guide = GUIDANCE * horizon * (1.0 - planner.discount) * terminal_value() if has_value else None
+    learned = predicted_return(model, planner.terminal_value)
+    return plan_objective(expression, env.action_repeat, learned, guide, encode_goal)
 
 
 def _violation(clauses: Sequence[Clause], rollout: Rollout) -> Tensor:
@@ -174,10 +208,10 @@ def _violation(clauses: Sequence[Clause], rollout: Rollout) -> Tensor:
     return reduce(torch.stack(excesses).clamp_min(0.0), "clause step rows -> rows", "sum")
 
 
-def _worth(terms: Sequence[tuple[float, Node]], rollout: Rollout) -> Tensor:
+def _score(terms: Sequence[tuple[float, Node]], rollout: Rollout) -> Tensor:
     values = predicted_quantities(rollout)
-    worth: Any = sum(weight * evaluate(node, values, plan_degree) for weight, node in terms)
-    return _discounted(torch.as_tensor(worth).expand(len(rollout.states), len(rollout.actions)), rollout)
+    score: Any = sum(weight * evaluate(node, values, planning_degree) for weight, node in terms)
+    return _discounted(torch.as_tensor(score).expand(len(rollout.states), len(rollout.actions)), rollout)
 
 
 def _closeness(goal: Tensor, rollout: Rollout) -> Tensor:
@@ -186,10 +220,10 @@ def _closeness(goal: Tensor, rollout: Rollout) -> Tensor:
     order = torch.arange(particles, device=goal.device) % len(turns)
     targets = repeat(turns[order], "particle latent -> (row particle) latent", row=len(rollout.actions) // particles)
     distances = (latents - targets).square().mean(dim=-1).sqrt()
-    return _discounted(plan_degree(distances / GOAL_DISTANCE), rollout)
+    return _discounted(planning_degree(distances / GOAL_DISTANCE), rollout)
 
 
-def _discounted(worth: Tensor, rollout: Rollout) -> Tensor:
-    """The worth of states (step, rows) weighted and summed, (rows,)."""
-    by_row = rearrange(worth, "step rows -> rows step").to(rollout.rewards.dtype)
+def _discounted(scores: Tensor, rollout: Rollout) -> Tensor:
+    """Scores of states (step, rows), weighted and summed, (rows,)."""
+    by_row = rearrange(scores, "step rows -> rows step").to(rollout.rewards.dtype)
     return (by_row * rollout.weights[..., :-1]).sum(dim=1)

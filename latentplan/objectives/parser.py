@@ -1,11 +1,16 @@
-"""From text to expressions, with errors that say where and what.
+"""Parser of objectives and constraints: from text to expressions, with errors that name the position in the text.
 
-conjunction:  comparison { "and" comparison }
-comparison:   sum [ ("<" | ">" | "->") sum ]
-sum:          product { ("+" | "-") product }
-product:      factor { "*" factor }
-factor:       "-" factor | NUMBER | NAME | "task" "(" NAME ")" | "abs" "(" sum ")" | "(" conjunction ")"
-              | "return" | "goal:FILE"
+The grammar, which `_Parser` reads by recursive descent, one method per rule:
+
+    conjunction:  comparison { "and" comparison }
+    comparison:   sum [ ("<" | ">" | "->") sum ]
+    sum:          product { ("+" | "-") product }
+    product:      factor { "*" factor }
+    factor:       "-" factor | NUMBER | NAME | "task" "(" NAME ")" | "abs" "(" sum ")" | "(" conjunction ")"
+                  | "return" | "goal:FILE"
+
+The parser is written by hand because most of its lines are rules and error messages that a grammar cannot state; a
+parser library would save none of these lines and take longer to import than all texts take to parse.
 """
 
 from __future__ import annotations
@@ -14,7 +19,7 @@ import difflib
 import math
 import re
 from collections.abc import Mapping
-from typing import NoReturn
+from typing import NamedTuple, NoReturn
 
 from latentplan.config import UserError
 from latentplan.config.quantities import TASK_PREFIX
@@ -33,22 +38,29 @@ from latentplan.objectives.expression import (
     combine,
     walk,
 )
-from latentplan.objectives.tokens import Token, fail, split_outside_quotes, tokenize
 
+_TOKEN = re.compile(
+    r"(?P<goal>goal:(?:\"[^\"]*\"|[^\s();\"]+))"
+    r"|(?P<number>(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?)"
+    r"|(?P<word>[A-Za-z_][A-Za-z_0-9]*(?:\.[A-Za-z_][A-Za-z_0-9]*)*)"
+    r"|(?P<sign>->|[-+*<>()])"
+)
 _RELATIONS = ("<", ">", "->")
+_MAX_TOKENS = 200
 _MAX_DEPTH = 50
+_MAX_SHOWN = 100  # characters of a text in an error message
 _SWITCH = re.compile(r"\s*(?P<start>[0-9]{1,15})\s*:(?P<text>.*)", re.DOTALL)
 
 
 def parse_schedule(text: str, scales: Mapping[str, float]) -> tuple[Phase, ...]:
-    """An objective, or several that follow each other: `height > 1.2; 500: speed -> 1.0`.
+    """Objectives with the env frames at which they begin, from a text such as `height > 1.2; 500: speed -> 1.0`.
 
     Args:
         text: Objectives separated by `;`, each but the first preceded by the env frame from which it holds.
-        scales: Scale of every quantity that may be named.
+        scales: Scale of every quantity that an objective may name.
 
     Raises:
-        UserError: The text is no such thing; names the position and the nearest name.
+        UserError: The text is no schedule; the message names the position and the nearest name.
     """
     phases: list[Phase] = []
     for part in split_outside_quotes(text, ";"):
@@ -57,65 +69,91 @@ def parse_schedule(text: str, scales: Mapping[str, float]) -> tuple[Phase, ...]:
             raise UserError(f"{part.strip()!r} needs the env frame from which it holds, as in '; 500: speed -> 1.0'")
         start = 0 if match is None else int(match["start"])
         if start <= phases[-1].start if phases else start > 0:
-            raise UserError(f"env frames of {text!r} must begin with 0 (which needs not be written) and rise")
+            raise UserError(f"env frames of {text!r} must begin with 0 (which may be left out) and increase")
         phases.append(Phase(start, parse_objective(part if match is None else match["text"], scales)))
     return tuple(phases)
 
 
 def parse_objective(text: str, scales: Mapping[str, float]) -> Expression:
-    """What is to be maximised: a clause, clauses joined by `and`, or a weighted sum of such, quantities and `return`.
+    """The objective that a text describes: a weighted sum of clauses, clauses joined by `and`, quantities and `return`.
 
     Raises:
-        UserError: The text is no such thing; names the position and the nearest name.
+        UserError: The text is no objective; the message names the position and the nearest name.
     """
     parser = _Parser(text, scales)
-    return Expression(text.strip(), tuple(parser.split_sum(parser.parse(), 1.0)))
+    return Expression(parser.text, tuple(parser.split_sum(parser.parse(), 1.0)))
 
 
 def parse_reward(text: str, scales: Mapping[str, float], setting: str) -> Expression:
-    """What a body is to be paid: an objective of quantities and tasks alone, without `return` and goal images.
+    """The reward that a text describes: an objective of quantities and tasks, without `return` and goal images.
 
     Raises:
-        UserError: The text is no such thing; names the setting.
+        UserError: The text is no reward; the message names the setting.
     """
     expression = parse_objective(text, scales)
     if any(isinstance(term, LearnedReturn | GoalImage) for _, term in expression.terms):
-        raise UserError(f"{setting} {text!r} must be made of named quantities and tasks alone")
+        raise UserError(f"{setting} {text!r} must consist of named quantities and tasks only")
     return expression
 
 
 def parse_constraints(text: str, scales: Mapping[str, float]) -> tuple[Clause, ...]:
-    """Inequalities that must hold at every moment, separated by `;` or joined by `and`.
+    """Inequalities that must hold at every moment, from a text that separates them by `;` or joins them by `and`.
 
     Raises:
-        UserError: The text is no such thing; names the position and the nearest name.
+        UserError: The text is no constraint; the message names the position and the nearest name.
     """
     return tuple(clause for part in text.split(";") for clause in _Parser(part, scales).inequalities())
 
 
+def split_outside_quotes(text: str, separator: str) -> list[str]:
+    """Parts of a text between separators (one character each); separators within double quotes are ignored."""
+    return re.split(rf'{re.escape(separator)}(?=(?:[^"]*"[^"]*")*[^"]*$)', text)
+
+
+class _Token(NamedTuple):
+    """A piece of text.
+
+    Attributes:
+        kind: `goal`, `number`, `word`, `sign` or `end`.
+        text: The characters of the token; empty at the end.
+        position: Index of its first character.
+    """
+
+    kind: str
+    text: str
+    position: int
+
+    @property
+    def shown(self) -> str:
+        """The token for an error message."""
+        return _shortened(self.text) or "the end"
+
+
 class _Parser:
+    """Reads one text; `places` holds the position of each node by its identity."""
+
     def __init__(self, text: str, scales: Mapping[str, float]) -> None:
         self.text, self.scales = text.strip(), scales
-        self.tokens = tokenize(self.text)
+        self.tokens = self._tokenize()
         self.index = self.depth = 0
-        self.places: dict[int, int] = {}  # where a node begins, by its identity
+        self.places: dict[int, int] = {}
 
     def parse(self) -> Node:
         """The whole text as one node."""
         node = self._conjunction()
         if self._next.kind != "end":
-            self._fail(self._next, f"expected an operator or the end, got {self._next.text!r}")
+            self._fail(self._next, f"expected an operator or the end, got {self._next.shown!r}")
         return node
 
     def split_sum(self, node: Node, weight: float) -> list[tuple[float, Node]]:
-        """The terms of a weighted sum; only there may the learned return and goal images stand."""
+        """The terms of a weighted sum, the only place where the learned return and goal images may stand."""
         match node:
             case Arithmetic("+" | "-" as sign, left, right):
                 factor = weight if sign == "+" else -weight
                 return self.split_sum(left, weight) + self.split_sum(right, factor)
             case Arithmetic("*", Number(value), other) | Arithmetic("*", other, Number(value)):
                 if not math.isfinite(weight * value):
-                    self._fail_at(node, "a weight beyond every number")
+                    self._fail(node, "this weight is too large for a number")
                 return self.split_sum(other, weight * value)
         if not isinstance(node, LearnedReturn | GoalImage):
             self._forbid_whole_terms(node)
@@ -132,8 +170,27 @@ class _Parser:
             elif isinstance(node, Clause) and node.relation != "->":
                 found.append(node)
             else:
-                self._fail_at(node, "a constraint is an inequality such as 'cart < 0.5', or several joined by 'and'")
+                self._fail(node, "a constraint is an inequality such as 'cart < 0.5', or several joined by 'and'")
         return found
+
+    def _tokenize(self) -> list[_Token]:
+        """The tokens of the text, and an `end`."""
+        tokens: list[_Token] = []
+        position = 0
+        while position < len(self.text):
+            if self.text[position].isspace():
+                position += 1
+                continue
+            match = _TOKEN.match(self.text, position)
+            token = _Token(str(match and match.lastgroup), match[0] if match else self.text[position], position)
+            if match is None:
+                is_goal = token.text == ":" and tokens and tokens[-1].text == "goal"
+                self._fail(token, 'write goal:FILE or goal:"FILE"' if is_goal else f"{token.text!r} means nothing here")
+            if len(tokens) == _MAX_TOKENS:
+                self._fail(token, f"an expression has at most {_MAX_TOKENS} numbers, names and signs")
+            tokens.append(token)
+            position = match.end()
+        return [*tokens, _Token("end", "", len(self.text))]
 
     def _conjunction(self) -> Node:
         node = self._comparison()
@@ -143,7 +200,7 @@ class _Parser:
             for side in (node, right):
                 if not _is_degree(side):
                     self._fail(sign, "'and' joins clauses such as height > 1.2; write weights around parentheses")
-            node = self._note(Both(node, right), node)
+            node = self._place(Both(node, right), node)
         return node
 
     def _comparison(self) -> Node:
@@ -162,20 +219,20 @@ class _Parser:
             self._fail(relation, "a comparison needs a quantity on one side at least")
         end = self.tokens[self.index - 1]
         written = self.text[first.position : end.position + len(end.text)]
-        return self._note(Clause(relation.text, left, right, margin, written), left)
+        return self._place(Clause(relation.text, left, right, margin, written), left)
 
     def _sum(self) -> Node:
         node = self._product()
         while self._next.text in ("+", "-"):
             sign = self._take()
-            node = self._note(combine(sign.text, node, self._product()), node)
+            node = self._place(self._combine(sign, node, self._product()), node)
         return node
 
     def _product(self) -> Node:
         node = self._factor()
         while self._next.text == "*":
-            self._take()
-            node = self._note(combine("*", node, self._factor()), node)
+            sign = self._take()
+            node = self._place(self._combine(sign, node, self._factor()), node)
         return node
 
     def _factor(self) -> Node:
@@ -188,39 +245,44 @@ class _Parser:
         self.depth -= 1
         return node
 
-    def _read(self, token: Token) -> Node:
+    def _read(self, token: _Token) -> Node:
         match token:
-            case Token("number", text):
+            case _Token("number", text):
                 if not math.isfinite(float(text)):
-                    self._fail(token, f"{text} is no finite number")
+                    self._fail(token, f"{token.shown} is too large for a number")
                 return Number(float(text))
-            case Token("goal", text):
+            case _Token("goal", text):
                 return GoalImage(text.removeprefix("goal:").strip('"'))
-            case Token("sign", "-"):
-                return combine("*", Number(-1.0), self._factor())
-            case Token("sign", "("):
+            case _Token("sign", "-"):
+                return self._combine(token._replace(text="*"), Number(-1.0), self._factor())
+            case _Token("sign", "("):
                 node = self._conjunction()
-                self._expect(")")
+                self._expect(")", "an operator or ')'")
                 return node
-            case Token("word", "abs"):
+            case _Token("word", "abs"):
                 self._expect("(")
                 inner = self._sum()
-                self._expect(")")
+                if self._next.text in _RELATIONS:
+                    self._fail(self._next, "abs() takes a quantity, not a comparison")
+                self._expect(")", "an operator or ')'")
                 return Absolute(inner)
-            case Token("word", "task"):
+            case _Token("word", "task"):
                 self._expect("(")
                 task = self._take()
+                if task.kind != "word":
+                    self._fail(task, f"expected the name of a task, got {task.shown!r}")
                 self._expect(")")
                 return self._quantity(task, TASK_PREFIX + task.text)
-            case Token("word", "return"):
+            case _Token("word", "return"):
                 return LearnedReturn()
-            case Token("word", text) if text != "and":
+            case _Token("word", text) if text != "and":
                 return self._quantity(token, text)
-        self._fail(token, f"expected a quantity, a number or '(', got {token.text or 'the end'!r}")
+        self._fail(token, f"expected a quantity, a number or '(', got {token.shown!r}")
 
-    def _quantity(self, token: Token, name: str) -> Name:
+    def _quantity(self, token: _Token, name: str) -> Name:
         if name in self.scales:
             return Name(name)
+        name = _shortened(name)
         if self._next.text == "(":
             self._fail(token, f"unknown function {name!r}; available: abs(QUANTITY), task(NAME)")
         if not self.scales:
@@ -229,7 +291,13 @@ class _Parser:
         available = ", ".join(self.scales)
         self._fail(token, f"unknown quantity {name!r}; available: {available}. Did you mean {nearest!r}?")
 
-    def _check_side(self, relation: Token, side: Node) -> None:
+    def _combine(self, sign: _Token, left: Node, right: Node) -> Node:
+        node = combine(sign.text, left, right)
+        if isinstance(node, Number) and not math.isfinite(node.value):
+            self._fail(sign, "this product or sum is too large for a number")
+        return node
+
+    def _check_side(self, relation: _Token, side: Node) -> None:
         parts = list(walk(side))
         self._forbid_whole_terms(side)
         if any(isinstance(part, Clause | Both) for part in parts):
@@ -242,9 +310,10 @@ class _Parser:
         for part in walk(node):
             if isinstance(part, LearnedReturn | GoalImage):
                 name = "return" if isinstance(part, LearnedReturn) else "a goal image"
-                self._fail_at(part, f"{name} can only be weighted and added")
+                self._fail(part, f"{name} can only be weighted and added")
 
     def _scale(self, node: Node) -> float:
+        """The scale of a side: scales add in sums and multiply in products, where a number counts as its size."""
         match node:
             case Name(name):
                 return self.scales[name]
@@ -259,30 +328,34 @@ class _Parser:
         return 0.0
 
     @property
-    def _next(self) -> Token:
+    def _next(self) -> _Token:
         return self.tokens[self.index]
 
-    def _take(self) -> Token:
+    def _take(self) -> _Token:
         token = self.tokens[self.index]
         self.index = min(self.index + 1, len(self.tokens) - 1)
         return token
 
-    def _expect(self, sign: str) -> None:
+    def _expect(self, sign: str, wanted: str | None = None) -> None:
         token = self._take()
         if token.text != sign:
-            self._fail(token, f"expected {sign!r}, got {token.text or 'the end'!r}")
+            self._fail(token, f"expected {wanted or repr(sign)}, got {token.shown!r}")
 
-    def _note(self, node: Node, first: Node) -> Node:
+    def _place(self, node: Node, first: Node) -> Node:
+        """The node, which begins where its first part begins."""
         self.places[id(node)] = self.places[id(first)]
         return node
 
-    def _fail_at(self, node: Node, reason: str) -> NoReturn:
-        fail(self.text, self.places[id(node)], reason)
-
-    def _fail(self, token: Token, reason: str) -> NoReturn:
-        fail(self.text, token.position, reason)
+    def _fail(self, place: _Token | Node, reason: str) -> NoReturn:
+        position = place.position if isinstance(place, _Token) else self.places[id(place)]
+        raise UserError(f"expression {_shortened(self.text)!r}, position {position + 1}: {reason}")
 
 
 def _is_degree(node: Node) -> bool:
+    """Whether the value of a node is a degree in [0, 1]: a clause, clauses joined by `and`, or the reward of a task."""
     is_reward = isinstance(node, Name) and node.name.startswith(TASK_PREFIX)
     return is_reward or isinstance(node, Clause | Both)
+
+
+def _shortened(text: str) -> str:
+    return text if len(text) <= _MAX_SHOWN else text[: _MAX_SHOWN - 3] + "..."

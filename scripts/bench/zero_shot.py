@@ -21,7 +21,7 @@ from bench.report import format_table, interval, number, write_json
 from latentplan.config import EnvConfig, UserError, to_dict
 from latentplan.config.files import build_config, raise_unknown
 from latentplan.config.planner import override_planner
-from latentplan.objectives.tokens import split_outside_quotes
+from latentplan.objectives.parser import split_outside_quotes
 
 if TYPE_CHECKING:
     from latentplan.envs import SuiteEnv

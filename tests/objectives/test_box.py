@@ -1,11 +1,11 @@
-"""Expressions that ask for a box are known, and a box is worth what its expression is."""
+"""Boxes are recognised in expressions, and the degree of a box is the value of its expression."""
 
 import math
 
 import pytest
 import torch
 
-from latentplan.objectives.box import box_degree, box_of, plan_degree
+from latentplan.objectives.box import box_degree, box_of, planning_degree
 from latentplan.objectives.expression import evaluate
 from latentplan.objectives.parser import parse_objective
 
@@ -31,14 +31,14 @@ def box(text):
         ("0.5 * (height > 1.2 and upright > 0.9)", {"height": (1.2, INF), "upright": (0.9, INF)}),
     ],
 )
-def test_a_box_is_known(text, expected):
+def test_box_of_returns_the_intervals_of_an_expression(text, expected):
     assert box(text) == expected
     low, high = (torch.tensor([expected.get(name, (-INF, INF))[end] for name in QUANTITIES]) for end in (0, 1))
     values = 3.0 * torch.randn(200, 3, generator=torch.Generator().manual_seed(0))
     [(weight, node)] = parse_objective(text, SCALES).terms
-    worth = evaluate(node, lambda name: values[:, QUANTITIES.index(name)], plan_degree)
+    expected_degree = evaluate(node, lambda name: values[:, QUANTITIES.index(name)], planning_degree)
     degree = box_degree(low, high, values, torch.tensor([SCALES[name] for name in QUANTITIES]))
-    assert weight > 0.0 and torch.allclose(degree, worth, atol=1e-6)
+    assert weight > 0.0 and torch.allclose(degree, expected_degree, atol=1e-6)
 
 
 @pytest.mark.parametrize(
@@ -59,10 +59,10 @@ def test_a_box_is_known(text, expected):
         "return + 2 * (speed -> 1.0)",
     ],
 )
-def test_what_is_no_box_is_left_to_others(text):
+def test_box_of_returns_none_when_expression_is_not_a_box(text):
     assert box(text) is None
 
 
-def test_a_box_that_is_open_everywhere_is_always_met():
+def test_box_degree_is_one_when_every_interval_is_open():
     values = torch.randn(5, 3)
     assert torch.equal(box_degree(torch.full((3,), -INF), torch.full((3,), INF), values, torch.ones(3)), torch.ones(5))

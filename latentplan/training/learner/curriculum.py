@@ -15,7 +15,7 @@ from torch import Tensor
 
 from latentplan.config import Config, UserError
 from latentplan.config.quantities import TASK_PREFIX
-from latentplan.objectives.box import paid_degree
+from latentplan.objectives.box import scoring_degree
 from latentplan.objectives.expression import Name, Node, evaluate
 from latentplan.objectives.parser import parse_reward
 from latentplan.replay.buffer import Batch
@@ -59,7 +59,7 @@ class Curriculum(lightning.Callback):
         if not self._terms or self._is_over():
             return batch
         values = {name: batch.labels[..., column] for name, column in self._columns.items()}
-        paid = sum(weight * evaluate(node, values.__getitem__, paid_degree) for weight, node in self._terms)
+        paid = sum(weight * evaluate(node, values.__getitem__, scoring_degree) for weight, node in self._terms)
         return batch._replace(rewards=summed_reward(torch.as_tensor(paid).expand(batch.labels.shape[:2]), self._repeat))
 
     def on_train_epoch_start(self, trainer: lightning.Trainer, learner: Learner) -> None:  # type: ignore[override]
