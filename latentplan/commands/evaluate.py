@@ -102,7 +102,7 @@ def _play_and_report(
             from latentplan.reporting.film import filming
 
             planner = agent if request.mode in PLANNING_MODES else None
-            on_step = stack.enter_context(filming(request.video, env, planner, judge=scored))
+            on_step = stack.enter_context(filming(request.video, env, planner, goals=scored))
         try:
             for episode in iterate_timed_episodes(env, agent, seeds, clock, on_step=on_step):
                 episodes.append(episode)

@@ -1,1 +1,1 @@
-"""What a person looks at: films and figures."""
+"""Films of episodes and figures of learning curves."""

@@ -1,4 +1,4 @@
-"""Learning curves: what planner and actor earned as the run went on."""
+"""Learning curves: evaluation returns of planner and actor over a run."""
 
 from __future__ import annotations
 
@@ -7,7 +7,6 @@ import os
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter
 
@@ -19,10 +18,10 @@ CLOCKS = {"env_frames": "environment frames", "minutes": "minutes"}
 
 
 def read_curve(metrics_csv: str | os.PathLike[str], clock: str, column: str) -> tuple[list[float], list[float]]:
-    """The rows of a metrics file in which both a clock and a column have a value, as (times, values).
+    """Times and values of one column of a metrics file, from the rows in which the clock and the column have a value.
 
     Raises:
-        ValueError: The file lacks one of the two columns.
+        ValueError: The file lacks one of the two columns; the message names those it has.
     """
     with open(metrics_csv, newline="", encoding="utf-8") as file:
         reader = csv.DictReader(file)
@@ -37,9 +36,9 @@ def plot_curves(metrics_csv: str | os.PathLike[str], png: str | os.PathLike[str]
     """Draws the evaluation return of planner and actor, against environment frames and against minutes.
 
     Args:
-        metrics_csv: A run's metrics, with columns `env_frames`, `minutes`, `planner_return` and `actor_return`; cells
+        metrics_csv: Metrics of a run, with columns `env_frames`, `minutes`, `planner_return` and `actor_return`; cells
             without a measurement are empty.
-        png: Where the figure goes.
+        png: Path of the figure.
 
     Returns:
         The path of the figure.
@@ -48,13 +47,17 @@ def plot_curves(metrics_csv: str | os.PathLike[str], png: str | os.PathLike[str]
         ValueError: A column is missing.
     """
     figure = Figure(figsize=(10, 4), layout="constrained")
-    FigureCanvasAgg(figure)
     panels = figure.subplots(1, 2, sharey=True)
     for axes, (clock, label) in zip(panels, CLOCKS.items(), strict=True):
         _draw(axes, metrics_csv, clock)
         axes.set_xlabel(label)
     panels[0].set_ylabel("evaluation return")
     panels[0].legend(loc="upper left", frameon=False)
+    return save_figure(figure, png)
+
+
+def save_figure(figure: Figure, png: str | os.PathLike[str]) -> Path:
+    """Writes a figure as PNG under a temporary name and renames it, so that the file is never half written."""
     path = Path(png)
     partial = path.with_name(f".{path.name}.{os.getpid()}")
     figure.savefig(partial, dpi=120, format="png")

@@ -1,15 +1,15 @@
-"""The film of an episode, as a callback for rollouts."""
+"""Films of episodes, made by a callback of the rollout."""
 
 from __future__ import annotations
 
 import contextlib
 import os
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from typing import TYPE_CHECKING, Any, Protocol
 
-from latentplan.reporting.goal import Judge, draw_goal
-from latentplan.reporting.video import GAP, PANEL_SIZE, Frame, VideoWriter, compose_frame
+from latentplan.reporting.frame import PANEL_SIZE, Frame, compose_frame, draw_goal_strip
+from latentplan.reporting.video import VideoWriter
 
 if TYPE_CHECKING:
     import gymnasium
@@ -18,7 +18,7 @@ DEFAULT_FPS = 20.0
 
 
 class Moment(Protocol):
-    """What a film needs to know of one moment of an episode; rollouts hand it to their callback."""
+    """One step of an episode, as rollouts hand it to their callback."""
 
     @property
     def episode(self) -> int:
@@ -26,26 +26,26 @@ class Moment(Protocol):
 
     @property
     def decision(self) -> int:
-        """Decisions executed before this moment."""
+        """Number of decisions executed before this step."""
 
     @property
     def total_return(self) -> float:
-        """Reward earned before this moment."""
+        """Sum of the rewards before this step."""
 
     @property
     def frame(self) -> Frame:
-        """What the agent sees, uint8 (height, width, 3)."""
+        """Observation of the agent, uint8 (height, width, 3)."""
 
     @property
     def action(self) -> Any:
-        """What it chose, or None where the episode is over."""
+        """Action of the agent, or None at the end of the episode."""
 
 
-class Imagining(Protocol):
-    """An agent that can show where its present plan ends.
+class ImaginingAgent(Protocol):
+    """An agent that can picture the end of its plan.
 
     Attributes:
-        steps_ahead: Model steps from now to what it showed last.
+        steps_ahead: Model steps from the present to the last imagined frame.
     """
 
     steps_ahead: int
@@ -55,26 +55,39 @@ class Imagining(Protocol):
         ...
 
 
+class GoalScores(Protocol):
+    """Scores of the objective and the constraints of the episode that is filmed."""
+
+    @property
+    def worth(self) -> Sequence[float]:
+        """Score of the objective at each env frame so far; empty without an objective."""
+
+    @property
+    def clauses(self) -> Sequence[tuple[str, bool]]:
+        """Text of every clause, and whether the clause is met; empty before the first env frame."""
+
+
 @contextlib.contextmanager
 def filming(
     path: str | os.PathLike[str],
     env: gymnasium.Env[Any, Any],
-    planner: Imagining | None,
+    planner: ImaginingAgent | None,
     *,
     every: int = 1,
-    judge: Judge | None = None,
+    goals: GoalScores | None = None,
 ) -> Iterator[Callable[[Moment], None]]:
-    """Films the first episode that is played inside the block, in real time where the environment tells its rate.
+    """Films the first episode that is played inside the block, in real time if the environment gives its frame rate.
 
     Args:
-        path: Where the film goes, `.mp4` or `.webm`; it appears when the block ends well.
-        env: The environment that is played; `render_large` gives the picture where it has that.
-        planner: The agent, where it plans; None leaves the plan's side empty.
-        every: Decisions per picture (the last moment has one whatever that is); the film keeps the time of the episode.
-        judge: Who scores an objective or constraints; the film then shows how they are met.
+        path: Path of the film, `.mp4` or `.webm`; the film appears when the block ends without an error.
+        env: The environment that is played; its `render_large` gives the picture if it has this method.
+        planner: The agent, if it plans; None leaves the right side empty.
+        every: Decisions per frame of the film; the end of the episode always gets a frame. The film keeps the duration
+            of the episode.
+        goals: Scores of an objective or constraints; the film then shows them in a strip.
 
     Yields:
-        The callback to hand to the rollouts.
+        The callback for the rollout.
     """
     with contextlib.ExitStack() as stack:
         films: list[VideoWriter] = []
@@ -82,7 +95,7 @@ def filming(
         def film(moment: Moment) -> None:
             if moment.episode > 0 or (moment.decision % every and moment.action is not None):
                 return
-            picture = _compose(moment, env, planner, judge)
+            picture = _compose(moment, env, planner, goals)
             if not films:
                 fps = float(env.unwrapped.metadata.get("render_fps") or DEFAULT_FPS)
                 films.append(stack.enter_context(VideoWriter(path, fps / every, (picture.shape[1], picture.shape[0]))))
@@ -93,9 +106,9 @@ def filming(
 
 @contextlib.contextmanager
 def filming_if_possible(
-    path: str | os.PathLike[str], env: gymnasium.Env[Any, Any], planner: Imagining | None, *, every: int = 1
+    path: str | os.PathLike[str], env: gymnasium.Env[Any, Any], planner: ImaginingAgent | None, *, every: int = 1
 ) -> Iterator[Callable[[Moment], None]]:
-    """As `filming`, but where a film fails there is a warning and no film, and the episode goes on without it."""
+    """The same as `filming`, but an error of the film becomes a warning and the episode goes on without a film."""
     errors: list[Exception] = []
     with contextlib.ExitStack() as stack:
         film = stack.enter_context(filming(path, env, planner, every=every))
@@ -119,15 +132,17 @@ def filming_if_possible(
         warnings.warn(f"no film at {path}: {errors[0]}", RuntimeWarning, stacklevel=1)
 
 
-def _compose(moment: Moment, env: gymnasium.Env[Any, Any], planner: Imagining | None, judge: Judge | None) -> Frame:
-    over = moment.action is None
+def _compose(
+    moment: Moment, env: gymnasium.Env[Any, Any], planner: ImaginingAgent | None, goals: GoalScores | None
+) -> Frame:
+    is_over = moment.action is None
     render = getattr(env.unwrapped, "render_large", None)
-    imagined = None if planner is None or over else planner.imagine()
+    imagined = None if planner is None or is_over else planner.imagine()
     return compose_frame(
         moment.frame if render is None else render(PANEL_SIZE),
         imagined,
         [f"return {moment.total_return:.1f}    step {moment.decision}"],
         horizon=None if planner is None else planner.steps_ahead,
-        absence="episode over" if over else "no plan",
-        strip=None if judge is None else draw_goal(2 * PANEL_SIZE + GAP, judge.worth, judge.clauses),
+        absence="episode over" if is_over else "no plan",
+        strip=None if goals is None else draw_goal_strip(goals.worth, goals.clauses),
     )

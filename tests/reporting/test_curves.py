@@ -1,3 +1,5 @@
+"""Learning curves are read from metrics files and drawn."""
+
 import cv2
 import pytest
 
@@ -18,17 +20,17 @@ def metrics(tmp_path):
     return path
 
 
-def test_rows_without_a_measurement_are_left_out(metrics):
+def test_read_curve_skips_rows_without_a_measurement(metrics):
     assert read_curve(metrics, "env_frames", "planner_return") == ([2000.0, 4000.0], [110.5, 300.0])
     assert read_curve(metrics, "minutes", "actor_return") == ([1.0, 2.0], [90.0, 310.25])
 
 
-def test_a_missing_column_is_named_with_those_there(metrics):
+def test_read_curve_names_the_missing_column_and_the_present_ones(metrics):
     with pytest.raises(ValueError, match="'value_loss'.*planner_return"):
         read_curve(metrics, "env_frames", "value_loss")
 
 
-def test_both_curves_are_drawn_in_both_panels(metrics, tmp_path):
+def test_plot_curves_draws_both_curves_in_both_panels(metrics, tmp_path):
     image = cv2.cvtColor(cv2.imread(str(plot_curves(metrics, tmp_path / "curves.png"))), cv2.COLOR_BGR2HSV)
     for half in (image[:, : image.shape[1] // 2], image[:, image.shape[1] // 2 :]):
         strong = half[..., 0][half[..., 1] > 150]
@@ -36,7 +38,7 @@ def test_both_curves_are_drawn_in_both_panels(metrics, tmp_path):
         assert ((strong > 10) & (strong < 22)).sum() > 100  # orange: the actor
 
 
-def test_a_run_without_an_evaluation_gives_an_empty_figure(tmp_path):
+def test_plot_curves_writes_an_empty_figure_when_there_is_no_evaluation(tmp_path):
     path = tmp_path / "metrics.csv"
     path.write_text("env_frames,minutes,planner_return,actor_return\n")
     plot_curves(path, tmp_path / "curves.png")
