@@ -1,4 +1,8 @@
-"""`benchmark.py ablate`: what each part of a trained planner earns, in paired episodes."""
+"""`benchmark.py ablate --checkpoint DIR`: the return of a trained planner without each of its parts.
+
+All arms play the same starts, so the table shows paired differences of episode returns, with 95 % intervals; decision
+times are in milliseconds.
+"""
 
 from __future__ import annotations
 
@@ -6,7 +10,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
-from bench.arms import NAMES, REFERENCE, Arm, Outcome, check_checkpoint, parse_arms, play_arm, single_thread
+from bench.ablation_arms import NAMES, REFERENCE, Arm, Outcome, check_checkpoint, parse_arms, play_arm, single_thread
 from bench.options import DEVICE_FLAGS, Flags, choose_device, output_path, whole_number
 from bench.report import format_table, interval, number, write_csv, write_json
 from latentplan.config import UserError, to_dict
@@ -60,7 +64,7 @@ def run(flags: Flags) -> int:
 
 
 def compare_arms(outcomes: Sequence[Outcome]) -> dict[str, dict[str, Any]]:
-    """Each arm's mean return and its paired difference to the reference, which comes first, as plain values."""
+    """The mean return of each arm and its paired difference to the first arm, as plain values."""
     from bench.statistics import mean_estimate, paired_difference
 
     reference = outcomes[0].returns
@@ -83,7 +87,7 @@ def compare_arms(outcomes: Sequence[Outcome]) -> dict[str, dict[str, Any]]:
 
 
 def summary_table(compared: dict[str, dict[str, Any]]) -> str:
-    """The comparison for people."""
+    """The comparison as a text table."""
     header = ["arm", "return", "95 %", "minus full", "95 %", "ms p50", "differs from actor"]
     rows = []
     for name, facts in compared.items():
@@ -103,7 +107,7 @@ def summary_table(compared: dict[str, dict[str, Any]]) -> str:
 
 
 def episode_rows(outcomes: Sequence[Outcome], seeds: Sequence[int]) -> list[dict[str, Any]]:
-    """One row per arm and episode."""
+    """Rows of the CSV file: one per arm and episode."""
     return [
         {"arm": outcome.arm.name, "episode": index, "start_seed": seed, "return": total, "decision_ms_p50": median_ms}
         for outcome in outcomes
@@ -112,7 +116,7 @@ def episode_rows(outcomes: Sequence[Outcome], seeds: Sequence[int]) -> list[dict
 
 
 def _play(checkpoint: str, arms: Sequence[Arm], seeds: Sequence[int], device: str, workers: int) -> Iterator[Outcome]:
-    """The outcomes in the order of the arms, each as soon as it and those before it are there."""
+    """Yields the outcomes in the order of the arms, each as soon as it and all arms before it are finished."""
     if workers == 1:
         for arm in arms:
             yield play_arm(checkpoint, arm, seeds, device, 1)

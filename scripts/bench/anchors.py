@@ -1,4 +1,4 @@
-"""Published returns from pixels, to set learning curves beside.
+"""Published returns of training from pixels, for comparison with our learning curves.
 
 Episode returns of `dm_control.suite`, at most 1,000; frames are simulator control steps, before action repeat. Read
 from the result files in the public repositories of TD-MPC2 (nicklashansen/tdmpc2, 3 seeds), DreamerV3

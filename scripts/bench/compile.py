@@ -1,4 +1,8 @@
-"""`benchmark.py compile`: small models of one's own, stepped by Python and with `compile_rollout`."""
+"""`benchmark.py compile`: searches in small models, stepped by Python and with `compile_rollout`.
+
+The table shows median milliseconds per search of both, their ratio, the seconds of compilation, and the largest
+difference of the planned actions.
+"""
 
 from __future__ import annotations
 
@@ -20,7 +24,7 @@ FLAGS = {
     "--json": ("FILE", "result as JSON"),
 }
 SETTINGS = ()
-WARM_UP_PLANS = 3  # torch compiles for the first size, then once more for sizes that vary
+WARM_UP_PLANS = 3  # torch compiles for the first size, then once more for variable sizes
 
 
 def run(flags: Flags) -> int:
@@ -53,7 +57,7 @@ def run(flags: Flags) -> int:
 
 
 def own_models(device: torch.device) -> dict[str, tuple[Model, torch.Tensor]]:
-    """A model of equations and one that is a small network, each with a state (1, n) to plan from."""
+    """A model made of equations and a model that is a small network, each with a start state (1, n)."""
     import torch
 
     from latentplan.planning import FunctionModel
@@ -83,11 +87,11 @@ def own_models(device: torch.device) -> dict[str, tuple[Model, torch.Tensor]]:
 
 
 def measure_model(model: Model, state: torch.Tensor, planner: CEMPlanner, plans: int) -> dict[str, Any]:
-    """Median milliseconds of a search in the model as it is and compiled, from the same noise.
+    """Median milliseconds of a search in the model, stepped and compiled, from the same noise.
 
     Returns:
-        `stepped_ms`, `compiled_ms`, their `ratio`, `compilation_s` (what the first searches took beyond the later ones)
-        and `largest_difference` of the sequences that the two chose.
+        `stepped_ms`, `compiled_ms`, their `ratio`, `compilation_s` (extra seconds of the first compiled searches) and
+        `largest_difference` between the planned action sequences of both.
     """
     import torch
 

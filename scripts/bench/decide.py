@@ -1,4 +1,7 @@
-"""`benchmark.py decide`: how long planner and actor think."""
+"""`benchmark.py decide`: milliseconds per decision of planner and actor, from a frame in memory to an action.
+
+The table shows percentiles over decisions on random frames, and the model steps per decision and environment.
+"""
 
 from __future__ import annotations
 
@@ -72,12 +75,12 @@ def run(flags: Flags) -> int:
 
 
 def measure_decisions(agent: Agent, batch: int, decisions: int) -> dict[str, Any]:
-    """Time from frames in memory to actions, and imagined model steps per decision and environment.
+    """Milliseconds from frames in memory to actions, and model steps per decision and environment.
 
     Args:
-        agent: Who decides; warm-started where it plans.
-        batch: Frames per decision; a single one is given without a batch axis.
-        decisions: Decisions that are timed.
+        agent: The agent; a planner is warm-started.
+        batch: Frames per decision; a single frame has no batch axis.
+        decisions: Number of timed decisions.
 
     Returns:
         `decision_ms` with `p50`, `p95` and `p99`, and `model_steps`.
@@ -102,7 +105,7 @@ def measure_decisions(agent: Agent, batch: int, decisions: int) -> dict[str, Any
 
 @contextmanager
 def counted_model_steps(model: WorldModel) -> Iterator[dict[str, int]]:
-    """Counts the rows that the model imagines one step further, under `rows`, while the context lasts."""
+    """Counts the model steps of all rows, under `rows`, inside the `with` block."""
     counts = {"rows": 0}
 
     def counting(method: Any) -> Any:
@@ -123,7 +126,7 @@ def counted_model_steps(model: WorldModel) -> Iterator[dict[str, int]]:
 
 
 def _load(flags: Flags, composed: Config | None, device: torch.device) -> tuple[WorldModel, Config, float]:
-    """Model, settings and discount: of the checkpoint, or of an untrained agent."""
+    """Model, settings and discount of the checkpoint, or of an untrained agent."""
     if composed is not None:
         import torch
 
@@ -139,7 +142,7 @@ def _load(flags: Flags, composed: Config | None, device: torch.device) -> tuple[
 
 
 def _agents(model: WorldModel, config: Config, discount: float) -> dict[str, Agent]:
-    from bench.arms import without_actor
+    from bench.ablation_arms import without_actor
     from latentplan.agents.actor import ActorAgent
     from latentplan.agents.planning import PlanningAgent
 

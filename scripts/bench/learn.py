@@ -1,4 +1,8 @@
-"""`benchmark.py learn`: learning curves over tasks and seeds, beside published returns."""
+"""`benchmark.py learn --tasks T,T --seeds S,S`: learning curves over tasks and seeds, beside published returns.
+
+Every run is a `train.py` process. The tables show env frames and minutes until a run reaches an evaluation return, and
+final returns as interquartile means with 95 % intervals; `curves.csv`, `summary.json` and `curves.png` hold the same.
+"""
 
 from __future__ import annotations
 
@@ -45,7 +49,7 @@ OWN_FLAGS = {  # settings that these runs differ in, or are told by
 FORWARDED = ("--preset", "--device", "--config")
 FINISHED = "finished.json"
 MODES = ("planner", "actor")
-NEAR = 0.03  # of a number of frames: how far from it an evaluation may be that stands for it
+NEAR = 0.03  # an evaluation counts for a number of env frames within this share of that number
 OWN = "latentplan"
 
 
@@ -82,10 +86,10 @@ def run(flags: Flags) -> int:
 
 
 def read_run(task: str, seed: int, folder: Path, mode: str) -> Curve:
-    """The evaluations that a run recorded, and the one that ended it.
+    """The evaluations of a run, with the final one.
 
     Raises:
-        UserError: There are none, or the files that hold them are damaged.
+        UserError: The run has no evaluation, or its files are damaged.
     """
     from latentplan.reporting.curves import read_curve
 
@@ -106,10 +110,10 @@ def read_run(task: str, seed: int, folder: Path, mode: str) -> Curve:
 
 
 def check_same(config: Config, folder: Path) -> None:
-    """That what a folder holds, if anything, was begun with these settings; only its budget may have been another.
+    """Checks that the run in a folder, if there is one, has these settings, apart from its budget.
 
     Raises:
-        UserError: It was not; the first setting that differs is named.
+        UserError: A setting differs; the message names the first one.
     """
     if not (folder / "config.yaml").exists():
         return
@@ -128,12 +132,12 @@ def _settings(config: Config) -> dict[str, Any]:
 
 
 def first_reaching(curve: Curve, threshold: float) -> Point | None:
-    """The first evaluation of at least `threshold`, or None."""
+    """The first evaluation with a return of at least `threshold`, or None."""
     return next((point for point in curve.points if point.total_return >= threshold), None)
 
 
 def run_facts(curves: Sequence[Curve], thresholds: Sequence[int]) -> list[dict[str, Any]]:
-    """Per run: its clocks, final return, and frames and minutes to each threshold (None where not reached)."""
+    """Per run: env frames, minutes, final return, and frames and minutes to each threshold (None if not reached)."""
     facts = []
     for curve in curves:
         reached = {str(threshold): first_reaching(curve, threshold) for threshold in thresholds}
@@ -153,7 +157,7 @@ def run_facts(curves: Sequence[Curve], thresholds: Sequence[int]) -> list[dict[s
 
 
 def run_table(curves: Sequence[Curve], thresholds: Sequence[int]) -> str:
-    """`run_facts` for people; frames and minutes to a threshold share a cell."""
+    """`run_facts` as a text table; frames and minutes to a threshold share a cell."""
     rows = []
     for facts in run_facts(curves, thresholds):
         cells = [f"{facts['task']} seed {facts['seed']}", number(facts["env_frames"], 0), number(facts["minutes"])]
@@ -166,7 +170,7 @@ def run_table(curves: Sequence[Curve], thresholds: Sequence[int]) -> str:
 
 
 def final_estimates(curves: Sequence[Curve]) -> dict[str, dict[str, Any]]:
-    """Interquartile mean of the final returns with its interval, by task and, of several, over all."""
+    """Interquartile mean of the final returns with its interval, by task and, for several tasks, over all."""
     from bench.statistics import interquartile_estimate
 
     groups: dict[str, list[float]] = {}
@@ -182,12 +186,13 @@ def final_estimates(curves: Sequence[Curve]) -> dict[str, dict[str, Any]]:
 
 
 def compare(task: str, curves: Sequence[Curve], thresholds: Sequence[int]) -> dict[str, dict[str, Any]]:
-    """A task's runs beside what is published, by method, its own first.
+    """Our runs of a task and published results, by method; our runs come first.
 
     Returns:
-        Per method `returns` by frames (of its own runs the interquartile mean over those evaluated near so many frames,
-        with `intervals`), and `frames_to` each threshold: of published methods the first of the frames at which a
-        return is known, of the runs their median, None where half of them or more do not reach it.
+        Per method `returns` by env frames (for our runs the interquartile mean over the evaluations near that number of
+        frames, with `intervals`), and `frames_to` each threshold. For published methods `frames_to` is the first number
+        of frames with a known return above the threshold; for our runs the median, None if half of them do not reach
+        the threshold.
     """
     from bench.statistics import interquartile_estimate
 
@@ -209,7 +214,7 @@ def compare(task: str, curves: Sequence[Curve], thresholds: Sequence[int]) -> di
 
 
 def anchor_table(task: str, rows: Mapping[str, Mapping[str, Any]], thresholds: Sequence[int]) -> str:
-    """What `compare` found, for people."""
+    """The result of `compare` as a text table."""
     table = []
     for method, facts in rows.items():
         cells = [number(facts["returns"].get(frames), 0) for frames in FRAMES]
@@ -220,7 +225,7 @@ def anchor_table(task: str, rows: Mapping[str, Mapping[str, Any]], thresholds: S
 
 
 def _nearest(curve: Curve, frames: int) -> Point | None:
-    """The evaluation nearest to so many frames; None where all are too far off."""
+    """The evaluation nearest to a number of env frames; None if none is near enough (see `NEAR`)."""
     point = min(curve.points, key=lambda point: abs(point.env_frames - frames))
     return point if abs(point.env_frames - frames) <= NEAR * frames else None
 
@@ -232,7 +237,7 @@ def _median_frames(curves: Sequence[Curve], threshold: int) -> float | None:
 
 
 def _train(task: str, seed: int, folder: Path, budget: list[str], extra: list[str]) -> None:
-    """Run `train.py` in its own process, unless the folder holds the finished run already."""
+    """Runs `train.py` in a process of its own, unless the folder holds the finished run already."""
     marker = folder / FINISHED
     if _finished_with(marker) == budget:
         print(f"{folder} is finished and not repeated", flush=True)
@@ -242,7 +247,7 @@ def _train(task: str, seed: int, folder: Path, budget: list[str], extra: list[st
     script = Path(__file__).resolve().parent.parent / "train.py"
     print(f"training {task}, seed {seed}", flush=True)
     training = subprocess.Popen([sys.executable, str(script), *arguments])
-    previous = signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches the run too, which has to save itself
+    previous = signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches the run too, which then saves its state
     try:
         code = training.wait()
     finally:
@@ -255,7 +260,7 @@ def _train(task: str, seed: int, folder: Path, budget: list[str], extra: list[st
 
 
 def _finished_with(marker: Path) -> list[str] | None:
-    """The budget of a finished run; None where there is none, or nothing that can be read of it."""
+    """The budget of a finished run; None if the run is not finished or its marker cannot be read."""
     try:
         budget: list[str] = json.loads(marker.read_text())["budget"]
     except (OSError, ValueError, TypeError, KeyError):

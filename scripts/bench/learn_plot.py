@@ -1,4 +1,4 @@
-"""Learning curves, and how they are drawn."""
+"""Learning curves of `benchmark.py learn`, and their figure."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from bench.anchors import METHODS, published
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-MARKERS = "sD^v<>PX*hp"  # of METHODS
+MARKERS = "sD^v<>PX*hp"  # one per method of METHODS
 
 
 class Point(NamedTuple):
@@ -31,15 +31,15 @@ class Curve(NamedTuple):
 
 
 def plot_runs(curves: Sequence[Curve], mode: str, png: Path) -> None:
-    """Evaluation return against frames: a panel per task, two in a row, and a line per seed."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    """Draws evaluation returns against env frames: one panel per task, two in a row, one line per seed."""
     from matplotlib.figure import Figure
     from matplotlib.ticker import EngFormatter
+
+    from latentplan.reporting.curves import save_figure
 
     tasks = list(dict.fromkeys(curve.task for curve in curves))
     rows, columns = (len(tasks) + 1) // 2, min(2, len(tasks))
     figure = Figure(figsize=(6.5 * columns, 4 * rows), layout="constrained")
-    FigureCanvasAgg(figure)
     for place, task in enumerate(tasks, start=1):
         axes = figure.add_subplot(rows, columns, place)
         for curve in (curve for curve in curves if curve.task == task):
@@ -51,11 +51,11 @@ def plot_runs(curves: Sequence[Curve], mode: str, png: Path) -> None:
         axes.xaxis.set_major_formatter(EngFormatter(sep=""))
         axes.grid(alpha=0.25)
         axes.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), frameon=False, fontsize="small")
-    figure.savefig(png, dpi=120, format="png")
+    save_figure(figure, png)
 
 
 def _mark_published(axes: Axes, task: str, last: float) -> None:
-    """What methods are known to earn at the frames that a panel shows."""
+    """Marks published returns at the env frames that a panel shows."""
     for method, known in published(task).items():
         marker = MARKERS[METHODS.index(method)]
         shown = {frames: value for frames, value in known.items() if frames <= last}

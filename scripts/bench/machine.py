@@ -1,4 +1,4 @@
-"""What the machine can do at best, to judge what the program does by."""
+"""Description of the machine, its peak FLOP/s, and a clock that waits for the device."""
 
 from __future__ import annotations
 
@@ -26,21 +26,21 @@ def describe_machine(device: torch.device) -> dict[str, Any]:
 
 
 def processor_name() -> str:
-    """What the processor calls itself."""
+    """Model name of the processor."""
     try:
         lines = Path("/proc/cpuinfo").read_text().splitlines()
         return next(line.partition(":")[2].strip() for line in lines if line.startswith("model name"))
-    except (OSError, StopIteration):  # not Linux, or an architecture that names no model
+    except (OSError, StopIteration):  # no Linux, or an architecture without a model name
         return platform.processor() or platform.machine()
 
 
 def product_limits(device: torch.device, size: int | None = None, repeats: int = 4) -> dict[str, float]:
-    """FLOP/s of the fastest of a few big square matrix products, by precision.
+    """Peak FLOP/s by precision: the fastest of a few large square matrix products.
 
     Args:
-        device: Where to compute.
+        device: Device that computes the products.
         size: Rows and columns; None takes a size that fills the device.
-        repeats: Products timed, after one that is not.
+        repeats: Number of timed products, after one for warm-up.
     """
     size = size or PRODUCT_SIZES[device.type]
     limits = {}
@@ -57,7 +57,7 @@ def product_limits(device: torch.device, size: int | None = None, repeats: int =
 
 
 def now(device: torch.device) -> float:
-    """Seconds on a steady clock, when everything asked of the device is done."""
+    """Seconds of a monotonic clock, read after the device has finished all its work."""
     if device.type == "cuda":
         torch.cuda.synchronize(device)
     return time.perf_counter()

@@ -1,4 +1,7 @@
-"""`benchmark.py plan`: our planner beside other libraries, on the same model with the same settings."""
+"""`benchmark.py plan`: our planner beside planners of other libraries, on the same model with the same settings.
+
+The table shows milliseconds per search as percentiles, and ratios to our planner and to the matrix products alone.
+"""
 
 from __future__ import annotations
 
@@ -45,12 +48,12 @@ Times = dict[tuple[str, str], list[float]]
 
 
 class Arm(NamedTuple):
-    """What is timed.
+    """A planner that is timed.
 
     Attributes:
-        planner: Whose search.
-        dtype: Of the model's trunk.
-        search_ms: One search, in milliseconds.
+        planner: Name of the planner.
+        dtype: Precision of the model's trunk.
+        search_ms: Runs one search and returns its milliseconds.
     """
 
     planner: str
@@ -59,12 +62,12 @@ class Arm(NamedTuple):
 
 
 class Comparison(NamedTuple):
-    """What was measured.
+    """Times of all planners.
 
     Attributes:
         times: Milliseconds of each search, by planner and dtype.
-        versions: Of the peers that took part.
-        left_out: Why the others did not.
+        versions: Version of each other library that took part.
+        left_out: Reason for each library that did not take part.
     """
 
     times: Times
@@ -104,7 +107,7 @@ def run(flags: Flags) -> int:
     print(f"{machine['name']} ({device.type}, {machine['threads']} threads), {config.env.domain}, {sizes}")
     print(table(result))
     if plot_path is not None:
-        from bench.scaling import measure_scaling, plot_scaling, scaling_table
+        from bench.plan_scaling import measure_scaling, plot_scaling, scaling_table
 
         result["scaling"] = measure_scaling(problem, result["best_dtype"])
         print(scaling_table(result["scaling"]))
@@ -144,7 +147,7 @@ def compare(problem: Problem, peers: Sequence[str], plans: int, folder: Path = F
 def own_arms(problem: Problem) -> list[Arm]:
     """Our planner, a plain loop, and the matrix products alone."""
     from bench.peers.problem import DTYPES
-    from bench.searches import matrix_products, our_search, plain_search, timed
+    from bench.plan_searches import matrix_products, our_search, plain_search, timed
 
     return [
         *(Arm(OURS, dtype, timed(our_search(problem, dtype), problem)) for dtype in DTYPES),
@@ -154,11 +157,11 @@ def own_arms(problem: Problem) -> list[Arm]:
 
 
 def summarise(times: Times, threads: int) -> dict[str, Any]:
-    """Percentiles of every planner and the ratios between them; a ratio without a peer is None.
+    """Percentiles of every planner and the ratios between them; a ratio to other libraries is None without one.
 
     Args:
         times: Milliseconds of each search by planner and dtype, those of `OURS` and `PRODUCTS` among them.
-        threads: CPU threads that all had.
+        threads: CPU threads of every planner.
     """
     import numpy as np
 
@@ -186,7 +189,7 @@ def summarise(times: Times, threads: int) -> dict[str, Any]:
 
 
 def table(result: dict[str, Any]) -> str:
-    """The comparison for people."""
+    """The comparison as a text table."""
     best, limits = result["best_dtype"], result["matrix_limit_ms"]
     ours = next(row["p50_ms"] for row in result["rows"] if row["planner"] == OURS and row["dtype"] == best)
     lines = [
@@ -234,7 +237,7 @@ def _take_turns(arms: Sequence[Arm], plans: int, left_out: dict[str, str]) -> Ti
 
 @contextmanager
 def _leaving_out(name: str, left_out: dict[str, str]) -> Iterator[None]:
-    """Notes why a peer cannot take part, and goes on without it."""
+    """Records the reason if a library cannot take part, and goes on without it."""
     try:
         yield
     except PeerError as error:

@@ -1,4 +1,8 @@
-"""`benchmark.py realtime`: what thinking earns and what it costs, in worlds that wait and in worlds that do not."""
+"""`benchmark.py realtime --checkpoint DIR`: return and decision time, with and without an environment that waits.
+
+Four parts: returns by the iterations of a search, by the control rate (Hz) of an environment that does not wait, by the
+number of actions executed from each plan, and the model's prediction error by model steps. Times are in milliseconds.
+"""
 
 from __future__ import annotations
 
@@ -12,7 +16,7 @@ from latentplan.config import UserError, to_dict
 from latentplan.config.files import raise_unknown
 
 if TYPE_CHECKING:
-    from bench.clocked import Row, Trial
+    from bench.realtime_measurements import Row, Trial
 
 PARTS = ("iterations", "rates", "error", "replan")
 FLAGS = {
@@ -40,9 +44,9 @@ def run(flags: Flags) -> int:
     rates = [positive_number({"--rates": word}, "--rates", 0.0) for word in words(flags, "--rates", "25,50,100,200")]
     json_path, plot_path = output_path(flags, "--json"), output_path(flags, "--plot")
     device = choose_device(flags)
-    from bench.arms import check_checkpoint
-    from bench.clocked import Trial
+    from bench.ablation_arms import check_checkpoint
     from bench.machine import describe_machine
+    from bench.realtime_measurements import Trial
     from latentplan.agents.checkpoint import load_model
     from latentplan.envs import make_env
     from latentplan.evaluation.episodes import episode_seed
@@ -79,8 +83,8 @@ def run(flags: Flags) -> int:
 
 
 def measure_parts(trial: Trial, parts: Sequence[str], rates: Sequence[float]) -> Iterator[tuple[str, Row]]:
-    """Each point of each part, as soon as it is known."""
-    from bench.clocked import measure_error, measure_iterations, measure_rates, measure_replanning
+    """Yields each row of each part, as soon as it is measured."""
+    from bench.realtime_measurements import measure_error, measure_iterations, measure_rates, measure_replanning
 
     rows = {
         "iterations": lambda: measure_iterations(trial),
@@ -94,7 +98,7 @@ def measure_parts(trial: Trial, parts: Sequence[str], rates: Sequence[float]) ->
 
 
 def part_table(part: str, rows: Sequence[Row]) -> str:
-    """A part for people."""
+    """A part as a text table."""
     columns = {
         "iterations": ("iterations", *_RETURN, *_LATENCY),
         "rates": ("agent", "Hz", *_RETURN, *_LATENCY, "missed", "planned"),

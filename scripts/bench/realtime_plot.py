@@ -1,8 +1,7 @@
-"""The picture of `benchmark.py realtime`: a panel per part that was measured."""
+"""Figure of `benchmark.py realtime`: one panel per part that was measured."""
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -19,14 +18,15 @@ AGENT_STYLES = {
 
 
 def plot_realtime(result: Mapping[str, Rows], png: Path) -> None:
-    """Draws the parts that have rows, side by side in two columns, and replaces the file whole.
+    """Draws the parts that have rows, in two columns.
 
     Args:
         result: Rows by part, as in the JSON.
-        png: Where the picture goes.
+        png: Path of the figure.
     """
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
+
+    from latentplan.reporting.curves import save_figure
 
     panels: dict[str, Callable[[Any, Rows], None]] = {
         "rates": _draw_rates,
@@ -40,16 +40,13 @@ def plot_realtime(result: Mapping[str, Rows], png: Path) -> None:
     columns = min(2, len(chosen))
     lines = -(-len(chosen) // columns)
     figure = Figure(figsize=(6.0 * columns, 4.2 * lines), layout="constrained")
-    FigureCanvasAgg(figure)
     grid = figure.subplots(lines, columns, squeeze=False).ravel()
     for axes, (draw, rows) in zip(grid, chosen, strict=False):
         draw(axes, rows)
         axes.grid(alpha=0.3)
     for axes in grid[len(chosen) :]:
         axes.set_visible(False)
-    partial = png.with_name(f".{png.name}.{os.getpid()}")
-    figure.savefig(partial, dpi=120, format="png")
-    partial.replace(png)
+    save_figure(figure, png)
 
 
 def _draw_rates(axes: Any, rows: Rows) -> None:
@@ -57,13 +54,13 @@ def _draw_rates(axes: Any, rows: Rows) -> None:
     for index, (name, (colour, marker, label)) in enumerate(AGENT_STYLES.items()):
         own = sorted((row for row in rows if row["agent"] == name), key=lambda row: row["control_hz"])
         if own:
-            # A little apart, so that intervals of different agents can be told from each other.
+            # A small shift per agent, so that the intervals of agents do not overlap.
             shift = 1.0 + 0.035 * (index - 2)
             _draw_returns(axes, [row["control_hz"] * shift for row in own], own, colour, marker, label)
     axes.set_xscale("log")
     axes.set_xticks(rates, [f"{rate:g}" for rate in rates], minor=False)
     axes.set_xticks([], minor=True)
-    axes.set_xlabel("decisions per second of a world that does not wait")
+    axes.set_xlabel("decisions per second of an environment that does not wait")
     axes.set_title("Return by control rate")
     axes.legend(frameon=False, loc="upper center", bbox_to_anchor=(0.5, -0.16), ncols=3, fontsize="small")
 
@@ -108,7 +105,7 @@ def _draw_replanning(axes: Any, rows: Rows) -> None:
 
 
 def _draw_returns(axes: Any, positions: Sequence[float], rows: Rows, colour: str, marker: str, label: str) -> None:
-    """Mean returns with their intervals, which single episodes do not have."""
+    """Draws mean returns, with their intervals if there are any (a single episode has none)."""
     means = [row["mean_return"] for row in rows]
     axes.plot(positions, means, marker=marker, color=colour, label=label, linewidth=1.5, markersize=5)
     for position, row in zip(positions, rows, strict=True):

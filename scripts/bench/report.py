@@ -1,4 +1,4 @@
-"""Results as compact tables, JSON and CSV."""
+"""Results as text tables, JSON and CSV."""
 
 from __future__ import annotations
 
@@ -15,20 +15,20 @@ from latentplan.config import UserError
 
 
 def format_table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """Columns as wide as they need, the first to the left, the others to the right."""
+    """A text table; the first column is left-aligned, the others are right-aligned."""
     widths = [max(len(line[column]) for line in (header, *rows)) for column in range(len(header))]
     return "\n".join(_aligned(line, widths) for line in (header, ["-" * width for width in widths], *rows))
 
 
 def number(value: float | None, digits: int = 1, sign: bool = False) -> str:
-    """A number for a table; `-` where there is none."""
+    """A number for a table; `-` for None and NaN."""
     if value is None or math.isnan(value):
         return "-"
     return f"{value:{'+' if sign else ''},.{digits}f}"
 
 
 def interval(ends: Sequence[float | None], digits: int = 1, sign: bool = False) -> str:
-    """An interval for a table; `-` where there is none."""
+    """An interval for a table; `-` if an end is None."""
     low, high = ends
     if low is None or high is None:
         return "-"
@@ -36,13 +36,13 @@ def interval(ends: Sequence[float | None], digits: int = 1, sign: bool = False) 
 
 
 def write_json(path: Path | None, result: Mapping[str, Any]) -> None:
-    """Replace the file whole; without a path, nothing happens."""
+    """Writes a result as JSON, if there is a path; the file is replaced as a whole."""
     if path is not None:
         _replace(path, json.dumps(result, indent=2) + "\n")
 
 
 def write_csv(path: Path | None, rows: Sequence[Mapping[str, Any]]) -> None:
-    """Replace the file whole, its columns those of the first row; without a path, nothing happens."""
+    """Writes rows as CSV with the columns of the first row, if there is a path; the file is replaced as a whole."""
     if path is None:
         return
     text = io.StringIO(newline="")

@@ -1,4 +1,8 @@
-"""`benchmark.py soak`: deadlines missed on the wall clock, beside those that the machine itself misses."""
+"""`benchmark.py soak --checkpoint DIR`: deadlines that agents miss on the wall clock.
+
+Agents take turns on recorded frames with an agent that does nothing, whose misses are those of the machine. The table
+shows missed deadlines per 10,000 decisions; decision times and wake-up delays are in milliseconds.
+"""
 
 from __future__ import annotations
 
@@ -34,19 +38,19 @@ FLAGS = {
 SETTINGS = ()
 NUM_FRAMES = 250
 WARM_UP_DECISIONS = 5
-DEADLINE_SHARE = 0.3  # of a period, for a search; seeing and doubting take as much, the rest is the machine's
-PAUSE_SECONDS = 0.2  # between blocks, so that what one agent still searches does not disturb the next
+DEADLINE_SHARE = 0.3  # share of a period for a search; encoding and gating take as much, the machine takes the rest
+PAUSE_SECONDS = 0.2  # between blocks, so that a search in the background does not disturb the next agent
 
 
 @dataclass
 class Tally:
-    """What one agent did.
+    """Decisions and missed deadlines of one agent.
 
     Attributes:
-        due: Boundaries at which a decision was due.
-        misses: Those at which the agent was still busy with an earlier one.
-        decision_ms: From a frame in memory to an action.
-        wake_ms: From a boundary to the loop's awakening, which is the machine's doing.
+        due: Number of period boundaries at which a decision was due.
+        misses: Number of boundaries at which the agent was still busy with an earlier decision.
+        decision_ms: Milliseconds of each decision, from a frame in memory to an action.
+        wake_ms: Milliseconds from each boundary until the operating system woke the loop.
     """
 
     due: int = 0
@@ -56,13 +60,13 @@ class Tally:
 
 
 class IdleAgent:
-    """Decides nothing, so that what it misses is what the machine misses."""
+    """Does nothing, so that its missed deadlines are those of the machine."""
 
     def act(self, frame: np.ndarray) -> None:
-        """Nothing."""
+        """Does nothing."""
 
     def reset(self) -> None:
-        """Nothing to forget."""
+        """Does nothing."""
 
 
 def run(flags: Flags) -> int:
@@ -112,15 +116,15 @@ def take_turns(
     block: int,
     tallies: Mapping[str, Tally],
 ) -> None:
-    """Plays blocks of every agent in turn, so that the machine's noise meets them all.
+    """Plays blocks of every agent in turn, so that noise of the machine affects all agents.
 
     Args:
-        agents: By name.
-        frames: uint8 (64, 64, 3) each, shown again and again.
+        agents: Agents by name.
+        frames: Frames uint8 (64, 64, 3), repeated in a cycle.
         control_hz: Decisions per second.
-        decisions: That are due of each agent.
-        block: Decisions of one agent before the next takes over.
-        tallies: By name; filled.
+        decisions: Number of due decisions of each agent.
+        block: Number of due decisions of one agent before the next agent takes over.
+        tallies: Tallies by name, which are updated.
     """
     for first in range(0, decisions, block):
         for name, agent in agents.items():
@@ -134,7 +138,7 @@ def take_turns(
 def play_block(
     agent: Agent | IdleAgent, frames: Sequence[np.ndarray], control_hz: float, due: int, tally: Tally
 ) -> None:
-    """Decides at the boundaries of the wall clock; one that passes while the agent is busy is missed."""
+    """Decides at the period boundaries of the wall clock; a boundary is missed if the agent is still busy."""
     period = 1.0 / control_hz
     began = time.perf_counter() + period
     boundary = 0
@@ -152,7 +156,7 @@ def play_block(
 
 
 def soak_rows(tallies: Mapping[str, Tally]) -> dict[str, dict[str, Any]]:
-    """What each agent did, as plain values; agents that had no turn are left out."""
+    """Decisions and misses of each agent, as plain values; agents without a turn are left out."""
     import numpy as np
 
     from latentplan.evaluation.statistics import latency_percentiles
@@ -176,7 +180,7 @@ def soak_rows(tallies: Mapping[str, Tally]) -> dict[str, dict[str, Any]]:
 
 
 def soak_table(rows: Mapping[str, dict[str, Any]]) -> str:
-    """The agents for people."""
+    """The agents as a text table."""
     header = ["agent", "due", "missed", "per 10,000", "minus no-op", "ms p50", "p99", "max", "wake p99"]
     lines = [
         [
@@ -194,7 +198,7 @@ def soak_table(rows: Mapping[str, dict[str, Any]]) -> str:
 
 
 def _record_frames(checkpoint: Path, device: str) -> list[np.ndarray]:
-    """What the actor sees in an episode, held in memory."""
+    """Observations of an episode of the actor."""
     from latentplan.agents.checkpoint import load_agent, load_model
     from latentplan.envs import make_env
 
@@ -215,7 +219,7 @@ def _record_frames(checkpoint: Path, device: str) -> list[np.ndarray]:
 
 @contextlib.contextmanager
 def _loaded_agents(checkpoint: str, modes: Sequence[str], device: str, deadline_ms: float) -> Any:
-    """The agents by name, ready to act; those that search before they act have a deadline."""
+    """The agents by name, ready to act; agents that search before they act have a deadline."""
     from latentplan.agents.background import BackgroundAgent
     from latentplan.agents.checkpoint import load_agent
 

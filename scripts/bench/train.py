@@ -1,4 +1,7 @@
-"""`benchmark.py train`: what an update costs, part by part."""
+"""`benchmark.py train`: time of an update of the learner, part by part, on synthetic replay.
+
+The table shows milliseconds, GFLOP and GFLOP/s of each part, beside the GFLOP/s of a large matrix product.
+"""
 
 from __future__ import annotations
 
@@ -34,7 +37,7 @@ def run(flags: Flags) -> int:
     import torch
 
     from bench.machine import describe_machine, product_limits
-    from bench.update import measure_update
+    from bench.train_update import measure_update
     from latentplan.training.resources import set_up_torch
 
     set_up_torch(torch.get_num_threads(), device)  # as a run does

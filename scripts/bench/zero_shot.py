@@ -1,4 +1,9 @@
-"""`benchmark.py zero-shot`: goals that an agent was not trained for, pursued by planner, actor and chance."""
+"""`benchmark.py zero-shot --checkpoint DIR --objectives "A | B"`: goals that the agent was not trained for.
+
+Every objective and constraint is played by planner, gated agent, actor and random actions from the same starts. A
+score is the return of the objective, or for a constraint the share of env frames that violate it, both from the true
+quantities of the simulator; decision times are in milliseconds.
+"""
 
 from __future__ import annotations
 
@@ -7,7 +12,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from bench.arms import check_checkpoint, single_thread
+from bench.ablation_arms import check_checkpoint, single_thread
 from bench.options import (
     DEVICE_FLAGS,
     Flags,
@@ -55,10 +60,10 @@ class Job(NamedTuple):
     """One row of the result.
 
     Attributes:
-        objective: What is scored, or None.
-        constraint: What is scored, or None.
-        player: Who plays; see `make_player`. `unconstrained` is a planner that does not know of the constraint,
-            `trained planner` and `trained actor` are another checkpoint's, which are told nothing.
+        objective: Objective that is scored, or None.
+        constraint: Constraint that is scored, or None.
+        player: Name of the agent; see `load_zero_shot_agent`. `unconstrained` is a planner without the constraint;
+            `trained planner` and `trained actor` are agents of another checkpoint, without objective and constraint.
     """
 
     objective: str | None
@@ -67,12 +72,12 @@ class Job(NamedTuple):
 
 
 class Conditions(NamedTuple):
-    """What all rows share.
+    """Conditions that all rows share.
 
     Attributes:
         checkpoint: Folder of the agent or run.
-        seeds: Of each episode's start.
-        device: Where the agent computes.
+        seeds: Seed of the start of each episode.
+        device: Device of the agent, `cpu` or `cuda`.
         planner: Settings of the search that differ from the agent's.
         push: Standard deviation of kicks to the joints' velocities, in m/s or rad/s; 0 for none.
         trained: Folder of the agent that was trained for the objectives, or None.
@@ -165,7 +170,7 @@ def list_jobs(flags: Flags) -> list[Job]:
 
 
 def play_job(conditions: Conditions, job: Job) -> dict[str, Any]:
-    """Play one episode per seed and score it by the true quantities.
+    """Plays one episode per seed and scores it by the true quantities of the simulator.
 
     Returns:
         The row: `goal`, `kind` (`objective` or `constraint`), `player`, the score of each episode in `scores`
@@ -174,8 +179,8 @@ def play_job(conditions: Conditions, job: Job) -> dict[str, Any]:
     """
     import torch
 
-    from bench.players import make_player
     from bench.statistics import mean_estimate
+    from bench.zero_shot_agents import load_zero_shot_agent
     from latentplan.agents.checkpoint import load_model
     from latentplan.envs import make_env
     from latentplan.evaluation.episodes import run_episodes
@@ -189,10 +194,10 @@ def play_job(conditions: Conditions, job: Job) -> dict[str, Any]:
         checkpoint, player, search = conditions.trained, job.player.removeprefix("trained "), {}
     _, config, _ = load_model(checkpoint)
     own = config if checkpoint == conditions.checkpoint else load_model(conditions.checkpoint)[1]
-    agent = make_player(player, checkpoint, conditions.device, search)
+    agent = load_zero_shot_agent(player, checkpoint, conditions.device, search)
     goals = read_goals(job.objective, job.constraint, config.env.domain)
     assert goals is not None, "a job names an objective or a constraint"
-    # Each in the world that it knows, and all paid by the same task.
+    # Each agent plays in the environment of its own training, with the reward of the same task.
     env = make_env(replace(goal_env(config.env), task=own.env.task, objective=own.env.objective))
     try:
         scored = score_env(env, goals, agent if job.player in PURSUERS else None)
@@ -220,7 +225,7 @@ def play_job(conditions: Conditions, job: Job) -> dict[str, Any]:
 
 
 def summary_table(rows: Sequence[dict[str, Any]]) -> str:
-    """The rows for people: scores are objective returns, or for constraints violation rates."""
+    """The rows as a text table; scores are objective returns, or for constraints violation rates."""
     header = ["goal", "player", "score", "95 %", "task return", "95 %", "planned", "ms p50"]
     lines = [
         [
@@ -250,7 +255,7 @@ def _check_goals(jobs: Sequence[Job], domain: str) -> None:
 
 
 def _pusher(env: SuiteEnv, conditions: Conditions) -> Callable[[Step], None] | None:
-    """What kicks the body before a decision is executed: the same kicks at the same moments whoever plays."""
+    """A callback that kicks the body before decisions; kicks depend on the episode's seed and the decision only."""
     if conditions.push == 0.0:
         return None
     import numpy as np
@@ -265,7 +270,7 @@ def _pusher(env: SuiteEnv, conditions: Conditions) -> Callable[[Step], None] | N
 
 
 def _play(conditions: Conditions, jobs: Sequence[Job], workers: int) -> Iterator[dict[str, Any]]:
-    """The rows in order, each as soon as it and those before it are there."""
+    """Yields the rows in order, each as soon as it and all rows before it are finished."""
     if workers == 1:
         for job in jobs:
             yield play_job(conditions, job)

@@ -18,13 +18,13 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "scripts"))
 
 import benchmark  # noqa: E402
 from bench.ablate import compare_arms  # noqa: E402
-from bench.arms import NAMES, Arm, Outcome, parse_arms  # noqa: E402
+from bench.ablation_arms import NAMES, Arm, Outcome, parse_arms  # noqa: E402
 from bench.decide import measure_decisions  # noqa: E402
 from bench.machine import product_limits  # noqa: E402
 from bench.render import measure_qualities  # noqa: E402
 from bench.report import format_table, interval, number  # noqa: E402
 from bench.statistics import interquartile_estimate, interquartile_mean, paired_difference  # noqa: E402
-from bench.update import PARTS, measure_graph, measure_update  # noqa: E402
+from bench.train_update import PARTS, measure_graph, measure_update  # noqa: E402
 
 ENV = EnvConfig(domain="cartpole", task="swingup", action_repeat=100, render_quality="fastest")
 MODEL = ModelConfig(deter_dim=8, hidden_dim=8, encoder_channels=(4, 4), decoder_channels=2, num_bins=5)

@@ -19,8 +19,8 @@ from bench.peers.client import PeerProcess  # noqa: E402
 from bench.peers.install import PEERS, Peer, PeerError, last_line  # noqa: E402
 from bench.peers.problem import Problem, as_state, build_model, next_features, rewards_at, start_state  # noqa: E402
 from bench.plan import OURS, PLAIN, PRODUCTS, compare, summarise  # noqa: E402
-from bench.scaling import scaling_table  # noqa: E402
-from bench.searches import matrix_products, our_search, plain_search, product_shapes  # noqa: E402
+from bench.plan_scaling import scaling_table  # noqa: E402
+from bench.plan_searches import matrix_products, our_search, plain_search, product_shapes  # noqa: E402
 
 MODEL = ModelConfig(deter_dim=8, hidden_dim=12, encoder_channels=(4, 4), decoder_channels=2, num_bins=5)
 PROBLEM = Problem(
@@ -184,7 +184,7 @@ def test_an_installed_peer_is_not_installed_again(tmp_path, monkeypatch):
 def test_a_peer_answers_from_its_own_process_until_it_fails(tmp_path, monkeypatch):
     lines = [
         "from bench.peers.serve import serve",
-        "from bench.searches import plain_search",
+        "from bench.plan_searches import plain_search",
         "def make_search(problem, model):",
         "    print('libraries talk')",
         "    if type(model).__name__ == 'WorldModel': raise RuntimeError('no half precision here')",

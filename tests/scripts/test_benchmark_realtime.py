@@ -14,8 +14,8 @@ from latentplan.models import WorldModel
 sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "scripts"))
 
 import benchmark  # noqa: E402
-from bench.clocked import AGENTS, ITERATIONS, REPLAN_EVERY  # noqa: E402
 from bench.realtime import PARTS, part_table  # noqa: E402
+from bench.realtime_measurements import AGENTS, ITERATIONS, REPLAN_EVERY  # noqa: E402
 from bench.soak import IDLE, IdleAgent, Tally, play_block, soak_rows, soak_table, take_turns  # noqa: E402
 
 ENV = EnvConfig(domain="cartpole", task="swingup", action_repeat=100, render_quality="fastest")

@@ -102,12 +102,12 @@ def test_kicks_are_the_same_for_every_player_and_change_what_they_earn(checkpoin
 
 
 def test_the_plain_gate_acts_by_its_actor_wherever_it_does_not_plan(checkpoint):
-    from bench.players import make_player
+    from bench.zero_shot_agents import load_zero_shot_agent
 
     frames = torch.randint(0, 256, (12, 64, 64, 3), dtype=torch.uint8).numpy()
     sources = {}
     for player in ("random gate", "random moments"):
-        agent = make_player(player, str(checkpoint), "cpu", {"horizon": 2})
+        agent = load_zero_shot_agent(player, str(checkpoint), "cpu", {"horizon": 2})
         agent.set_objective("cart -> 1.0")
         sources[player] = []
         for frame in frames:
@@ -140,8 +140,8 @@ def test_bad_goals_are_one_line(capsys, checkpoint, flags, reason):
 
 
 def test_all_who_pursue_a_goal_search_alike(checkpoint):
-    from bench.players import make_player
+    from bench.zero_shot_agents import load_zero_shot_agent
 
     changes = {"horizon": 2}
-    searches = [make_player(player, str(checkpoint), "cpu", changes).controller.planner for player in PURSUERS]
+    searches = [load_zero_shot_agent(player, str(checkpoint), "cpu", changes).controller.planner for player in PURSUERS]
     assert {(search.horizon, search.goal_horizon) for search in searches} == {(2, None)}

@@ -1,1 +1,1 @@
-"""Other planner libraries on the same model: where they live, each in a process of its own, and how they are asked."""
+"""Planners of other libraries on the same model, each in a process of its own, with an environment of their own."""

@@ -1,4 +1,4 @@
-"""This side of a peer: its process, and questions to it."""
+"""Our side of a peer (a planner of another library): its process, and requests to it."""
 
 from __future__ import annotations
 
@@ -14,15 +14,15 @@ SCRIPTS = Path(__file__).resolve().parents[2]
 
 
 class PeerProcess:
-    """A peer that waits in a process of its own until it is asked for a search; it knows its `name` and `version`.
+    """A peer in a process of its own, which runs one search per request; `name` and `version` name the library.
 
     Args:
         name: One of `PEERS`.
-        problem: What it searches.
-        folder: Where the peers' environment lives.
+        problem: The search.
+        folder: Folder of the peers' Python environment.
 
     Raises:
-        PeerError: It cannot be installed.
+        PeerError: The library cannot be installed.
     """
 
     def __init__(self, name: str, problem: Problem, folder: Path) -> None:
@@ -43,10 +43,10 @@ class PeerProcess:
             )
 
     def search_ms(self, dtype: str) -> float:
-        """Milliseconds of one search, the model's trunk in `float32` or `bfloat16`.
+        """Milliseconds of one search, with the trunk of the model in `float32` or `bfloat16`.
 
         Raises:
-            PeerError: It failed; the last line of its own error is told.
+            PeerError: The search failed; the message is the last line of the error.
         """
         assert self._process.stdin is not None and self._process.stdout is not None
         try:
@@ -56,7 +56,9 @@ class PeerProcess:
             answer = ""
         if not answer:
             self._process.wait()
-            raise PeerError(last_line(self._log.read_text(errors="replace")) or "it ended without a word")
+            raise PeerError(
+                last_line(self._log.read_text(errors="replace")) or "its process ended without an error message"
+            )
         return float(json.loads(answer)["ms"])
 
     def close(self) -> None:

@@ -1,4 +1,4 @@
-"""pytorch_icem's iCEM, with rewards judged for all steps at once."""
+"""pytorch_icem's iCEM, with the rewards of all steps computed at once."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ def make_search(problem: Problem, model: WorldModel) -> Search:
     """A cold search from the problem's start."""
     features = start_state(problem).features[0]
     controller = iCEM(
-        lambda rows, action: next_features(model, rows, action.clamp(-1.0, 1.0)),  # it knows no bounds
+        lambda rows, action: next_features(model, rows, action.clamp(-1.0, 1.0)),  # iCEM here has no action bounds
         lambda rows, actions: -rewards_at(model, rows).sum(-1),
         nx=len(features),
         nu=1,
@@ -28,7 +28,7 @@ def make_search(problem: Problem, model: WorldModel) -> Search:
         warmup_iters=problem.iterations,
         device=problem.device,
     )
-    # Its constructor takes sigma for one-dimensional actions only; the search itself broadcasts over any number.
+    # The constructor accepts sigma for one-dimensional actions only; the search broadcasts over any number.
     controller.nu = problem.action_dim
     controller.sigma = torch.full((problem.action_dim,), INIT_STD, device=problem.device)
 

@@ -1,4 +1,4 @@
-"""An environment for the peers, beside the project's own: the same torch, and packages nothing else here should see."""
+"""Python environment of the peers, apart from the project's: the same torch, and packages of the peers alone."""
 
 from __future__ import annotations
 
@@ -20,8 +20,8 @@ class Peer(NamedTuple):
     Attributes:
         module: The adapter that serves it.
         package: Its name on PyPI.
-        requirements: What pip installs besides, and nothing that these ask for themselves: the rest comes from the
-            project's own environment, in the versions found there.
+        requirements: Further packages that pip installs, without their dependencies: those come from the project's own
+            environment, in the versions found there.
     """
 
     module: str
@@ -30,7 +30,7 @@ class Peer(NamedTuple):
 
 
 class PeerError(Exception):
-    """A peer cannot take part; the message says why, in one line."""
+    """A peer cannot take part; the message gives the reason in one line."""
 
 
 _UTILITIES = ("arm-pytorch-utilities", "pytorch-seed", "scipy", "matplotlib")
@@ -52,11 +52,11 @@ PEERS = {
 
 
 def install(name: str, folder: Path) -> Path:
-    """The Python of the peers' environment, with one of them in it; made and filled on first use.
+    """Path of the Python of the peers' environment, with one peer installed; the environment is made on first use.
 
     Args:
         name: One of `PEERS`.
-        folder: Where the environment lives.
+        folder: Folder of the environment.
 
     Raises:
         PeerError: It could not be installed.

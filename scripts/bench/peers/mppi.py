@@ -1,4 +1,4 @@
-"""pytorch_mppi's MPPI: one command per iteration, the nominal trajectory kept in between."""
+"""pytorch_mppi's MPPI: one command per iteration, with the nominal trajectory kept between commands."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What every planner is timed on: one search in one untrained RSSM."""
+"""The search that every planner is timed on, in one untrained RSSM."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ from latentplan.models import State, WorldModel
 
 DTYPES = {"float32": torch.float32, "bfloat16": torch.bfloat16}
 ELITE_SHARE = 0.1
-REWARD_SCALE = 0.1  # an untrained reward head is zero everywhere, which leaves nothing to search for
+REWARD_SCALE = 0.1  # an untrained reward head predicts zero everywhere, so all candidates would be equal
 
 
 @dataclass(frozen=True)
 class Problem:
-    """One search: the sizes that every planner is given, and the model that it is given.
+    """One search: its sizes and its model, the same for every planner.
 
     Attributes:
         samples: Candidates per iteration.
@@ -30,7 +30,7 @@ class Problem:
         model: Settings of the world model, as plain values.
         device: `cpu` or `cuda`.
         threads: CPU threads.
-        seed: Of the weights and of the start.
+        seed: Seed of the weights and of the start.
     """
 
     samples: int

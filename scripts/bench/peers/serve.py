@@ -1,4 +1,4 @@
-"""The side of a peer: a process that runs one search for each line it reads and answers with its time."""
+"""The peer's side: a process that runs one search for each line of input and answers with its time."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ MakeSearch = Callable[[Problem, WorldModel], Search]
 def serve(make_search: MakeSearch) -> None:
     """Answers `{"dtype": ...}` with `{"ms": ...}`, line by line, until the input ends.
 
-    The problem is the first argument of the command line. What a library prints goes to the error stream.
+    The problem is the first argument of the command line. Output of the library goes to the error stream.
 
     Args:
         make_search: `make_search(problem, model) -> search`; `search()` returns the first action, (action,).
@@ -48,5 +48,5 @@ def _timed(search: Search, problem: Problem) -> dict[str, Any]:
     action = search()
     elapsed = now(device) - started
     if action.shape != (problem.action_dim,) or not bool(torch.isfinite(action).all()):
-        raise ValueError(f"a search must end in an action of shape ({problem.action_dim},), got {action}")
+        raise ValueError(f"a search must return an action of shape ({problem.action_dim},), got {action}")
     return {"ms": 1000.0 * elapsed}

@@ -1,4 +1,4 @@
-"""stable-worldmodel's CEMSolver, whose model names the cost of whole action sequences."""
+"""stable-worldmodel's CEMSolver, whose model returns the cost of whole action sequences."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ from latentplan.models import State, WorldModel
 
 
 class RewardCost:
-    """The model as that library wants it: `get_cost` of candidates (1, sample, horizon, action) is (1, sample)."""
+    """The model with the interface of that library: `get_cost` of candidates (1, sample, horizon, action)."""
 
     def __init__(self, model: WorldModel, start: State) -> None:
         self.model, self.start = model, start
 
     def get_cost(self, info: dict[str, Tensor], candidates: Tensor) -> Tensor:
-        """Minus the summed reward; the solver knows no bounds, so actions are clamped here."""
+        """Minus the summed reward; actions are clamped here, because the solver has no bounds."""
         return -summed_rewards(self.model, self.start, candidates[0].clamp(-1.0, 1.0))[None]
 
 
@@ -55,7 +55,7 @@ def make_search(problem: Problem, model: WorldModel) -> Search:
 
 
 def _load_solvers_alone() -> None:
-    """Lets its solvers be imported without its datasets and environments, which want another torchvision and arrow."""
+    """Makes the solvers importable without the datasets and environments, which need other versions of packages."""
     found = importlib.util.find_spec("stable_worldmodel")
     if found is None:
         raise ModuleNotFoundError("stable_worldmodel is not installed")

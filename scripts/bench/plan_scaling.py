@@ -1,8 +1,7 @@
-"""How the time of our planner grows with the size of the search."""
+"""Milliseconds of our planner by the size of the search, for `benchmark.py plan --scaling`."""
 
 from __future__ import annotations
 
-import os
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -10,10 +9,10 @@ from statistics import median
 from typing import Any
 
 from bench.peers.problem import Problem
+from bench.plan_searches import our_search, timed
 from bench.report import format_table, number
-from bench.searches import our_search, timed
 
-FACTORS = (0.25, 0.5, 1.0, 2.0, 4.0)  # of the samples, the horizon and the iterations that were asked for
+FACTORS = (0.25, 0.5, 1.0, 2.0, 4.0)  # multiples of the requested samples, horizon and iterations
 BATCHES = (1, 4, 16, 64)
 ROUNDS = 3
 AXES = ("samples", "horizon", "iterations", "environments")
@@ -23,8 +22,8 @@ def measure_scaling(problem: Problem, dtype: str) -> list[dict[str, Any]]:
     """Median milliseconds of a search along each axis, the other sizes as in `problem`.
 
     Returns:
-        One row per point: `axis`, `value`, `p50_ms`, and `of_linear`: the time as a share of what the axis's first
-        point costs, times as much as the value is larger.
+        One row per point: `axis`, `value`, `p50_ms` (median milliseconds), and `of_linear` (the time as a share of the
+        time under linear growth from the first point of the axis).
     """
     points = [(axis, value) for axis in AXES[:-1] for value in _values(getattr(problem, axis))]
     points += [("environments", batch) for batch in BATCHES]
@@ -42,18 +41,18 @@ def measure_scaling(problem: Problem, dtype: str) -> list[dict[str, Any]]:
 
 
 def scaling_table(rows: Sequence[dict[str, Any]]) -> str:
-    """The points for people."""
+    """The points as a text table."""
     lines = [[row["axis"], f"{row['value']:,}", number(row["p50_ms"]), number(row["of_linear"], 2)] for row in rows]
     return format_table(["along", "value", "p50 ms", "of linear"], lines)
 
 
 def plot_scaling(rows: Sequence[dict[str, Any]], png: Path) -> None:
-    """Draws a panel per axis, with the line along which time grows as the size does."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    """Draws one panel per axis, with a dotted line of linear growth."""
     from matplotlib.figure import Figure
 
+    from latentplan.reporting.curves import save_figure
+
     figure = Figure(figsize=(12, 3.4), layout="constrained")
-    FigureCanvasAgg(figure)
     for axes, axis in zip(figure.subplots(1, len(AXES), sharey=True), AXES, strict=True):
         chosen = [row for row in rows if row["axis"] == axis]
         values = [row["value"] for row in chosen]
@@ -66,9 +65,7 @@ def plot_scaling(rows: Sequence[dict[str, Any]], png: Path) -> None:
         axes.grid(alpha=0.3)
     figure.axes[0].set_ylabel("milliseconds per search")
     figure.axes[0].legend(frameon=False)
-    partial = png.with_name(f".{png.name}.{os.getpid()}")
-    figure.savefig(partial, dpi=120, format="png")
-    partial.replace(png)
+    save_figure(figure, png)
 
 
 def _values(base: int) -> list[int]:

@@ -1,4 +1,4 @@
-"""Arms of an ablation: how they are named, and what each earns."""
+"""Arms of an ablation: settings of the agent by name, and the episodes of each arm."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ DIFFERENT_ACTION = 0.1
 
 
 class Arm(NamedTuple):
-    """One way to decide.
+    """One configuration of the agent.
 
     Attributes:
-        name: In the table.
+        name: Name of the row in the table.
         mode: `planner`, `actor` or `random`.
-        planner: Settings of the search laid over the checkpoint's.
+        planner: Settings of the search that replace those of the checkpoint.
     """
 
     name: str
@@ -31,15 +31,15 @@ class Arm(NamedTuple):
 
 
 class Outcome(NamedTuple):
-    """What an arm earned.
+    """Result of an arm.
 
     Attributes:
-        arm: Who played.
-        returns: Of each episode.
-        episode_ms: Median milliseconds per decision of each episode.
-        decision_ms: `p50`, `p95` and `p99` over all decisions.
-        differs_from_actor: Share of the decisions in which a planner's action and the actor's mode on the same
-            belief are more than 0.1 apart in some dimension; None for the other modes.
+        arm: The arm.
+        returns: Return of each episode.
+        episode_ms: Median milliseconds per decision, for each episode.
+        decision_ms: Percentiles `p50`, `p95` and `p99` over all decisions, in milliseconds.
+        differs_from_actor: Share of the decisions at which the planner's action and the actor's mode for the same
+            belief differ by more than 0.1 in some dimension; None for the modes actor and random.
     """
 
     arm: Arm
@@ -50,19 +50,19 @@ class Outcome(NamedTuple):
 
 
 def parse_arms(text: str, base: PlannerConfig) -> list[Arm]:
-    """The arms that `full,actor,wide:init_std=1.0,num_iterations=6` names; the reference is first, named or not.
+    """The arms of a text such as `full,actor,wide:init_std=1.0,num_iterations=6`; the reference always comes first.
 
     Args:
-        text: Known names, and `name:field=value,field=value` for settings laid over `base`.
-        base: The checkpoint's own settings of the search.
+        text: Known names, and `name:field=value,field=value` for settings that replace those of `base`.
+        base: Settings of the search in the checkpoint.
 
     Raises:
-        UserError: A name or field is unknown, a value is not allowed, or a name comes twice.
+        UserError: A name or field is unknown, a value is not allowed, or two arms have the same name.
     """
     given: dict[str, dict[str, str]] = {}  # settings of each arm, as typed
     for name, words in _split_arms(text):
         if name in given:
-            raise UserError(f"arm {name!r} comes twice; give each arm its own name")
+            raise UserError(f"two arms are named {name!r}; give each arm its own name")
         if not words and name not in NAMES:
             raise_unknown("arm", name, NAMES)
         if words and (not name or name in NAMES):
@@ -73,21 +73,21 @@ def parse_arms(text: str, base: PlannerConfig) -> list[Arm]:
 
 
 def without_actor(base: PlannerConfig) -> dict[str, Any]:
-    """The settings that keep the actor out of a search."""
+    """Settings of a search that does not use the actor."""
     tail = {"tail": "zero"} if base.tail == "policy" else {}
     trust = {} if base.surprise_limit is None else {"surprise_limit": None}
     return {"num_policy_samples": 0, "start": "shifted", **tail, **trust}
 
 
 def play_arm(checkpoint: str, arm: Arm, seeds: Sequence[int], device: str, threads: int) -> Outcome:
-    """Play one episode per seed with the checkpoint's own pictures.
+    """Plays one episode per seed, with the render quality of the checkpoint.
 
     Args:
-        checkpoint: A checkpoint, or a run folder.
-        arm: Who plays.
-        seeds: Of the starts.
+        checkpoint: Folder of a checkpoint or of a run.
+        arm: The arm that plays.
+        seeds: Seeds of the starts.
         device: `cpu` or `cuda`.
-        threads: CPU threads.
+        threads: Number of CPU threads.
     """
     import numpy as np
     import torch
@@ -123,16 +123,16 @@ def play_arm(checkpoint: str, arm: Arm, seeds: Sequence[int], device: str, threa
 
 
 def single_thread() -> None:
-    """Settles the threads of a fresh process before torch and a renderer are imported."""
+    """Limits a new process to one thread, before torch and the renderer are imported."""
     for name in ("OMP_NUM_THREADS", "MKL_NUM_THREADS"):
         os.environ[name] = "1"
 
 
 def check_checkpoint(path: Path) -> tuple[dict[str, Any], PlannerConfig]:
-    """What a checkpoint says of itself, and its settings of the search.
+    """Information about a checkpoint, and its settings of the search.
 
     Raises:
-        UserError: There is none, or it is damaged.
+        UserError: The checkpoint is missing or damaged.
     """
     from latentplan.agents.checkpoint import load_model
 
@@ -141,7 +141,7 @@ def check_checkpoint(path: Path) -> tuple[dict[str, Any], PlannerConfig]:
 
 
 def _split_arms(text: str) -> list[tuple[str, list[str]]]:
-    """Names and the settings that follow them: a word without `=` or with `:` begins an arm."""
+    """Names of the arms with their settings; a word without `=` or with `:` begins an arm."""
     arms: list[tuple[str, list[str]]] = []
     for word in (part.strip() for part in text.split(",")):
         name, colon, setting = word.partition(":")

@@ -1,4 +1,4 @@
-"""Who plays a goal, by name."""
+"""Agents of the zero-shot benchmark, by the name of their row."""
 
 from __future__ import annotations
 
@@ -11,19 +11,19 @@ from latentplan.config.planner import override_planner
 
 
 class PlainGate(GatedAgent):
-    """Plans at random decisions and acts by the actor at all others, whatever the goal."""
+    """Plans at random decisions and acts by the actor at all others, for every objective."""
 
-    _is_foreign = False  # so that the last plan is not followed
+    _is_foreign = False  # act by the actor between plans, as for the training objective, instead of by the last plan
 
 
-def make_player(player: str, checkpoint: str, device: str, planner: dict[str, Any]) -> Any:
-    """The agent.
+def load_zero_shot_agent(player: str, checkpoint: str, device: str, planner: dict[str, Any]) -> Any:
+    """The agent of a row.
 
     Args:
-        player: `planner`, `unconstrained`, `gated`, `random moments` (a gated agent that doubts at random), `random
-            gate` (see `PlainGate`), `actor` or `random`.
+        player: `planner`, `unconstrained`, `gated`, `random moments` (a gated agent that plans at random decisions),
+            `random gate` (see `PlainGate`), `actor` or `random`.
         checkpoint: Folder of the trained agent or run.
-        device: Where it computes.
+        device: Device of the agent, `cpu` or `cuda`.
         planner: Settings of the search that differ from the agent's.
     """
     if player == "random gate":

@@ -1,4 +1,4 @@
-"""One update of the learner, timed and counted on synthetic replay."""
+"""Milliseconds and floating-point operations of one update of the learner, on synthetic replay."""
 
 from __future__ import annotations
 
@@ -24,19 +24,19 @@ from latentplan.training.learner.module import Learner
 
 NUM_ROWS = 4096
 WARM_UP_UPDATES = 2
-DISCOUNT = 0.99  # any value costs the same
+DISCOUNT = 0.99  # the time does not depend on it
 PARTS = ("sample", "encode", "recurrence", "decode", "heads", "behaviour", "optimizer", "other")
 Lap = dict[str, float]
 Parts = dict[str, Callable[[], Any]]
 
 
 class OwnOptimizers:
-    """What makes a learner hold its own optimizers, so that it updates without a Trainer."""
+    """Mixin of a learner that holds its own optimizers, so that it updates without a Trainer."""
 
     own_optimizers: list[torch.optim.Optimizer]
 
     def optimizers(self, use_pl_optimizer: bool = True) -> Any:
-        """The optimizers, as they are."""
+        """The optimizers, without a wrapper of Lightning."""
         return self.own_optimizers
 
 
@@ -44,7 +44,7 @@ class StandaloneLearner(OwnOptimizers, Learner):
     """A learner that updates without a Trainer."""
 
     def step_in_turn(self, batch: Batch) -> None:
-        """An update whose two halves follow each other in one thread, so that each can be timed and counted."""
+        """Runs both halves of an update one after the other in one thread, so that each can be timed and counted."""
         self.training_step(batch, 0)
         assert self._waiting is not None
         waiting, self._waiting = self._waiting, None
@@ -52,15 +52,15 @@ class StandaloneLearner(OwnOptimizers, Learner):
 
 
 class StandaloneGraph(OwnOptimizers, GraphedLearner):
-    """The same for a whole update in one CUDA graph."""
+    """A learner that updates without a Trainer, with the whole update in one CUDA graph."""
 
 
 class PhaseMeter:
-    """Splits an update where its optimizers step, and charges what a meter counted to each phase.
+    """Splits an update at the steps of its optimizers, and adds the reading of a meter to each phase.
 
     Args:
-        learner: Whose optimizers are listened to: first the world model's, then the behaviour's.
-        read: What the meter shows: seconds, or operations.
+        learner: The learner, with the optimizers of world model and behaviour in this order.
+        read: Returns the reading of the meter, in seconds or operations.
     """
 
     def __init__(self, learner: StandaloneLearner, read: Callable[[], float]) -> None:
@@ -72,32 +72,32 @@ class PhaseMeter:
             self._handles += [before, after]
 
     def start(self) -> None:
-        """Begin a lap."""
+        """Begins a lap."""
         self.last, self.lap = self.read(), Lap()
 
     def mark(self, phase: str) -> None:
-        """Charge what was counted since the last mark."""
+        """Adds the reading since the last mark to a phase."""
         shown = self.read()
         self.lap[phase] = self.lap.get(phase, 0.0) + shown - self.last
         self.last = shown
 
     def skip(self) -> None:
-        """Leave out what was counted since the last mark."""
+        """Drops the reading since the last mark."""
         self.last = self.read()
 
     def close(self) -> None:
-        """Stop listening."""
+        """Removes the hooks from the optimizers."""
         for handle in self._handles:
             handle.remove()
 
 
 def measure_update(config: Config, action_dim: int, device: torch.device, updates: int) -> dict[str, Any]:
-    """What an update of the learner that `config` describes costs.
+    """Time and operations of an update of the learner with these settings.
 
-    `update_ms` is what a run pays, its two halves overlapping; `in_turn_ms` what they take one after the other.
-    `sample`, `behaviour`, `optimizer` and `other` are timed within the latter; `encode`, `recurrence` and
-    `decode` are run forward and backward by themselves on the same batch, and `heads` is what is left of the
-    world model's loss, its gradient clipping included.
+    `update_ms` is the time in a training run, where the two halves of an update overlap; `in_turn_ms` is the time of
+    the halves one after the other. `sample`, `behaviour`, `optimizer` and `other` are timed within `in_turn_ms`;
+    `encode`, `recurrence` and `decode` are run forward and backward by themselves on the same batch, and `heads` is the
+    rest of the world model's loss, with its gradient clipping.
 
     Returns:
         Plain values: `parts` (ms and counted operations of each), `update_ms`, `graph_ms` (the same update as one CUDA
@@ -131,13 +131,13 @@ def measure_update(config: Config, action_dim: int, device: torch.device, update
 
 
 def measure_graph(config: Config, action_dim: int, device: torch.device, updates: int) -> float:
-    """Milliseconds of an update as `learning.cuda_graph` takes it, the median; on a CPU of what would be recorded."""
+    """Median milliseconds of an update with `learning.cuda_graph`; on a CPU the same update without a graph."""
     replay = synthetic_replay(replace(config, replay=replace(config.replay, on_device=True)), action_dim, device)
     model = WorldModel(config.model, action_dim).to(device)
     learner = StandaloneGraph(model, config.learning, DISCOUNT, replay, 0, lambda batch: batch).to(device)
     learner.own_optimizers = learner.configure_optimizers()
     rng, seconds = np.random.default_rng(1), []
-    for _ in range(GRAPH_WARM_UP_UPDATES + 1 + updates):  # the first of them is recorded when those before it are done
+    for _ in range(GRAPH_WARM_UP_UPDATES + 1 + updates):  # after the warm-up, one update records the graph
         rows, started = replay.draw(config.learning.batch_size, config.learning.sequence_length, rng), now(device)
         learner.training_step(rows, 0)
         seconds.append(now(device) - started)
@@ -146,7 +146,7 @@ def measure_graph(config: Config, action_dim: int, device: torch.device, updates
 
 
 def synthetic_replay(config: Config, action_dim: int, device: torch.device) -> Replay:
-    """A replay of noise: random pictures, actions and rewards in episodes four sequences long."""
+    """A replay of random frames, actions and rewards, in episodes that are four sequences long."""
     where = device if config.replay.on_device else torch.device("cpu")
     length = config.learning.sequence_length
     num_rows = max(NUM_ROWS, 8 * length)
@@ -166,7 +166,7 @@ def synthetic_replay(config: Config, action_dim: int, device: torch.device) -> R
 
 
 def _timed_laps(learner: StandaloneLearner, alone: Parts, device: torch.device, updates: int) -> list[Lap]:
-    """Seconds of each part; what is run alone follows every update, so that a busy machine slows both alike."""
+    """Seconds of each part; parts run alone follow every update, so that a busy machine slows both alike."""
     meter = PhaseMeter(learner, lambda: now(device))
     rng = np.random.default_rng(1)
     laps = []
@@ -202,7 +202,7 @@ def _lap(learner: StandaloneLearner, alone: Parts, meter: PhaseMeter, rng: np.ra
 
 
 def _overlapped_seconds(learner: StandaloneLearner, device: torch.device, rng: np.random.Generator) -> float:
-    """One update as a run takes it: behaviour learns from the batch before while the model learns."""
+    """Seconds of an update as in a run: behaviour learns from the previous batch while the model learns."""
     learner.training_step(_sample(learner, rng), 0)
     batch, started = _sample(learner, rng), now(device)
     learner.training_step(batch, 0)

@@ -1,4 +1,4 @@
-"""Searches that are compared: ours, the plain loop anyone would write, and the products that none can do without."""
+"""Searches of `benchmark.py plan`: our planner, a plain CEM loop, and the bare matrix products of a search."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ Search = Callable[[], Any]
 
 
 def timed(search: Search, problem: Problem) -> Callable[[], float]:
-    """The search as a function that tells how many milliseconds it took."""
+    """A function that runs the search once and returns its duration in milliseconds."""
     device = torch.device(problem.device)
 
     @torch.no_grad()
@@ -29,7 +29,7 @@ def timed(search: Search, problem: Problem) -> Callable[[], float]:
 
 
 def our_search(problem: Problem, dtype: str, batch: int = 1) -> Search:
-    """A cold search of our planner from `batch` starts at once, by reward alone."""
+    """A cold search of our planner from `batch` starts at once, without terminal value."""
     model, start = build_model(problem, dtype), start_state(problem, batch)
     planner = CEMPlanner(
         action_dim=problem.action_dim,
@@ -43,7 +43,7 @@ def our_search(problem: Problem, dtype: str, batch: int = 1) -> Search:
 
 
 def plain_search(problem: Problem, dtype: str = "float32") -> Search:
-    """The cross-entropy method in a dozen lines."""
+    """A cold search by a plain cross-entropy method."""
     model, start = build_model(problem, dtype), start_state(problem)
     shape = (problem.horizon, problem.action_dim)
 
@@ -61,9 +61,9 @@ def plain_search(problem: Problem, dtype: str = "float32") -> Search:
 
 
 def product_shapes(problem: Problem) -> list[tuple[int, int, int]]:
-    """The (rows, in, out) of the products in one iteration: those of each step, then the reward head's for all steps.
+    """Sizes (rows, in, out) of the matrix products in one iteration: of each step, then of the reward head.
 
-    Of the prior only the mean is counted, which is all that a search needs.
+    The prior counts with its mean only, because a search does not use its standard deviation.
     """
     model, rows = problem.model_config, problem.samples
     latent, deter, hidden = model.latent_dim, model.deter_dim, model.hidden_dim
@@ -73,13 +73,13 @@ def product_shapes(problem: Problem) -> list[tuple[int, int, int]]:
         (rows, deter, hidden),
         (rows, hidden, latent),
     ]
-    every = rows * problem.horizon
-    head = [(every, deter + latent, hidden), (every, hidden, hidden), (every, hidden, model.num_bins)]
+    all_rows = rows * problem.horizon
+    head = [(all_rows, deter + latent, hidden), (all_rows, hidden, hidden), (all_rows, hidden, model.num_bins)]
     return step * problem.horizon + head
 
 
 def matrix_products(problem: Problem, dtype: str) -> Search:
-    """Just the matrix products of a search, into memory that is there already."""
+    """The matrix products of a search alone, written into memory that is already allocated."""
     shapes = product_shapes(problem)
     operands = {
         (rows, inner, outer): [

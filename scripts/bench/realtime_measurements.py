@@ -1,4 +1,4 @@
-"""What thinking earns and costs a trained agent, part by part."""
+"""Measurements of `benchmark.py realtime`: returns and decision times of a trained agent, and prediction errors."""
 
 from __future__ import annotations
 
@@ -12,27 +12,27 @@ if TYPE_CHECKING:
     from latentplan.envs.suite import SuiteEnv
     from latentplan.evaluation.timed import TimedEpisode
 
-ITERATIONS = {  # warm searches have their cold first one do as much as the cold ones do
+ITERATIONS = {  # the first search of a warm planner is cold and has 5 iterations, as in the cold planner
     "5 cold": {"num_iterations": 5, "warm_start": False},
     **{f"{count} warm": {"num_iterations": 5, "warm_start_iterations": count} for count in (5, 3, 2, 1)},
 }
 AGENTS = ("planner", "deadline", "background", "gated", "actor")
 REPLAN_EVERY = (1, 2, 5, 10, 20)
 IMAGINED_STEPS = 20
-START_EVERY = 5  # decisions between the starts of imagination
+START_EVERY = 5  # decisions between the starts of imagined rollouts
 Row = dict[str, Any]
 
 
 @dataclass(frozen=True)
 class Trial:
-    """Who is measured, and where.
+    """A trained agent, its environment, and the starts of its episodes.
 
     Attributes:
-        checkpoint: A checkpoint, or a run folder.
+        checkpoint: Folder of a checkpoint or of a run.
         device: `cpu` or `cuda`.
-        env: The checkpoint's environment.
-        seeds: Of the episodes' starts.
-        horizon: Of the checkpoint's own search.
+        env: Environment of the checkpoint.
+        seeds: Seeds of the starts of the episodes.
+        horizon: Horizon of the search in the checkpoint, in model steps.
     """
 
     checkpoint: str
@@ -48,12 +48,12 @@ class Trial:
         control_hz: float | None = None,
         prepare: Callable[[Any], None] | None = None,
     ) -> Row:
-        """One episode per seed: return with interval, latency, and what `summarize_timed` tells besides.
+        """Plays one episode per seed; returns the result of `summarize_timed` and `mean_decision_ms`.
 
         Args:
-            mode: Of the agent.
-            settings: Of the search, in place of the checkpoint's.
-            control_hz: Of a world that does not wait for what thinking takes here; None for one that waits.
+            mode: Mode of the agent.
+            settings: Settings of the search that replace those of the checkpoint.
+            control_hz: Decisions per second of an environment that does not wait; None for one that waits.
             prepare: Changes the agent before it plays.
         """
         from latentplan.evaluation.clock import VirtualClock
@@ -69,13 +69,13 @@ class Trial:
 
 
 def measure_iterations(trial: Trial) -> Iterator[Row]:
-    """Latency and return by the refits of a search, in a world that waits."""
+    """Yields decision time and return by the iterations of a search, in an environment that waits."""
     for name, settings in ITERATIONS.items():
         yield {"iterations": name, **trial.play("planner", settings)}
 
 
 def measure_rates(trial: Trial, rates: Sequence[float]) -> Iterator[Row]:
-    """Return by the rate of a world that does not wait, for every way to decide."""
+    """Yields the return by the control rate of an environment that does not wait, for every agent."""
     for control_hz in rates:
         for name in AGENTS:
             mode = "planner" if name == "deadline" else name
@@ -84,9 +84,9 @@ def measure_rates(trial: Trial, rates: Sequence[float]) -> Iterator[Row]:
 
 
 def measure_replanning(trial: Trial) -> Iterator[Row]:
-    """Return by the actions that are executed from each plan, in a world that waits."""
+    """Yields the return by the number of actions executed from each plan, in an environment that waits."""
     for every in REPLAN_EVERY:
-        horizon = max(trial.horizon, every)  # a plan must be as long as it is executed
+        horizon = max(trial.horizon, every)  # a plan must hold all actions that are executed
 
         def replan(agent: Any, every: int = every) -> None:
             agent.controller.replan_every = every
@@ -95,9 +95,9 @@ def measure_replanning(trial: Trial) -> Iterator[Row]:
 
 
 def measure_error(trial: Trial) -> Iterator[Row]:
-    """How far imagination leaves what is then seen, by the steps imagined, along episodes of the actor.
+    """Yields the distance between imagined and observed latents and rewards by model steps, in episodes of the actor.
 
-    Each row also tells what a model would do that expects nothing to change: latent and reward stay where they were.
+    Each row also holds the errors of a model that predicts no change: latent and reward stay as they are at the start.
     """
     from latentplan.agents.checkpoint import load_agent
 
@@ -113,43 +113,43 @@ def measure_error(trial: Trial) -> Iterator[Row]:
 
 
 def _record(agent: Any, env: SuiteEnv, seed: int) -> tuple[list[Any], list[np.ndarray], list[float]]:
-    """Beliefs, the actions taken at them, and the rewards that arrived with the next."""
+    """Beliefs of an episode, the action at each belief, and the reward that followed the action."""
     from latentplan.models.symmetry import unturned
 
     beliefs, actions, rewards = [], [], []
     agent.reset()
     frame, _ = env.reset(seed=seed)
-    over = False
-    while not over:
+    is_over = False
+    while not is_over:
         action = agent.act(frame)
         beliefs.append(unturned(agent.state))
         actions.append(action)
         frame, reward, terminated, truncated, _ = env.step(action)
         rewards.append(reward)
-        over = terminated or truncated
+        is_over = terminated or truncated
     return beliefs, actions, rewards
 
 
 def _prediction_errors(model: Any, beliefs: list[Any], actions: list[np.ndarray], rewards: list[float]) -> np.ndarray:
-    """(step, start, quantity): latent distance, reward error, and the same of expecting no change."""
+    """Errors (step, start, 4): latent distance and reward error of the model, and of predicting no change."""
     import torch
 
     steps = min(IMAGINED_STEPS, len(beliefs) - 2)
     starts = torch.arange(1, len(beliefs) - steps, START_EVERY)
     taken = torch.as_tensor(np.stack(actions), device=model.device)
-    earned = torch.tensor(rewards, device=model.device)
-    seen = torch.cat([belief.stoch for belief in beliefs])
+    all_rewards = torch.tensor(rewards, device=model.device)
+    latents = torch.cat([belief.stoch for belief in beliefs])
     state = type(beliefs[0])(*(torch.cat(parts)[starts] for parts in zip(*beliefs, strict=True)))
     rows = []
     with torch.no_grad():
         for step in range(steps):
             state, reward = model.step(state, taken[starts + step])
-            after, arrived = seen[starts + step + 1], earned[starts + step]
+            latent, observed_reward = latents[starts + step + 1], all_rewards[starts + step]
             columns = (
-                (state.stoch - after).norm(dim=-1),
-                (reward - arrived).abs(),
-                (seen[starts] - after).norm(dim=-1),
-                (earned[starts - 1] - arrived).abs(),
+                (state.stoch - latent).norm(dim=-1),
+                (reward - observed_reward).abs(),
+                (latents[starts] - latent).norm(dim=-1),
+                (all_rewards[starts - 1] - observed_reward).abs(),
             )
             rows.append(torch.stack([column.float().cpu() for column in columns], dim=-1))
     return torch.stack(rows).numpy() if rows else np.zeros((0, 0, 4))
