@@ -1,54 +1,29 @@
+"""`scripts/benchmark.py`: command line, statistics, tables, and the commands train, decide, render, compile, ablate."""
+
 import csv
 import json
-import sys
 from dataclasses import replace
-from pathlib import Path
 
+import benchmark
 import numpy as np
 import pytest
 import torch
+from bench.ablate import compare_arms
+from bench.ablation_arms import NAMES, Arm, Outcome, parse_arms
+from bench.decide import measure_decisions
+from bench.machine import product_limits
+from bench.render import measure_qualities
+from bench.report import format_table, interval, number
+from bench.statistics import interquartile_estimate, interquartile_mean, paired_difference
+from bench.train_update import PARTS, measure_graph, measure_update
 
 from latentplan.agents.actor import ActorAgent
-from latentplan.agents.checkpoint import save_checkpoint
 from latentplan.agents.planning import PlanningAgent
-from latentplan.config import Config, EnvConfig, LearningConfig, ModelConfig, PlannerConfig, UserError
+from latentplan.config import PlannerConfig, UserError
 from latentplan.models import WorldModel
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "scripts"))
-
-import benchmark  # noqa: E402
-from bench.ablate import compare_arms  # noqa: E402
-from bench.ablation_arms import NAMES, Arm, Outcome, parse_arms  # noqa: E402
-from bench.decide import measure_decisions  # noqa: E402
-from bench.machine import product_limits  # noqa: E402
-from bench.render import measure_qualities  # noqa: E402
-from bench.report import format_table, interval, number  # noqa: E402
-from bench.statistics import interquartile_estimate, interquartile_mean, paired_difference  # noqa: E402
-from bench.train_update import PARTS, measure_graph, measure_update  # noqa: E402
-
-ENV = EnvConfig(domain="cartpole", task="swingup", action_repeat=100, render_quality="fastest")
-MODEL = ModelConfig(deter_dim=8, hidden_dim=8, encoder_channels=(4, 4), decoder_channels=2, num_bins=5)
-PLANNER = PlannerConfig(
-    horizon=3, num_samples=8, num_elites=2, num_policy_samples=2, num_iterations=4, warm_start_iterations=2
-)
-LEARNING = LearningConfig(batch_size=2, sequence_length=3, imagination_horizon=2, imagination_starts=4)
-CONFIG = Config(env=ENV, model=MODEL, planner=PLANNER, learning=LEARNING)
 CPU = torch.device("cpu")
-
-
-@pytest.fixture(scope="module")
-def model():
-    torch.manual_seed(0)
-    return WorldModel(MODEL, action_dim=1)
-
-
-@pytest.fixture(scope="module")
-def checkpoint(model, tmp_path_factory):
-    """An untrained agent for ten-decision episodes of cartpole."""
-    folder = tmp_path_factory.mktemp("agent")
-    info = {"domain": "cartpole", "task": "swingup", "env_frames": 1234, "discount": 0.9, "metrics": {}}
-    save_checkpoint(folder, model, CONFIG, info)
-    return folder
+PLANNER = PlannerConfig()
 
 
 def outcome(name, returns, share=None):
@@ -82,7 +57,7 @@ def ablated(tmp_path, checkpoint, arms, *flags):
         (["learn", "--seeds", "0,-1"], "--seeds"),
     ],
 )
-def test_bad_input_is_one_line_that_names_it(capsys, arguments, named):
+def test_benchmark_refuses_bad_input_in_one_line_that_names_it(capsys, arguments, named):
     assert benchmark.main(arguments) == 2
     captured = capsys.readouterr()
     assert captured.out == ""
@@ -91,7 +66,7 @@ def test_bad_input_is_one_line_that_names_it(capsys, arguments, named):
     assert named in captured.err
 
 
-def test_help_lists_every_command_and_its_flags(capsys):
+def test_benchmark_help_lists_every_command_and_its_flags(capsys):
     assert benchmark.main([]) == 0
     overview = capsys.readouterr().out
     for command in benchmark.COMMANDS:
@@ -100,27 +75,27 @@ def test_help_lists_every_command_and_its_flags(capsys):
         assert "  --" in capsys.readouterr().out
 
 
-def test_tables_align_columns_and_show_what_is_missing():
+def test_format_table_aligns_columns_and_marks_missing_values():
     table = format_table(["arm", "return"], [["a", number(12.345)], ["longer", number(None)]])
     assert table.splitlines() == ["arm     return", "------  ------", "a         12.3", "longer       -"]
     assert interval((None, None)) == "-"
     assert interval((-1.0, 2.0), sign=True) == "-1.0 to +2.0"
 
 
-def test_the_full_planner_comes_first_whether_named_or_not():
+def test_parse_arms_puts_the_full_planner_first():
     assert [arm.name for arm in parse_arms("actor,cold", PLANNER)] == ["full", "actor", "cold"]
     assert [arm.name for arm in parse_arms("actor,full", PLANNER)] == ["full", "actor"]
     assert [arm.name for arm in parse_arms(",".join(NAMES), PLANNER)] == list(NAMES)
 
 
-def test_own_arms_lay_typed_settings_over_the_planner():
+def test_parse_arms_applies_settings_of_own_arms():
     full, wide, actor, short = parse_arms("wide:init_std=1,num_iterations=6,actor,short:horizon=2", PLANNER)
     assert (full.planner, actor.mode, actor.planner) == ({}, "actor", {})
     assert wide == Arm("wide", "planner", {"init_std": 1.0, "num_iterations": 6})
     assert short == Arm("short", "planner", {"horizon": 2})
 
 
-def test_without_the_actor_nothing_of_the_search_asks_it():
+def test_parse_arms_removes_every_use_of_the_actor_from_no_actor():
     _, arm = parse_arms("no_actor", replace(PLANNER, start="policy", tail="policy", surprise_limit=2.0))
     assert arm.planner == {"num_policy_samples": 0, "start": "shifted", "tail": "zero", "surprise_limit": None}
 
@@ -128,12 +103,12 @@ def test_without_the_actor_nothing_of_the_search_asks_it():
 @pytest.mark.parametrize(
     "text", ["ful", "horizon=2", "actor,horizon=2", "w:horizn=2", "w:horizon=x", "w:horizon", "w:", "cold,cold", ":a=1"]
 )
-def test_arms_that_cannot_be_are_refused(text):
+def test_parse_arms_refuses_invalid_arms(text):
     with pytest.raises(UserError):
         parse_arms(text, PLANNER)
 
 
-def test_pairing_removes_what_the_starts_share():
+def test_paired_difference_removes_the_effect_of_the_starts():
     starts = np.array([10.0, 500.0, 90.0, 300.0])
     shifted = paired_difference((starts + 7.0).tolist(), starts.tolist())
     assert shifted == pytest.approx((7.0, 7.0, 7.0))
@@ -142,62 +117,61 @@ def test_pairing_removes_what_the_starts_share():
     assert forward == pytest.approx((-backward.mean, -backward.high, -backward.low))
 
 
-def test_a_single_pair_has_a_difference_but_no_interval():
+def test_paired_difference_has_no_interval_for_a_single_pair():
     assert paired_difference([3.0], [1.0]) == (2.0, None, None)
 
 
-def test_episodes_that_are_not_paired_are_refused():
+def test_paired_difference_refuses_lists_of_different_length():
     with pytest.raises(ValueError):
         paired_difference([1.0, 2.0], [1.0])
 
 
-def test_the_interquartile_mean_ignores_the_outer_quarters():
+def test_interquartile_mean_ignores_the_outer_quarters():
     values = [0.0, 4.0, 5.0, 6.0, 7.0, 8.0, 9.0, 10.0]
     assert interquartile_mean(values) == interquartile_mean([*values[1:], -1e6]) == 6.5
     assert interquartile_mean([1.0, 3.0]) == 2.0
 
 
-def test_the_bootstrap_resamples_within_each_task():
+def test_interquartile_estimate_keeps_groups_apart():
     apart = interquartile_estimate([[100.0, 100.0], [900.0, 900.0]])
     assert apart == (500.0, 500.0, 500.0)
     spread = interquartile_estimate([[1.0, 2.0, 3.0, 4.0]])
     assert spread.low < spread.mean == 2.5 < spread.high
+    resampled = interquartile_estimate([[100.0] * 5, [900.0] * 5])  # a bootstrap, because each group has five returns
+    assert resampled == (500.0, 500.0, 500.0)
 
 
-def test_arms_are_compared_with_the_first():
+def test_compare_arms_compares_with_the_first_arm():
     compared = compare_arms([outcome("full", [1.0, 2.0], 0.5), outcome("cold", [2.0, 4.0])])
     assert compared["full"]["minus_full"] is None
     assert compared["cold"]["minus_full"] == 1.5
     assert compared["full"]["differs_from_actor"] == 0.5
 
 
-def test_an_update_is_measured_in_parts_whose_operations_add_up():
-    measured = measure_update(CONFIG, action_dim=2, device=CPU, updates=2)
+def test_measure_update_splits_an_update_into_parts_whose_operations_add_up(config):
+    measured = measure_update(config, action_dim=1, device=CPU, updates=1)
     assert set(measured["parts"]) == set(PARTS)
     assert sum(part["flop"] for part in measured["parts"].values()) == measured["flop"]
-    assert all(measured["parts"][name]["flop"] > 0 for name in ("encode", "recurrence", "decode", "behaviour"))
+    assert measured["parts"]["behaviour"]["flop"] > 0
     assert measured["frames_per_s"] == pytest.approx(8 * measured["updates_per_s"])
-    assert measured["graph_ms"] is None and measure_graph(CONFIG, action_dim=2, device=CPU, updates=2) > 0.0
+    assert measured["graph_ms"] is None and measure_graph(config, action_dim=1, device=CPU, updates=1) > 0.0
     assert measured["flop_per_s"] / product_limits(CPU, size=64)["float32"] > 0.0
-
-
-def test_operations_grow_with_the_batch():
-    small, large = (
-        measure_update(replace(CONFIG, learning=replace(LEARNING, batch_size=size)), 1, CPU, 1)["parts"]
-        for size in (2, 4)
-    )
+    double = replace(config, learning=replace(config.learning, batch_size=2 * config.learning.batch_size))
+    larger = measure_update(double, action_dim=1, device=CPU, updates=1)["parts"]
     for name in ("encode", "recurrence", "decode"):
-        assert large[name]["flop"] == 2 * small[name]["flop"]
+        assert larger[name]["flop"] == 2 * measured["parts"][name]["flop"] > 0
 
 
-def test_model_steps_of_a_decision_are_those_of_a_warm_search(model):
-    steps = measure_decisions(PlanningAgent(model, CONFIG, 0.9), batch=1, decisions=2)["model_steps"]
+def test_measure_decisions_counts_the_model_steps_of_a_warm_search(config):
+    torch.manual_seed(0)
+    model = WorldModel(config.model, action_dim=1)
+    steps = measure_decisions(PlanningAgent(model, config, 0.9), batch=1, decisions=2)["model_steps"]
     assert steps == 3 * (2 * (8 - 2) + 2)  # horizon, times fresh candidates of two refits and the proposals
-    assert measure_decisions(PlanningAgent(model, CONFIG, 0.9), batch=3, decisions=1)["model_steps"] == steps
-    assert measure_decisions(ActorAgent(model, CONFIG), batch=1, decisions=2)["model_steps"] == 0
+    assert measure_decisions(PlanningAgent(model, config, 0.9), batch=3, decisions=1)["model_steps"] == steps
+    assert measure_decisions(ActorAgent(model, config), batch=1, decisions=2)["model_steps"] == 0
 
 
-def test_compiled_models_are_timed_beside_themselves(tmp_path, monkeypatch, capsys):
+def test_compile_times_each_model_stepped_and_compiled(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr("torch.compile", lambda function, **_: function)
     path = tmp_path / "compile.json"
     sizes = ["--samples", "16", "--horizon", "3", "--iterations", "2", "--plans", "2"]
@@ -209,7 +183,7 @@ def test_compiled_models_are_timed_beside_themselves(tmp_path, monkeypatch, caps
         assert row["largest_difference"] == 0.0 and row["stepped_ms"] > 0.0
 
 
-def test_decide_leaves_planner_settings_to_the_command_line(tmp_path, checkpoint):
+def test_decide_applies_planner_settings_of_the_command_line(tmp_path, checkpoint):
     path = tmp_path / "result.json"
     command = ["decide", "--checkpoint", checkpoint, "--decisions", 2, "--device", "cpu", "--json", path]
     assert benchmark.main([str(word) for word in [*command, "--planner.horizon", 1]]) == 0
@@ -219,14 +193,15 @@ def test_decide_leaves_planner_settings_to_the_command_line(tmp_path, checkpoint
     assert result["arms"]["planner without actor"]["model_steps"] == 16
 
 
-def test_qualities_are_compared_on_the_same_states():
-    measured = measure_qualities(replace(ENV, action_repeat=1), num_frames=2)
+def test_measure_qualities_compares_the_same_states(config, monkeypatch):
+    monkeypatch.setattr("bench.render.REPEATS", 1)
+    measured = measure_qualities(replace(config.env, action_repeat=1), num_frames=1)
     assert measured["exact"]["pixel_change"] == 0.0
     assert 0.0 < measured["fastest"]["pixel_change"] < 100.0
     assert all(facts["frame_ms"] > 0.0 for facts in measured.values())
 
 
-def test_equal_arms_earn_the_same_in_every_episode(tmp_path, checkpoint):
+def test_ablate_gives_equal_arms_equal_returns(tmp_path, checkpoint):
     episodes = tmp_path / "episodes.csv"
     result = ablated(tmp_path, checkpoint, "actor,twin:horizon=3", "--episodes", 2, "--csv", episodes)
     full, twin, actor = (result["arms"][name] for name in ("full", "twin", "actor"))
@@ -239,7 +214,9 @@ def test_equal_arms_earn_the_same_in_every_episode(tmp_path, checkpoint):
     assert len({row["start_seed"] for row in rows}) == 2
 
 
-def test_returns_do_not_depend_on_the_number_of_workers(tmp_path, checkpoint):
+@pytest.mark.usefixtures("_full_episodes")  # as in the workers
+def test_ablate_returns_do_not_depend_on_the_number_of_workers(tmp_path, save_agent):
+    checkpoint = save_agent(tmp_path / "agent", action_repeat=100)
     alone, together = (
         ablated(tmp_path, checkpoint, "actor", "--episodes", 1, "--workers", workers)["arms"] for workers in (1, 2)
     )

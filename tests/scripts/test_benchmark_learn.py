@@ -1,27 +1,22 @@
-"""`benchmark.py learn`: curves, tables, and what it finds already learned."""
+"""`benchmark.py learn`: curves, tables, and finished runs that are not repeated."""
 
 import csv
 import json
-import sys
 from dataclasses import replace
-from pathlib import Path
 
+import benchmark
 import numpy as np
 import pytest
+from bench.anchors import METHODS, published
+from bench.learn import check_same, compare, first_reaching, read_run, run_facts
+from bench.learn_plot import MARKERS, Curve, Point
+from bench.statistics import interquartile_estimate, mean_estimate
 
 from latentplan.config import Config, EnvConfig, PlannerConfig, RunConfig, UserError
 from latentplan.config.files import dump_config
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "scripts"))
 
-import benchmark  # noqa: E402
-from bench.anchors import METHODS, published  # noqa: E402
-from bench.learn import check_same, compare, first_reaching, read_run, run_facts  # noqa: E402
-from bench.learn_plot import MARKERS, Curve, Point  # noqa: E402
-from bench.statistics import interquartile_estimate, mean_estimate  # noqa: E402
-
-
-def test_a_threshold_is_reached_at_the_first_evaluation_above_it():
+def test_first_reaching_returns_the_first_evaluation_above_a_threshold():
     curve = Curve("walker-walk", 0, [Point(10, 1.0, 50.0), Point(20, 2.0, 400.0), Point(30, 3.0, 300.0)])
     assert first_reaching(curve, 300) == Point(20, 2.0, 400.0)
     (facts,) = run_facts([curve], [300, 900])
@@ -29,14 +24,14 @@ def test_a_threshold_is_reached_at_the_first_evaluation_above_it():
     assert facts["final_return"] == 300.0
 
 
-def test_the_evaluation_that_ends_a_run_is_the_last_of_its_curve(tmp_path):
+def test_read_run_ends_with_the_final_evaluation(tmp_path):
     (tmp_path / "metrics.csv").write_text("env_frames,minutes,planner_return,actor_return\n80,4.0,1,2\n100,5.0,3,4\n")
     assert read_run("walker-walk", 0, tmp_path, "actor").points == [Point(80, 4.0, 2.0), Point(100, 5.0, 4.0)]
     (tmp_path / "final.json").write_text(json.dumps({"env_frames": 100, "minutes": 5.5, "planner": 7, "actor": 8}))
     assert read_run("walker-walk", 0, tmp_path, "actor").points == [Point(80, 4.0, 2.0), Point(100, 5.5, 8.0)]
 
 
-def test_runs_stand_beside_what_is_published_at_as_many_frames():
+def test_compare_sets_runs_beside_published_returns_at_the_same_frames():
     curves = [
         Curve("walker-walk", seed, [Point(60_000, 30.0, 100.0), Point(100_500, 60.0, final)])
         for seed, final in enumerate((500.0, 700.0, 900.0))
@@ -51,7 +46,7 @@ def test_runs_stand_beside_what_is_published_at_as_many_frames():
     assert list(compare("fish-swim", [curves[0]._replace(task="fish-swim")], [600])) == ["latentplan"]
 
 
-def test_finished_runs_are_collected_and_not_repeated(tmp_path, capsys):
+def test_learn_collects_finished_runs_without_repeating_them(tmp_path, capsys):
     for seed in (0, 1):
         folder = tmp_path / f"walker-walk-seed{seed}"
         folder.mkdir()
@@ -69,11 +64,11 @@ def test_finished_runs_are_collected_and_not_repeated(tmp_path, capsys):
     assert "not repeated" in printed and "EfficientZero V2" in printed
 
 
-def test_a_folder_of_other_settings_is_not_taken_for_these(tmp_path):
+def test_check_same_refuses_a_folder_with_other_settings(tmp_path):
     begun = Config(env=EnvConfig(task="walk"), run=RunConfig(frames=100, run_dir=str(tmp_path)))
     dump_config(begun, tmp_path / "config.yaml")
     check_same(begun, tmp_path / "nothing yet")
-    check_same(replace(begun, run=replace(begun.run, frames=200)), tmp_path)  # a budget may grow
+    check_same(replace(begun, run=replace(begun.run, frames=200)), tmp_path)  # a budget may be extended
     with pytest.raises(UserError, match=r"--planner\.horizon 8, not 7"):
         check_same(replace(begun, planner=PlannerConfig(horizon=7)), tmp_path)
     with pytest.raises(UserError, match=r"--run\.seed"):
@@ -82,19 +77,19 @@ def test_a_folder_of_other_settings_is_not_taken_for_these(tmp_path):
     dump_config(given, tmp_path / "config.yaml")
     with pytest.raises(UserError, match=r"--env\.objective upright, not None"):
         check_same(begun, tmp_path)
-    check_same(replace(given, env=replace(given.env, task=None)), tmp_path)  # the domain's usual one
+    check_same(replace(given, env=replace(given.env, task=None)), tmp_path)  # the default task of the domain
 
 
 @pytest.mark.parametrize(
     ("flag", "own"), [("--run.seed", "--seeds"), ("--env.task", "--tasks"), ("--run.frames", "--frames")]
 )
-def test_what_tells_the_runs_apart_is_given_by_its_own_flag(tmp_path, capsys, flag, own):
+def test_learn_refuses_settings_that_have_a_flag_of_their_own(tmp_path, capsys, flag, own):
     assert benchmark.main(["learn", flag, "5", "--out", str(tmp_path / "out")]) == 2
     assert f"{flag} is what {own} says here" in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
 
 
-def test_the_median_of_two_runs_is_between_them():
+def test_compare_takes_the_median_of_frames_to_a_threshold():
     curves = [Curve("walker-walk", seed, [Point(frames, 1.0, 700.0)]) for seed, frames in enumerate((20_000, 60_000))]
     assert compare("walker-walk", curves, [600])["latentplan"]["frames_to"] == {"600": 40_000}
     late = [curves[0], Curve("walker-walk", 1, [Point(60_000, 1.0, 0.0)])]
@@ -104,7 +99,7 @@ def test_the_median_of_two_runs_is_between_them():
 @pytest.mark.parametrize(
     ("name", "text"), [("final.json", "{"), ("final.json", "[]"), ("metrics.csv", ""), ("metrics.csv", None)]
 )
-def test_results_that_are_damaged_are_named(tmp_path, name, text):
+def test_read_run_names_the_folder_when_results_are_damaged(tmp_path, name, text):
     (tmp_path / "metrics.csv").write_text("env_frames,minutes,planner_return,actor_return\n80,4.0,1,2\n")
     (tmp_path / name).unlink(missing_ok=True)
     if text is not None:
@@ -113,7 +108,7 @@ def test_results_that_are_damaged_are_named(tmp_path, name, text):
         read_run("walker-walk", 0, tmp_path, "planner")
 
 
-def test_an_interval_of_few_runs_holds_the_truth_as_often_as_it_says():
+def test_interquartile_estimate_covers_the_truth_at_its_level_for_few_runs():
     rng, held = np.random.default_rng(0), 0
     for _ in range(400):
         low, high = interquartile_estimate([rng.normal(size=2), rng.normal(size=3)])[1:]

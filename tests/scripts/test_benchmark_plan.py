@@ -1,26 +1,24 @@
+"""`benchmark.py plan`: our planner beside those of other libraries."""
+
 import json
 import sys
 from dataclasses import replace
 from pathlib import Path
 
+import benchmark
 import pytest
 import torch
+from bench.peers import client, install
+from bench.peers.client import PeerProcess
+from bench.peers.install import PEERS, Peer, PeerError, last_line
+from bench.peers.problem import Problem, as_state, build_model, next_features, rewards_at, start_state
+from bench.plan import OURS, PLAIN, PRODUCTS, compare, summarise
+from bench.plan_scaling import scaling_table
+from bench.plan_searches import matrix_products, our_search, plain_search, product_shapes
 from torch.utils.flop_counter import FlopCounterMode
 
 from latentplan.config import ModelConfig, to_dict
 from latentplan.planning import check_model
-
-SCRIPTS = Path(__file__).resolve().parents[2] / "scripts"
-sys.path.insert(0, str(SCRIPTS))
-
-import benchmark  # noqa: E402
-from bench.peers import client, install  # noqa: E402
-from bench.peers.client import PeerProcess  # noqa: E402
-from bench.peers.install import PEERS, Peer, PeerError, last_line  # noqa: E402
-from bench.peers.problem import Problem, as_state, build_model, next_features, rewards_at, start_state  # noqa: E402
-from bench.plan import OURS, PLAIN, PRODUCTS, compare, summarise  # noqa: E402
-from bench.plan_scaling import scaling_table  # noqa: E402
-from bench.plan_searches import matrix_products, our_search, plain_search, product_shapes  # noqa: E402
 
 MODEL = ModelConfig(deter_dim=8, hidden_dim=12, encoder_channels=(4, 4), decoder_channels=2, num_bins=5)
 PROBLEM = Problem(
@@ -40,12 +38,12 @@ def counted_flop(search):
     return counter.get_total_flops()
 
 
-def test_a_problem_survives_the_way_to_another_process():
+def test_problem_survives_json():
     assert Problem.from_json(PROBLEM.to_json()) == PROBLEM
     assert PROBLEM.model_config == MODEL
 
 
-def test_both_precisions_are_the_same_model():
+def test_build_model_has_the_same_weights_in_both_precisions():
     full, half = (build_model(PROBLEM, dtype) for dtype in ("float32", "bfloat16"))
     for name, parameter in full.named_parameters():
         assert torch.equal(parameter, half.get_parameter(name))
@@ -58,12 +56,12 @@ def test_both_precisions_are_the_same_model():
     assert not torch.equal(exact, rounded)
 
 
-def test_the_float32_rollout_is_its_steps():
+def test_build_model_rollout_equals_its_steps_in_float32():
     check_model(build_model(PROBLEM, "float32"), start_state(PROBLEM, 3), 2)
 
 
 @pytest.mark.parametrize("dtype", ["float32", "bfloat16"])
-def test_peers_that_hold_vectors_see_the_same_model(dtype):
+def test_next_features_and_rewards_at_equal_the_step_of_the_model(dtype):
     model, start = build_model(PROBLEM, dtype), start_state(PROBLEM, 4)
     action = torch.linspace(-1, 1, 8).reshape(4, 2)
     with torch.no_grad():
@@ -73,13 +71,13 @@ def test_peers_that_hold_vectors_see_the_same_model(dtype):
         assert torch.equal(rewards_at(model, features), reward)
 
 
-def test_rewards_tell_candidates_apart():
+def test_build_model_rewards_differ_between_states():
     with torch.no_grad():
         returns = rewards_at(build_model(PROBLEM, "float32"), start_state(PROBLEM, 1).features + torch.rand(9, 40))
     assert returns.std() > 0.01
 
 
-def test_the_products_are_those_of_a_search_but_for_the_std_of_the_prior():
+def test_matrix_products_are_those_of_a_search_except_the_std_of_the_prior():
     products = counted_flop(matrix_products(PROBLEM, "float32"))
     assert products == PROBLEM.iterations * sum(2 * m * k * n for m, k, n in product_shapes(PROBLEM))
     std = 2 * PROBLEM.iterations * PROBLEM.horizon * PROBLEM.samples * MODEL.hidden_dim * MODEL.latent_dim
@@ -87,11 +85,11 @@ def test_the_products_are_those_of_a_search_but_for_the_std_of_the_prior():
     assert products <= counted_flop(our_search(PROBLEM, "float32")) <= products + std
 
 
-def test_environments_multiply_the_work():
+def test_our_search_multiplies_its_operations_by_the_batch():
     assert counted_flop(our_search(PROBLEM, "float32", 3)) == 3 * counted_flop(our_search(PROBLEM, "float32"))
 
 
-def test_all_searches_are_for_the_same_reward():
+def test_searches_find_actions_of_high_reward():
     problem = replace(PROBLEM, samples=200, iterations=6, horizon=1)
     model, start = build_model(problem, "float32"), start_state(problem)
     random = torch.rand(1000, 2, generator=torch.Generator().manual_seed(0)) * 2 - 1
@@ -103,7 +101,7 @@ def test_all_searches_are_for_the_same_reward():
     assert rewards[:2].min() > rewards[2:].quantile(0.95)
 
 
-def test_ratios_compare_the_fastest_of_each_side():
+def test_summarise_compares_the_fastest_of_each_side():
     times = {
         (OURS, "float32"): [30.0, 30.0, 30.0],
         (OURS, "bfloat16"): [10.0, 9.0, 50.0],
@@ -126,7 +124,7 @@ def test_ratios_compare_the_fastest_of_each_side():
     }
 
 
-def test_without_peers_there_are_limits_and_growth_but_no_ratios_to_peers(tmp_path, capsys):
+def test_plan_reports_limits_and_scaling_but_no_ratios_when_there_are_no_peers(tmp_path, capsys):
     json_path, plot = tmp_path / "plan.json", tmp_path / "growth.png"
     flags = "--peers none --samples 8 --horizon 2 --iterations 1 --plans 2 --action-dim 2 --device cpu"
     sizes = "--model.deter_dim 8 --model.hidden_dim 8 --model.num_bins 5"
@@ -156,7 +154,7 @@ def test_without_peers_there_are_limits_and_growth_but_no_ratios_to_peers(tmp_pa
         (["--model.deter_dim", "x"], "model.deter_dim"),
     ],
 )
-def test_bad_input_is_one_line_that_names_it(capsys, arguments, named):
+def test_plan_refuses_bad_input_in_one_line_that_names_it(capsys, arguments, named):
     assert benchmark.main(["plan", *arguments]) == 2
     captured = capsys.readouterr()
     assert captured.out == ""
@@ -164,7 +162,7 @@ def test_bad_input_is_one_line_that_names_it(capsys, arguments, named):
     assert named in captured.err
 
 
-def test_a_peer_that_cannot_be_installed_is_named_and_left_out(tmp_path, capsys):
+def test_compare_names_and_leaves_out_a_peer_that_cannot_be_installed(tmp_path, capsys):
     no_folder = tmp_path / "file"
     no_folder.write_text("in the way of an environment")
     measured = compare(PROBLEM, ["mbrl"], plans=1, folder=no_folder)
@@ -174,14 +172,14 @@ def test_a_peer_that_cannot_be_installed_is_named_and_left_out(tmp_path, capsys)
     assert "mbrl left out: " in capsys.readouterr().out
 
 
-def test_an_installed_peer_is_not_installed_again(tmp_path, monkeypatch):
+def test_install_skips_an_installed_peer(tmp_path, monkeypatch):
     monkeypatch.setattr(install, "_call", lambda command: pytest.fail(f"called {command}"))
     receipt = "\n".join((PEERS["mbrl"].package, *PEERS["mbrl"].requirements))
     (tmp_path / "mbrl.installed").write_text(receipt)
     assert install.install("mbrl", tmp_path) == tmp_path / "bin" / "python"
 
 
-def test_a_peer_answers_from_its_own_process_until_it_fails(tmp_path, monkeypatch):
+def test_peer_process_answers_until_it_fails(tmp_path, monkeypatch):
     lines = [
         "from bench.peers.serve import serve",
         "from bench.plan_searches import plain_search",
@@ -206,7 +204,7 @@ def test_a_peer_answers_from_its_own_process_until_it_fails(tmp_path, monkeypatc
         process.close()
 
 
-def test_the_line_about_the_error_is_the_one_that_is_told():
+def test_last_line_prefers_a_line_about_an_error():
     assert last_line("WARNING: slow\nERROR: no such package\n\nnotice: a new pip\n") == "ERROR: no such package"
     assert last_line("first\nlast\n\n") == "last"
     assert last_line("") == ""

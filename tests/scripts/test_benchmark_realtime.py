@@ -1,42 +1,21 @@
-import json
-import sys
-import time
-from pathlib import Path
+"""`benchmark.py realtime` and `benchmark.py soak`: decisions on virtual and wall clocks."""
 
+import json
+import time
+
+import benchmark
 import numpy as np
 import pytest
-import torch
+from bench.realtime import PARTS, part_table
+from bench.realtime_measurements import AGENTS, ITERATIONS, REPLAN_EVERY
+from bench.soak import IDLE, IdleAgent, Tally, play_block, soak_rows, soak_table, take_turns
 
-from latentplan.agents.checkpoint import save_checkpoint
-from latentplan.config import Config, EnvConfig, ModelConfig, PlannerConfig
-from latentplan.models import WorldModel
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "scripts"))
-
-import benchmark  # noqa: E402
-from bench.realtime import PARTS, part_table  # noqa: E402
-from bench.realtime_measurements import AGENTS, ITERATIONS, REPLAN_EVERY  # noqa: E402
-from bench.soak import IDLE, IdleAgent, Tally, play_block, soak_rows, soak_table, take_turns  # noqa: E402
-
-ENV = EnvConfig(domain="cartpole", task="swingup", action_repeat=100, render_quality="fastest")
-MODEL = ModelConfig(deter_dim=8, hidden_dim=8, encoder_channels=(4, 4), decoder_channels=2, num_bins=5)
-PLANNER = PlannerConfig(horizon=3, num_samples=8, num_elites=2, num_policy_samples=2, num_iterations=2)
 FRAMES = [np.zeros((64, 64, 3), np.uint8)] * 10
 
 
 @pytest.fixture(scope="module")
-def checkpoint(tmp_path_factory):
-    """An untrained agent for ten-decision episodes of cartpole."""
-    folder = tmp_path_factory.mktemp("agent")
-    info = {"domain": "cartpole", "task": "swingup", "env_frames": 1234, "discount": 0.9, "metrics": {}}
-    torch.manual_seed(0)
-    save_checkpoint(folder, WorldModel(MODEL, action_dim=1), Config(env=ENV, model=MODEL, planner=PLANNER), info)
-    return folder
-
-
-@pytest.fixture(scope="module")
 def measured(checkpoint, tmp_path_factory):
-    """Everything that `benchmark.py realtime` measures, and the folder of its files."""
+    """Result of `benchmark.py realtime` with all parts, and the folder of its files."""
     folder = tmp_path_factory.mktemp("realtime")
     flags = ["--episodes", 1, "--rates", 50, "--device", "cpu", "--json", folder / "r.json", "--plot", folder / "r.png"]
     assert benchmark.main(["realtime", "--checkpoint", str(checkpoint), *map(str, flags)]) == 0
@@ -44,7 +23,7 @@ def measured(checkpoint, tmp_path_factory):
 
 
 def sleeper(milliseconds):
-    """Takes as long for every decision."""
+    """An agent that takes the given time for every decision."""
 
     class Sleeper(IdleAgent):
         def act(self, frame):
@@ -66,7 +45,7 @@ def sleeper(milliseconds):
         (["soak", "--checkpoint", "no-such-folder"], "no-such-folder"),
     ],
 )
-def test_bad_input_is_one_line_that_names_it(capsys, arguments, named):
+def test_benchmark_refuses_bad_input_in_one_line_that_names_it(capsys, arguments, named):
     assert benchmark.main(arguments) == 2
     captured = capsys.readouterr()
     assert captured.out == ""
@@ -74,7 +53,7 @@ def test_bad_input_is_one_line_that_names_it(capsys, arguments, named):
     assert named in captured.err
 
 
-def test_every_point_of_every_part_is_measured(measured):
+def test_realtime_measures_every_row_of_every_part(measured):
     result, folder = measured
     assert [row["iterations"] for row in result["iterations"]] == list(ITERATIONS)
     assert [row["agent"] for row in result["rates"]] == list(AGENTS)
@@ -87,27 +66,28 @@ def test_every_point_of_every_part_is_measured(measured):
     assert (folder / "r.png").stat().st_size > 0
 
 
-def test_tables_have_a_line_per_point(measured):
+def test_part_table_has_one_line_per_row(measured):
     result, _ = measured
     for part in PARTS:
         assert len(part_table(part, result[part]).splitlines()) == 2 + len(result[part])
 
 
-def test_errors_are_those_of_imagination_and_of_no_change(measured):
+def test_measure_error_compares_the_model_with_no_change(measured):
     result, _ = measured
     for row in result["error"]:
         assert all(np.isfinite(row[name]) for name in ("latent_distance", "reward_error", "reward_change"))
     assert result["error"][0]["latent_change"] > 0.0
 
 
-def test_parts_are_chosen(tmp_path, checkpoint):
+def test_realtime_measures_the_chosen_parts_only(tmp_path, checkpoint):
     path = tmp_path / "r.json"
     flags = ["--parts", "error", "--episodes", "1", "--device", "cpu", "--json", str(path)]
     assert benchmark.main(["realtime", "--checkpoint", str(checkpoint), *flags]) == 0
     assert set(PARTS) & json.loads(path.read_text()).keys() == {"error"}
 
 
-def test_a_soak_counts_every_agent_beside_one_that_does_nothing(tmp_path, checkpoint, capsys):
+def test_soak_counts_every_agent_beside_an_idle_one(tmp_path, checkpoint, capsys, monkeypatch):
+    monkeypatch.setattr("bench.soak.PAUSE_SECONDS", 0.0)
     path = tmp_path / "soak.json"
     flags = ["--mode", "actor,gated", "--control-hz", "100", "--decisions", "30", "--block", "20", "--device", "cpu"]
     assert benchmark.main(["soak", "--checkpoint", str(checkpoint), *flags, "--json", str(path)]) == 0
@@ -120,16 +100,18 @@ def test_a_soak_counts_every_agent_beside_one_that_does_nothing(tmp_path, checkp
     assert "minus no-op" in capsys.readouterr().out
 
 
-def test_boundaries_that_pass_while_an_agent_is_busy_are_missed():
+def test_play_block_counts_boundaries_missed_by_a_busy_agent():
     tally = Tally()
-    play_block(sleeper(25.0), FRAMES, 100.0, 9, tally)  # at least two boundaries of 10 ms pass in each decision
+    play_block(
+        sleeper(25.0), FRAMES, 100.0, 9, tally
+    )  # at least two boundaries pass in each decision, at periods of 10 ms
     assert tally.due == 9
     assert tally.misses >= 6
     assert len(tally.decision_ms) + tally.misses == 9
     assert min(tally.decision_ms) >= 25.0
 
 
-def test_a_block_that_is_interrupted_counts_what_was_due():
+def test_play_block_counts_due_decisions_when_interrupted():
     class Interrupted:
         count = 0
 
@@ -145,7 +127,8 @@ def test_a_block_that_is_interrupted_counts_what_was_due():
     assert tally.due == 2 + tally.misses
 
 
-def test_agents_take_turns_block_by_block():
+def test_take_turns_plays_one_block_of_each_agent_in_turn(monkeypatch):
+    monkeypatch.setattr("bench.soak.PAUSE_SECONDS", 0.0)
     turns = []
 
     class Noting(IdleAgent):
@@ -162,7 +145,7 @@ def test_agents_take_turns_block_by_block():
     assert [tally.due for tally in tallies.values()] == [25, 25]
 
 
-def test_misses_are_told_beyond_those_of_the_machine():
+def test_soak_rows_subtract_the_misses_of_the_idle_agent():
     tallies = {IDLE: Tally(1000, 1, [0.1], [0.2]), "actor": Tally(500, 2, [1.0], [0.2]), "gated": Tally()}
     rows = soak_rows(tallies)
     assert list(rows) == [IDLE, "actor"]

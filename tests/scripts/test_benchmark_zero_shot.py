@@ -1,43 +1,25 @@
-"""Goals that an agent was not trained for, measured with every player."""
+"""`benchmark.py zero-shot`: goals that an agent was not trained for, played by every agent."""
 
 import json
-import sys
-from dataclasses import replace
-from pathlib import Path
 
+import benchmark
+import numpy as np
 import pytest
 import torch
-
-from latentplan.agents.checkpoint import save_checkpoint
-from latentplan.config import Config, EnvConfig, ModelConfig, PlannerConfig
-from latentplan.config.quantities import scales
-from latentplan.models import WorldModel
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "scripts"))
-
-import benchmark  # noqa: E402
-from bench.zero_shot import CONSTRAINT_PLAYERS, OBJECTIVE_PLAYERS, PURSUERS, list_jobs  # noqa: E402
-
-ENV = EnvConfig(domain="cartpole", task="swingup", action_repeat=200, render_quality="fastest")
-MODEL = ModelConfig(deter_dim=8, hidden_dim=8, encoder_channels=(4, 4), decoder_channels=2, num_bins=5)
-PLANNER = PlannerConfig(horizon=3, num_samples=8, num_elites=2, num_policy_samples=1, num_iterations=2)
+from bench.zero_shot import (
+    CONSTRAINT_PLAYERS,
+    OBJECTIVE_PLAYERS,
+    PURSUERS,
+    PUSH_PROBABILITY,
+    Conditions,
+    Job,
+    list_jobs,
+    play_job,
+)
+from bench.zero_shot_agents import load_zero_shot_agent
 
 
-@pytest.fixture(scope="module")
-def checkpoint(tmp_path_factory):
-    """An untrained agent for five-decision episodes of cartpole."""
-    return saved(tmp_path_factory.mktemp("agent"), ENV)
-
-
-def saved(folder, env):
-    info = {"domain": "cartpole", "task": "swingup", "env_frames": 1234, "discount": 0.9, "metrics": {}}
-    torch.manual_seed(0)
-    model = WorldModel(MODEL, 1, scales("cartpole"))
-    save_checkpoint(folder, model, Config(env=env, model=MODEL, planner=PLANNER), info)
-    return folder
-
-
-def test_every_goal_is_measured_with_every_player(tmp_path, checkpoint, capsys):
+def test_zero_shot_plays_every_goal_with_every_player(tmp_path, checkpoint, capsys):
     path = tmp_path / "result.json"
     flags = ["--objectives", "cart -> 1.0", "--constraints", "cart < 0.01", "--episodes", "2", "--json", str(path)]
     flags += ["--planner.horizon", "2", "--device", "cpu"]
@@ -51,14 +33,14 @@ def test_every_goal_is_measured_with_every_player(tmp_path, checkpoint, capsys):
     by_player = {(row["kind"], row["player"]): row for row in result["rows"]}
     assert all(0.0 <= rate <= 1.0 for rate in by_player["constraint", "planner"]["scores"])
     assert all(row["ci95"][0] <= row["mean"] <= row["ci95"][1] for row in result["rows"])
-    # Who does not know of the goal plays the same whatever is scored.
+    # Agents without the goal play the same episodes for every goal.
     for player in ("actor", "random"):
         assert by_player["objective", player]["returns"] == by_player["constraint", player]["returns"]
     assert result["planner"]["horizon"] == 2 and result["planner"]["goal_horizon"] is None  # as played
     assert "cart < 0.01 (constraint)" in capsys.readouterr().out
 
 
-def test_some_players_are_compared_with_an_agent_trained_for_the_goal(tmp_path, checkpoint):
+def test_zero_shot_adds_rows_of_an_agent_trained_for_the_goal(tmp_path, checkpoint):
     path = tmp_path / "result.json"
     flags = ["--objectives", "cart -> 1.0", "--players", "random, actor", "--trained", str(checkpoint)]
     flags += ["--episodes", "2", "--json", str(path), "--device", "cpu"]
@@ -67,11 +49,11 @@ def test_some_players_are_compared_with_an_agent_trained_for_the_goal(tmp_path, 
     assert [row["player"] for row in rows] == ["actor", "random", "trained planner", "trained actor"]
     by_player = {row["player"]: row for row in rows}
     assert by_player["trained actor"]["scores"] == by_player["actor"]["scores"]  # the same agent here
-    assert 1000.0 * by_player["actor"]["quantities"]["task.swingup"] == pytest.approx(by_player["actor"]["mean_return"])
+    assert 100.0 * by_player["actor"]["quantities"]["task.swingup"] == pytest.approx(by_player["actor"]["mean_return"])
 
 
-def test_what_is_trained_for_a_constraint_is_paid_by_the_task_too(tmp_path, checkpoint):
-    trained = saved(tmp_path / "trained", replace(ENV, task="balance", objective="cart > 100"))  # which pays nothing
+def test_zero_shot_pays_a_trained_agent_by_the_task_of_the_checkpoint(tmp_path, checkpoint, save_agent):
+    trained = save_agent(tmp_path / "trained", task="balance", objective="cart > 100")  # a reward of 0
     path = tmp_path / "result.json"
     flags = ["--constraints", "cart < 0.01", "--players", "actor", "--trained", str(trained), "--json", str(path)]
     assert (
@@ -85,25 +67,26 @@ def test_what_is_trained_for_a_constraint_is_paid_by_the_task_too(tmp_path, chec
     assert result["floor"] == "endless"
 
 
-def test_kicks_are_the_same_for_every_player_and_change_what_they_earn(checkpoint):
-    from bench.zero_shot import Conditions, Job, play_job
+def test_push_kicks_the_same_decisions_of_every_player(checkpoint):
+    kicked = {seed: any(first_draw(seed, decision) < PUSH_PROBABILITY for decision in range(10)) for seed in range(10)}
+    seeds = [next(seed for seed in kicked if kicked[seed] == wanted) for wanted in (True, False)]
 
-    def play(player, push, *seeds):
-        return play_job(Conditions(str(checkpoint), seeds, "cpu", {}, push), Job("cart -> 1.0", None, player))["scores"]
+    def scores(player, push):
+        conditions = Conditions(str(checkpoint), seeds, "cpu", {}, push)
+        return play_job(conditions, Job("cart -> 1.0", None, player))["scores"]
 
-    calm, pushed = play("actor", 0.0, *range(20)), play("actor", 3.0, *range(20))
-    changed = [before != after for before, after in zip(calm, pushed, strict=True)]
-    assert 0 < sum(changed) < 15  # five decisions per episode, one in 25 of them with a kick
-    assert play("actor", 3.0, *range(20)) == pushed
-    kicked = changed.index(True)
-    assert play("random", 0.0, kicked) != play("random", 3.0, kicked)
-    calm_seed = changed.index(False)
-    assert play("random", 0.0, calm_seed) == play("random", 3.0, calm_seed)
+    for player in ("actor", "random"):
+        pushed, calm = scores(player, 3.0), scores(player, 0.0)
+        assert pushed[0] != calm[0] and pushed[1] == calm[1]
+    assert scores("random", 3.0) == pushed
 
 
-def test_the_plain_gate_acts_by_its_actor_wherever_it_does_not_plan(checkpoint):
-    from bench.zero_shot_agents import load_zero_shot_agent
+def first_draw(seed, decision):
+    """The number that decides whether a decision has a kick."""
+    return np.random.default_rng((seed, decision)).random()
 
+
+def test_plain_gate_acts_by_the_actor_between_plans(checkpoint):
     frames = torch.randint(0, 256, (12, 64, 64, 3), dtype=torch.uint8).numpy()
     sources = {}
     for player in ("random gate", "random moments"):
@@ -117,7 +100,7 @@ def test_the_plain_gate_acts_by_its_actor_wherever_it_does_not_plan(checkpoint):
     assert set(sources["random moments"]) == {"plan", "tail"}
 
 
-def test_goals_are_listed_once_in_order():
+def test_list_jobs_lists_each_goal_once_in_order():
     jobs = list_jobs({"--objectives": "cart > 1; 500: cart < 1 | upright | upright |"})
     assert [job.objective for job in jobs[:: len(OBJECTIVE_PLAYERS)]] == ["cart > 1; 500: cart < 1", "upright"]
 
@@ -133,15 +116,13 @@ def test_goals_are_listed_once_in_order():
         (("--objectives", "cart > 1", "--trained", "nowhere"), "nowhere"),
     ],
 )
-def test_bad_goals_are_one_line(capsys, checkpoint, flags, reason):
+def test_zero_shot_refuses_bad_goals_in_one_line(capsys, checkpoint, flags, reason):
     assert benchmark.main(["zero-shot", "--checkpoint", str(checkpoint), *flags]) == 2
     error = capsys.readouterr().err
     assert error.startswith("error: ") and error.count("\n") == 1 and reason in error
 
 
-def test_all_who_pursue_a_goal_search_alike(checkpoint):
-    from bench.zero_shot_agents import load_zero_shot_agent
-
+def test_planning_players_share_their_search_settings(checkpoint):
     changes = {"horizon": 2}
     searches = [load_zero_shot_agent(player, str(checkpoint), "cpu", changes).controller.planner for player in PURSUERS]
     assert {(search.horizon, search.goal_horizon) for search in searches} == {(2, None)}
