@@ -1,5 +1,6 @@
 """Shared parts of the benchmark tests: the scripts on the import path, short episodes, and an untrained agent."""
 
+import contextlib
 import functools
 import sys
 from dataclasses import replace
@@ -8,10 +9,10 @@ from pathlib import Path
 import pytest
 import torch
 
+from latentplan import envs
 from latentplan.agents.checkpoint import save_checkpoint
 from latentplan.config import Config, EnvConfig, LearningConfig, ModelConfig, PlannerConfig
 from latentplan.config.quantities import scales
-from latentplan.envs import make_env  # noqa: F401
 from latentplan.models import WorldModel
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "scripts"))
@@ -31,6 +32,24 @@ def _short_episodes():
             return load(domain, task, {**(task_kwargs or {}), "time_limit": EPISODE_SECONDS}, **options)
 
         patch.setattr(suite, "load", load_short)
+        yield
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _shared_environments(_short_episodes):
+    """One environment per configuration and module, because a renderer takes half a second to start."""
+    shared, make_env = {}, envs.make_env
+
+    def make_shared(config, **options):
+        key = (config, *options.items())
+        if key not in shared:
+            env = shared[key] = make_env(config, **options)
+            closing.callback(env.close)
+            env.close = lambda: None
+        return shared[key]
+
+    with contextlib.ExitStack() as closing, pytest.MonkeyPatch.context() as patch:
+        patch.setattr("latentplan.envs.make_env", make_shared)
         yield
 
 

@@ -36,33 +36,23 @@ def test_zero_shot_plays_every_goal_with_every_player(tmp_path, checkpoint, caps
     # Agents without the goal play the same episodes for every goal.
     for player in ("actor", "random"):
         assert by_player["objective", player]["returns"] == by_player["constraint", player]["returns"]
+    actor = by_player["objective", "actor"]
+    assert 100.0 * actor["quantities"]["task.swingup"] == pytest.approx(actor["mean_return"])
     assert result["planner"]["horizon"] == 2 and result["planner"]["goal_horizon"] is None  # as played
     assert "cart < 0.01 (constraint)" in capsys.readouterr().out
 
 
-def test_zero_shot_adds_rows_of_an_agent_trained_for_the_goal(tmp_path, checkpoint):
-    path = tmp_path / "result.json"
-    flags = ["--objectives", "cart -> 1.0", "--players", "random, actor", "--trained", str(checkpoint)]
-    flags += ["--episodes", "2", "--json", str(path), "--device", "cpu"]
-    assert benchmark.main(["zero-shot", "--checkpoint", str(checkpoint), *flags]) == 0
-    rows = json.loads(path.read_text())["rows"]
-    assert [row["player"] for row in rows] == ["actor", "random", "trained planner", "trained actor"]
-    by_player = {row["player"]: row for row in rows}
-    assert by_player["trained actor"]["scores"] == by_player["actor"]["scores"]  # the same agent here
-    assert 100.0 * by_player["actor"]["quantities"]["task.swingup"] == pytest.approx(by_player["actor"]["mean_return"])
-
-
-def test_zero_shot_pays_a_trained_agent_by_the_task_of_the_checkpoint(tmp_path, checkpoint, save_agent):
+def test_zero_shot_adds_rows_of_an_agent_trained_for_the_goal_with_the_reward_of_the_task(
+    tmp_path, checkpoint, save_agent
+):
     trained = save_agent(tmp_path / "trained", task="balance", objective="cart > 100")  # a reward of 0
     path = tmp_path / "result.json"
-    flags = ["--constraints", "cart < 0.01", "--players", "actor", "--trained", str(trained), "--json", str(path)]
-    assert (
-        benchmark.main(["zero-shot", "--checkpoint", str(checkpoint), "--episodes", "2", "--device", "cpu", *flags])
-        == 0
-    )
+    flags = ["--constraints", "cart < 0.01", "--players", "actor, unconstrained", "--trained", str(trained)]
+    flags += ["--episodes", "2", "--json", str(path), "--device", "cpu"]
+    assert benchmark.main(["zero-shot", "--checkpoint", str(checkpoint), *flags]) == 0
     result = json.loads(path.read_text())
-    actor, _, same = result["rows"]
-    assert [row["player"] for row in result["rows"]] == ["actor", "trained planner", "trained actor"]
+    assert [row["player"] for row in result["rows"]] == ["unconstrained", "actor", "trained planner", "trained actor"]
+    _, actor, _, same = result["rows"]
     assert same["returns"] == actor["returns"] != [0.0, 0.0] and same["scores"] == actor["scores"]
     assert result["floor"] == "endless"
 
