@@ -24,7 +24,7 @@ FLAGS = {
     "--json": ("FILE", "result as JSON"),
 }
 SETTINGS = ()
-WARM_UP_PLANS = 3  # torch compiles for the first size, then once more for variable sizes
+WARM_UP_PLANS = 3  # torch compiles for the first size, then once more for sizes that vary
 
 
 def run(flags: Flags) -> int:

@@ -126,7 +126,7 @@ def counted_model_steps(model: WorldModel) -> Iterator[dict[str, int]]:
 
 
 def _load(flags: Flags, composed: Config | None, device: torch.device) -> tuple[WorldModel, Config, float]:
-    """Model, settings and discount of the checkpoint, or of an untrained agent."""
+    """Model, settings and discount: of the checkpoint, or of an untrained agent."""
     if composed is not None:
         import torch
 

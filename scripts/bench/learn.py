@@ -49,7 +49,7 @@ OWN_FLAGS = {  # settings that these runs differ in, or are told by
 FORWARDED = ("--preset", "--device", "--config")
 FINISHED = "finished.json"
 MODES = ("planner", "actor")
-NEAR = 0.03  # an evaluation counts for a number of env frames within this share of that number
+NEAR = 0.03  # of a number of frames: how far from it an evaluation may be that stands for it
 OWN = "latentplan"
 
 

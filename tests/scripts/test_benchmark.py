@@ -57,7 +57,7 @@ def ablated(tmp_path, checkpoint, arms, *flags):
         (["learn", "--seeds", "0,-1"], "--seeds"),
     ],
 )
-def test_benchmark_refuses_bad_input_in_one_line_that_names_it(capsys, arguments, named):
+def test_main_refuses_bad_flags_in_one_line_that_names_the_flag(capsys, arguments, named):
     assert benchmark.main(arguments) == 2
     captured = capsys.readouterr()
     assert captured.out == ""
@@ -66,7 +66,7 @@ def test_benchmark_refuses_bad_input_in_one_line_that_names_it(capsys, arguments
     assert named in captured.err
 
 
-def test_benchmark_help_lists_every_command_and_its_flags(capsys):
+def test_help_lists_every_command_and_every_flag(capsys):
     assert benchmark.main([]) == 0
     overview = capsys.readouterr().out
     for command in benchmark.COMMANDS:
@@ -95,7 +95,7 @@ def test_parse_arms_applies_settings_of_own_arms():
     assert short == Arm("short", "planner", {"horizon": 2})
 
 
-def test_parse_arms_removes_every_use_of_the_actor_from_no_actor():
+def test_parse_arms_no_actor_removes_every_use_of_the_actor():
     _, arm = parse_arms("no_actor", replace(PLANNER, start="policy", tail="policy", surprise_limit=2.0))
     assert arm.planner == {"num_policy_samples": 0, "start": "shifted", "tail": "zero", "surprise_limit": None}
 

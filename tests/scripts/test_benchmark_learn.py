@@ -83,7 +83,7 @@ def test_check_same_refuses_a_folder_with_other_settings(tmp_path):
 @pytest.mark.parametrize(
     ("flag", "own"), [("--run.seed", "--seeds"), ("--env.task", "--tasks"), ("--run.frames", "--frames")]
 )
-def test_learn_refuses_settings_that_have_a_flag_of_their_own(tmp_path, capsys, flag, own):
+def test_request_refuses_settings_that_its_own_flags_set(tmp_path, capsys, flag, own):
     assert benchmark.main(["learn", flag, "5", "--out", str(tmp_path / "out")]) == 2
     assert f"{flag} is what {own} says here" in capsys.readouterr().err
     assert not (tmp_path / "out").exists()

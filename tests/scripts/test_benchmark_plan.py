@@ -154,7 +154,7 @@ def test_plan_reports_limits_and_scaling_but_no_ratios_when_there_are_no_peers(t
         (["--model.deter_dim", "x"], "model.deter_dim"),
     ],
 )
-def test_plan_refuses_bad_input_in_one_line_that_names_it(capsys, arguments, named):
+def test_main_refuses_bad_flags_in_one_line_that_names_the_flag(capsys, arguments, named):
     assert benchmark.main(["plan", *arguments]) == 2
     captured = capsys.readouterr()
     assert captured.out == ""
