@@ -146,7 +146,7 @@ class _Parser:
         return node
 
     def split_sum(self, node: Node, weight: float) -> list[tuple[float, Node]]:
-        """The terms of a weighted sum, the only place where the learned return and goal images may stand."""
+        """The terms of a weighted sum, the only place where the learned return and goal images may occur."""
         match node:
             case Arithmetic("+" | "-" as sign, left, right):
                 factor = weight if sign == "+" else -weight

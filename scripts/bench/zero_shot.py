@@ -165,7 +165,7 @@ def list_jobs(flags: Flags) -> list[Job]:
         ),
     ]
     if not jobs:
-        raise UserError("--players names nobody who plays for an objective; unconstrained is for constraints")
+        raise UserError("--players names no agent that plays for an objective; unconstrained is for constraints")
     return jobs
 
 

@@ -143,8 +143,8 @@ def test_guide_is_a_quarter_of_the_return_at_the_rate_of_the_value(horizon, disc
 
 def test_plan_objective_rewards_latents_near_the_goal_image():
     features = torch.tensor([[[0.0, 0.0], [0.9, 0.0]]])
-    worth = objective("2 * goal:end.png", encode_goal=lambda path: torch.tensor([len(path) / 7.0]))
-    far, near = worth(rollout_of(features)).tolist()
+    score = objective("2 * goal:end.png", encode_goal=lambda path: torch.tensor([len(path) / 7.0]))
+    far, near = score(rollout_of(features)).tolist()
     assert far == pytest.approx(2 * planning_degree(torch.tensor(1.0)).item())
     assert near > 1.8
 

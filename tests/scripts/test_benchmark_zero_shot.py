@@ -102,7 +102,7 @@ def test_list_jobs_lists_each_goal_once_in_order():
         (("--objectives", "crat > 1"), "Did you mean 'cart'"),
         (("--constraints", "cart"), "ineq"),
         (("--objectives", "cart > 1", "--players", "planer"), "'planner'"),
-        (("--objectives", "cart > 1", "--players", "unconstrained"), "nobody"),
+        (("--objectives", "cart > 1", "--players", "unconstrained"), "names no agent"),
         (("--objectives", "cart > 1", "--trained", "nowhere"), "nowhere"),
     ],
 )
