@@ -42,7 +42,7 @@ def _opens_block(lines: list[str], number: int) -> bool:
     after = next((other for other in rest if other.strip()), "")
     deeper = _indent(after) > _indent(line)
     is_entry = re.match(r"^\s*(?:[*-] |\d+\. )|^\s+[\w*, ]+(?: \([^)]*\))?: ", line) or line.strip() in SECTIONS
-    return deeper and not is_entry and (line.rstrip().endswith(":") or not (rest and rest[0].strip()))
+    return deeper and not is_entry
 
 
 def _indent(line: str) -> int:
