@@ -39,5 +39,6 @@ html_show_sourcelink = False
 html_copy_source = False
 html_theme_options = {"navigation_with_keys": True, "top_of_page_buttons": []}
 pygments_style = "friendly"
+highlight_language = "none"
 copybutton_prompt_text = r"\$ "
 copybutton_prompt_is_regexp = True

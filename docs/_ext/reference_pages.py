@@ -15,6 +15,7 @@ from docutils.statemachine import StringList
 from sphinx.application import Sphinx
 
 SPECIAL = re.compile(r"(``.*?``|`[^`]*`)|([*|])|(?<=\w)(_)(?!\w)", flags=re.DOTALL)
+SHORT_CODE = 32  # characters
 SECTIONS = {f"{name}:" for name in ("Args", "Attributes", "Returns", "Raises", "Yields", "Note", "Example", "Examples")}
 
 
@@ -53,6 +54,13 @@ def hide_dataclass_text(app: Sphinx, what: str, name: str, subject: Any, options
     """The signature that Python writes for a dataclass without a docstring is no description."""
     if lines and re.match(r"^\w+\(.*\)$", lines[0]) and len(lines) <= 2 and inspect.isclass(subject):
         lines.clear()
+
+
+def keep_short_code_whole(app: Sphinx, doctree: nodes.document) -> None:
+    """Marks inline code that fits on a line, so that it is not broken at its hyphens."""
+    for code in doctree.findall(nodes.literal):
+        if len(code.astext()) <= SHORT_CODE:
+            code["classes"].append("short")
 
 
 class Api(Directive):
@@ -161,6 +169,7 @@ def setup(app: Sphinx) -> dict[str, Any]:
     """Register the directives."""
     app.add_directive("api", Api)
     app.add_directive("settings", Settings)
+    app.connect("doctree-read", keep_short_code_whole)
     app.connect("autodoc-process-docstring", hide_dataclass_text, priority=100)
     app.connect("autodoc-process-docstring", escape_markup, priority=200)
     return {"parallel_read_safe": True}
