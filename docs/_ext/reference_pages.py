@@ -56,6 +56,13 @@ def hide_dataclass_text(app: Sphinx, what: str, name: str, subject: Any, options
         lines.clear()
 
 
+def keep_property_text(app: Sphinx, what: str, name: str, subject: Any, options: Any, lines: list[str]) -> None:
+    """Napoleon reads "Whether it is so: because" of a property as a type and a description; the text is put back."""
+    getter = getattr(subject, "fget", getattr(subject, "func", None))
+    if what == "property" and getter is not None and any(line.startswith(":type:") for line in lines):
+        lines[:] = [_escaped(line) for line in (inspect.getdoc(getter) or "").splitlines()]
+
+
 def keep_short_code_whole(app: Sphinx, doctree: nodes.document) -> None:
     """Marks inline code that fits on a line, so that it is not broken at its hyphens."""
     for code in doctree.findall(nodes.literal):
@@ -172,4 +179,5 @@ def setup(app: Sphinx) -> dict[str, Any]:
     app.connect("doctree-read", keep_short_code_whole)
     app.connect("autodoc-process-docstring", hide_dataclass_text, priority=100)
     app.connect("autodoc-process-docstring", escape_markup, priority=200)
+    app.connect("autodoc-process-docstring", keep_property_text, priority=600)  # after napoleon, which has 500
     return {"parallel_read_safe": True}
