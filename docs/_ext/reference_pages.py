@@ -147,7 +147,8 @@ def _described_fields(docstring: str) -> dict[str, str]:
 def _default(field: dataclasses.Field[Any]) -> str:
     if field.default is dataclasses.MISSING:
         return "required" if field.default_factory is dataclasses.MISSING else str(field.default_factory())
-    return "null" if field.default is None else str(field.default)
+    words = {None: "null", True: "true", False: "false"}  # as in YAML
+    return words[field.default] if field.default is None or isinstance(field.default, bool) else str(field.default)
 
 
 def _escaped(text: str) -> str:
