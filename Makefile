@@ -1,12 +1,14 @@
 # `make train` and `make test` set up everything they need; `make train ARGS="--domain cartpole --minutes 5"`.
+# `make docs` builds the documentation into build/docs.
 # `make soak` fuzzes for long; `make soak ARGS="--checkpoint DIR"` counts missed deadlines on the wall clock.
 
 PYTHON ?= python3 python3.11 python3.12 python3.13
 ARGS ?=
 BIN := .venv/bin
 STAMP := .venv/.installed
+DOCS_STAMP := .venv/.docs-installed
 
-.PHONY: setup train test check doctor bench soak clean
+.PHONY: setup train test check doctor bench soak docs clean
 
 setup: $(STAMP)
 
@@ -30,6 +32,10 @@ bench: $(STAMP)
 soak: $(STAMP)
 	@$(BIN)/python $(if $(ARGS),scripts/benchmark.py soak $(ARGS),-m pytest -m soak)
 
+docs: $(DOCS_STAMP)
+	$(BIN)/sphinx-build -W --keep-going -b html docs build/docs
+	@echo "open build/docs/index.html"
+
 clean:
 	rm -rf .venv build dist *.egg-info .mypy_cache .ruff_cache .pytest_cache
 
@@ -38,6 +44,10 @@ $(STAMP): pyproject.toml constraints.txt
 	$(BIN)/python -m pip install --constraint constraints.txt --editable '.[dev]'
 	$(BIN)/python -m pip install --constraint constraints.txt --no-deps dm-control
 	@$(install_gl)
+	@touch $@
+
+$(DOCS_STAMP): $(STAMP)
+	$(BIN)/python -m pip install --constraint constraints.txt --editable '.[docs]'
 	@touch $@
 
 # The first interpreter the project runs on.

@@ -8,7 +8,7 @@ import pytest
 
 from latentplan.planning import CEMPlanner
 
-PAGE = (Path(__file__).parents[2] / "docs" / "planning.md").read_text()
+PAGE = (Path(__file__).parents[2] / "docs" / "guides" / "planning.md").read_text()
 EXAMPLES = re.findall(r"```python\n(.*?)```", PAGE, flags=re.DOTALL)
 
 
@@ -18,7 +18,7 @@ def test_the_page_has_its_examples():
 
 @pytest.mark.parametrize("index", range(len(EXAMPLES)))
 def test_example_runs(index):
-    exec(compile(EXAMPLES[index], f"docs/planning.md, example {index}", "exec"), {"__name__": "example"})
+    exec(compile(EXAMPLES[index], f"docs/guides/planning.md, example {index}", "exec"), {"__name__": "example"})
 
 
 def test_the_table_lists_every_option_with_its_default():
