@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Protocol
 
 import numpy as np
 import torch
@@ -18,6 +19,26 @@ from latentplan.objectives.image import read_goal
 from latentplan.objectives.objective import plan_goals
 from latentplan.planning import CEMPlanner
 from latentplan.planning.objectives import Constraint, Term
+
+
+class Agent(Protocol):
+    """Turns frames into actions.
+
+    An agent may have an attribute `last_source` with the origin of the most recent action: "plan", "tail" (the rest of
+    an older plan) or "actor". An agent without the attribute counts as one that does not plan.
+    """
+
+    def act(self, frame: np.ndarray) -> np.ndarray:
+        """The action, float32 (action,), for a frame, uint8 (height, width, channel)."""
+        ...
+
+    def reset(self) -> None:
+        """Forgets the past; called before every episode."""
+        ...
+
+    def seed(self, seed: int) -> None:
+        """Restarts the agent's own random stream."""
+        ...
 
 
 class ModelAgent:

@@ -12,20 +12,14 @@ import torch
 from safetensors import SafetensorError
 from safetensors.torch import load_file, save
 
-from latentplan.agents.actor import ActorAgent
-from latentplan.agents.background import BackgroundAgent
-from latentplan.agents.gated import GatedAgent
-from latentplan.agents.planning import PlanningAgent
-from latentplan.agents.random import RandomAgent
+from latentplan.agents.base import Agent
+from latentplan.agents.modes import MODES, make_agent
 from latentplan.config import Config, PlannerConfig, UserError, from_dict, to_dict
 from latentplan.config.planner import override_planner
 from latentplan.models import WorldModel
 
-Agent = PlanningAgent | ActorAgent | RandomAgent
 WEIGHTS = "weights.safetensors"
 INFO = "info.json"
-MODES = ("planner", "gated", "background", "actor", "random")
-OPTIONS = {"gated": ("planning_budget", "signal"), "background": ("worker", "max_age", "fresh_ticks", "make_executor")}
 KINDS = {
     "env_frames": int,
     "action_dim": int,
@@ -119,46 +113,46 @@ def load_model(path: str | Path, device: str = "cpu") -> tuple[WorldModel, Confi
         raise UserError(f"device {device!r} cannot be used: {str(error).splitlines()[0]}") from None
 
 
-def load_agent(
-    path: str | Path, mode: str = "planner", device: str = "cpu", **settings: Any
-) -> Agent | BackgroundAgent:
+def load_agent(path: str | Path, mode: str = "planner", device: str = "cpu", **settings: Any) -> Agent:
     """A trained agent, ready to act.
 
     Args:
-        path: A checkpoint, or a run folder.
-        mode: `planner`, `actor`, `random`, `gated` (the actor, and the planner in doubt; see `GatedAgent`) or
-            `background` (acts at once and plans beside, see `BackgroundAgent`; close it in the end).
+        path: A checkpoint, or a run folder (its best checkpoint, else its last).
+        mode: `planner` (plans at every decision), `actor` (the learned policy alone), `gated` (the actor, and the
+            planner at doubtful decisions; see `GatedAgent`), `background` (acts at once and plans beside the control
+            loop; see `BackgroundAgent`, and close it in the end) or `random`; see `latentplan.agents.modes`.
         device: `cpu` or `cuda`.
-        **settings: Settings of the search that replace the trained ones, such as `horizon=10`; `planning_budget` and
-            `signal` of a gated agent; those of `BackgroundAgent` where it plans in the background.
+        **settings: For modes that plan, planner settings that replace the trained ones, such as `horizon=10`. Also the
+            mode's own options: `planning_budget` and `signal` of `gated`; `worker`, `max_age`, `fresh_ticks` and
+            `make_executor` of `background`.
+
+    Returns:
+        An `Agent`: `act(frame)` takes uint8 frames (64, 64, 3) or (batch, 64, 64, 3) and returns float32 actions in
+        [-1, 1], (action,) or (batch, action); call `reset()` before every episode.
 
     Raises:
         UserError: The checkpoint, the mode or a setting cannot be used.
     """
     if mode not in MODES:
         raise UserError(f"mode must be one of {', '.join(MODES)}, got {mode!r}")
-    if settings and mode in ("actor", "random"):
+    entry = MODES[mode]
+    options = {name: settings.pop(name) for name in entry.options if name in settings}
+    if settings and not entry.plans:
         raise UserError(f"{next(iter(settings))} has no effect in mode {mode}: it does not plan")
     model, config, info = load_model(path, device)
-    if mode == "random":
-        return RandomAgent(model.action_dim)
-    if mode == "actor":
-        return ActorAgent(model, config)
     known = to_dict(config.planner)
-    options = {name: settings.pop(name) for name in OPTIONS.get(mode, ()) if name in settings}
     for name in settings:
         if name not in known:
-            names = (*known, *OPTIONS.get(mode, ()))
+            names = (*known, *entry.options)
             raise UserError(f"unknown planner setting {name!r}{_suggestion(name, {key: key for key in names})}")
-    kind: Any = {"planner": PlanningAgent, "gated": GatedAgent, "background": BackgroundAgent}[mode]
     try:
-        agent: Agent | BackgroundAgent = kind(
-            model, config, info["discount"], planner=PlannerConfig(**override_planner(known, settings)), **options
-        )
+        planner = PlannerConfig(**override_planner(known, settings))
+        agent = make_agent(mode, model, config, info["discount"], planner=planner, **options)
     except (TypeError, ValueError) as error:
         raise UserError(f"planner settings: {error}") from None
-    if isinstance(agent, BackgroundAgent):
-        agent.wait_until_ready()  # so that the first episode is not one of the actor alone
+    wait_until_ready = getattr(agent, "wait_until_ready", None)
+    if wait_until_ready is not None:
+        wait_until_ready()  # else the actor alone would decide in the first episode
     return agent
 
 

@@ -10,8 +10,8 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from latentplan.agents.base import Agent
 from latentplan.config import derive_seed
-from latentplan.evaluation.episodes import Agent
 from latentplan.evaluation.latency import Charge, Latency
 from latentplan.planning.model import State, state_device
 from latentplan.planning.objectives import Constraint, Term

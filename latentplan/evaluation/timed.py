@@ -17,23 +17,18 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 from typing import Any, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
-from latentplan.agents.background import BackgroundAgent
-from latentplan.agents.checkpoint import Agent as AnyAgent
+from latentplan.agents.base import Agent
 from latentplan.agents.checkpoint import load_agent
-from latentplan.config import derive_seed
+from latentplan.agents.modes import MODES
 from latentplan.evaluation.clock import VirtualClock, VirtualExecutor
-from latentplan.evaluation.episodes import Agent, OnStep, Step, finite
-from latentplan.evaluation.statistics import SOURCES, Episode, Floats, latency_percentiles, summarize
-
-Action = NDArray[np.float32]
+from latentplan.evaluation.episodes import Action, Frame, OnStep, Outcome, play_episode
+from latentplan.evaluation.statistics import Episode, EpisodeRecord, latency_percentiles, summarize
 
 WARM_UP_DECISIONS = 2
 _ROUNDING = 1e-9  # periods; a thought that ends with a period has not missed its end, whatever its last digit says
@@ -45,28 +40,17 @@ class ScheduledEnv(Protocol):
     substeps_per_decision: int
     action_space: Any
 
-    def reset(self, *, seed: int | None = None) -> tuple[NDArray[np.uint8], dict[str, Any]]:
+    def reset(self, *, seed: int | None = None) -> tuple[Frame, dict[str, Any]]:
         """The first frame of an episode, and an info."""
         ...
 
-    def step_schedule(
-        self, schedule: Sequence[tuple[Action, int]]
-    ) -> tuple[NDArray[np.uint8], float, bool, bool, dict[str, Any]]:
-        """Frame, summed reward, terminated, truncated and info after actions (action,) and their substeps."""
+    def step(self, action: Action) -> Outcome:
+        """As `step_schedule` with a single action (action,) for the whole decision."""
         ...
 
-
-@dataclass(frozen=True)
-class TimedEpisode(Episode):
-    """What an episode on the virtual clock came to; `decision_ms` is what the clock charged.
-
-    Attributes:
-        deadline_misses: Boundaries at which the agent was still thinking.
-        plan_age_ms: For each action from a plan: from the frame that the plan began with until the action acts.
-    """
-
-    deadline_misses: int = 0
-    plan_age_ms: Floats = field(default_factory=lambda: np.zeros(0))
+    def step_schedule(self, schedule: Sequence[tuple[Action, int]]) -> Outcome:
+        """Frame, summed reward, terminated, truncated and info after actions (action,) and their substeps."""
+        ...
 
 
 class Motors:
@@ -106,22 +90,20 @@ class Motors:
         return [(action, count) for action, count in parts if count > 0]
 
 
-def load_timed_agent(
-    path: str | Path, mode: str, clock: VirtualClock, device: str = "cpu", **settings: Any
-) -> AnyAgent | BackgroundAgent:
+def load_timed_agent(path: str | Path, mode: str, clock: VirtualClock, device: str = "cpu", **settings: Any) -> Agent:
     """A trained agent as `load_agent` gives it, except that plans made beside its decisions come by the clock.
 
     Raises:
         UserError: The checkpoint, the mode or a setting cannot be used.
     """
-    if mode == "background":
+    if mode in MODES and "make_executor" in MODES[mode].options:
         settings["make_executor"] = partial(VirtualExecutor, clock=clock)
     return load_agent(path, mode, device, **settings)
 
 
 def iterate_timed_episodes(
     env: ScheduledEnv, agent: Agent, seeds: Sequence[int], clock: VirtualClock, *, on_step: OnStep | None = None
-) -> Iterator[TimedEpisode]:
+) -> Iterator[Episode]:
     """Plays one episode per seed while the clock runs, each as soon as it has ended.
 
     Args:
@@ -134,10 +116,10 @@ def iterate_timed_episodes(
     if seeds and clock.control_hz is not None and not clock.latency.is_replayed:
         _warm_up(env, agent, seeds[0])
     for index, seed in enumerate(seeds):
-        yield _run_episode(env, agent, index, seed, clock, on_step)
+        yield play_episode(env, agent, index, seed, RunningWorld(env, clock), on_step)
 
 
-def summarize_timed(episodes: Sequence[TimedEpisode], clock: VirtualClock) -> dict[str, Any]:
+def summarize_timed(episodes: Sequence[Episode], clock: VirtualClock) -> dict[str, Any]:
     """What `summarize` tells, and how the agent kept up with the world, as plain values for JSON.
 
     Returns:
@@ -155,34 +137,54 @@ def summarize_timed(episodes: Sequence[TimedEpisode], clock: VirtualClock) -> di
     }
 
 
-def _run_episode(
-    env: ScheduledEnv, agent: Agent, index: int, seed: int, clock: VirtualClock, on_step: OnStep | None
-) -> TimedEpisode:
-    frame, _ = env.reset(seed=seed)
-    agent.reset()
-    agent.seed(derive_seed(seed, "agent"))
-    clock.restart(seed)
-    motors = Motors(_rest(env), env.substeps_per_decision)
-    record = _Record()
-    total_return, env_frames, periods, over = 0.0, 0, 0, False
-    while not over:
-        clock.advance(periods)
-        if motors.is_waiting:
-            record.deadline_misses += 1
+class RunningWorld:
+    """A world whose time goes on by a virtual clock while the agent decides; see the top of this module.
+
+    Args:
+        env: The environment; where the clock stands still only its `step` is used.
+        clock: Charges the agent's decisions and plans.
+    """
+
+    def __init__(self, env: ScheduledEnv, clock: VirtualClock) -> None:
+        self.env, self.clock, self.record = env, clock, EpisodeRecord()
+        self._is_running = clock.control_hz is not None
+        self._motors = Motors(_rest(env), env.substeps_per_decision if self._is_running else 1)
+        self._periods = 0
+        self._plan_began_ms = 0.0  # when the frame of the present plan was seen
+
+    def begin(self, seed: int) -> None:
+        """Restarts the clock."""
+        self.clock.restart(seed)
+
+    def decide(self, agent: Agent, frame: Frame) -> Action:
+        """The agent's latest action, (action,): a new one, unless the agent is still busy with an earlier frame."""
+        self.clock.advance(self._periods)
+        if self._motors.is_waiting:
+            self.record.deadline_misses += 1
         else:
-            action, decision_ms = clock.decide(agent, frame)
-            motors.order(action, clock.periods(decision_ms))
-            record.add(agent, clock.now_ms, decision_ms)
-        if on_step is not None:
-            on_step(Step(index, periods, total_return, frame, motors.latest))
-        frame, reward, terminated, truncated, info = env.step_schedule(motors.next_period())
-        total_return += finite(reward)
-        env_frames += int(info.get("env_frames", 1))
-        periods += 1
-        over = terminated or truncated
-    if on_step is not None:
-        on_step(Step(index, periods, total_return, frame, None))
-    return record.episode(total_return, env_frames)
+            action, decision_ms = self.clock.decide(agent, frame)
+            self._motors.order(action, self.clock.periods(decision_ms))
+            self.record.add_decision(agent, decision_ms)
+            self._record_plan_age(agent, decision_ms)
+        return self._motors.latest
+
+    def step(self) -> Outcome:
+        """Lets one period pass."""
+        self._periods += 1
+        if not self._is_running:
+            return self.env.step(self._motors.latest)
+        return self.env.step_schedule(self._motors.next_period())
+
+    def _record_plan_age(self, agent: Any, decision_ms: float) -> None:
+        source = getattr(agent, "last_source", "actor")
+        if source == "actor":
+            return
+        executor = agent.scheduler.executor if hasattr(agent, "scheduler") else None
+        if isinstance(executor, VirtualExecutor):
+            self._plan_began_ms = executor.asked_ms[agent.scheduler.tick - 1 - agent.plan_age]
+        elif source == "plan":
+            self._plan_began_ms = self.clock.now_ms
+        self.record.plan_age_ms.append(self.clock.now_ms + decision_ms - self._plan_began_ms)
 
 
 def _rest(env: ScheduledEnv) -> Action:
@@ -198,43 +200,3 @@ def _warm_up(env: ScheduledEnv, agent: Agent, seed: int) -> None:
     agent.reset()
     for _ in range(WARM_UP_DECISIONS):
         agent.act(frame)
-
-
-class _Record:
-    """What is counted in an episode."""
-
-    def __init__(self) -> None:
-        self.deadline_misses = 0
-        self._decision_ms: list[float] = []
-        self._sources = dict.fromkeys(SOURCES, 0)
-        self._surprised = 0
-        self._plan_age_ms: list[float] = []
-        self._planned_ms = 0.0  # when the present plan's frame was seen
-
-    def add(self, agent: Agent, now_ms: float, decision_ms: float) -> None:
-        """Counts a decision that began now."""
-        self._decision_ms.append(decision_ms)
-        source = getattr(agent, "last_source", "actor")
-        self._sources[source] += 1
-        self._surprised += getattr(agent, "was_surprised", False)
-        if source == "actor":
-            return
-        if isinstance(agent, BackgroundAgent) and isinstance(agent.scheduler.executor, VirtualExecutor):
-            assert agent.plan_age is not None
-            self._planned_ms = agent.scheduler.executor.asked_ms[agent.scheduler.tick - 1 - agent.plan_age]
-        elif source == "plan":
-            self._planned_ms = now_ms
-        self._plan_age_ms.append(now_ms + decision_ms - self._planned_ms)
-
-    def episode(self, total_return: float, env_frames: int) -> TimedEpisode:
-        """The episode that was counted."""
-        return TimedEpisode(
-            total_return,
-            len(self._decision_ms),
-            env_frames,
-            np.asarray(self._decision_ms),
-            self._sources,
-            self._surprised,
-            self.deadline_misses,
-            np.asarray(self._plan_age_ms),
-        )
