@@ -36,6 +36,7 @@ class EnvConfig:
         num_envs: Environments that collect at once; more than one runs each in its own process.
         objective: Expression over the body's quantities that pays in place of the task's reward, once per control step,
             such as `speed -> 2.0 and height > 1.1`; None leaves the task's.
+        suite: Suite that the domain belongs to, see `latentplan/config/suites.py`.
     """
 
     domain: str = "walker"
@@ -46,6 +47,7 @@ class EnvConfig:
     floor: str = "suite"
     num_envs: int = 1
     objective: str | None = None
+    suite: str = "dm_control"
 
     def __post_init__(self) -> None:
         at_least(self, action_repeat=1, num_envs=1, camera=-1)

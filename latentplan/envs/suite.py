@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 import logging
 import math
 from contextlib import contextmanager
@@ -14,50 +13,19 @@ from gymnasium.error import ResetNeeded
 
 from latentplan.config import EnvConfig, UserError
 from latentplan.envs.gl import explain_gl_errors, require_backend
+from latentplan.envs.registry import default_task, unknown_name
 from latentplan.envs.render import FrameRenderer, draw_floor_behind
 from latentplan.envs.reward import ObjectiveReward
 from latentplan.envs.substeps import control_step, split_schedule
 from latentplan.envs.true_quantities import measure, scales, true_values
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator, Sequence
+    from collections.abc import Iterator, Sequence
 
     from dm_control.mujoco import Physics
 
 FRAME_SIZE = 64
 _UNLIMITED_EPISODE_STEPS = 1000
-_DEFAULT_TASKS = {
-    "acrobot": "swingup",
-    "ball_in_cup": "catch",
-    "cartpole": "swingup",
-    "cheetah": "run",
-    "dog": "walk",
-    "finger": "spin",
-    "fish": "swim",
-    "hopper": "hop",
-    "humanoid": "walk",
-    "humanoid_CMU": "run",
-    "lqr": "lqr_2_1",
-    "manipulator": "bring_ball",
-    "pendulum": "swingup",
-    "point_mass": "easy",
-    "quadruped": "walk",
-    "reacher": "easy",
-    "stacker": "stack_2",
-    "swimmer": "swimmer6",
-    "walker": "walk",
-}
-
-
-def default_task(domain: str) -> str:
-    """The task a domain is usually benchmarked with.
-
-    Raises:
-        UserError: The domain is unknown.
-    """
-    if domain not in _DEFAULT_TASKS:
-        raise UserError(_unknown("domain", domain, _DEFAULT_TASKS))
-    return _DEFAULT_TASKS[domain]
 
 
 class SuiteEnv(gymnasium.Env[np.ndarray, np.ndarray]):
@@ -256,9 +224,9 @@ def _load(domain: str, task: str) -> Any:
     with explain_gl_errors():
         from dm_control import suite
     if domain not in suite.TASKS_BY_DOMAIN:
-        raise UserError(_unknown("domain", domain, suite.TASKS_BY_DOMAIN))
+        raise UserError(unknown_name("domain", domain, suite.TASKS_BY_DOMAIN))
     if task not in suite.TASKS_BY_DOMAIN[domain]:
-        raise UserError(_unknown(f"task of {domain}", task, suite.TASKS_BY_DOMAIN[domain]))
+        raise UserError(unknown_name(f"task of {domain}", task, suite.TASKS_BY_DOMAIN[domain]))
     with _quiet_model_compiler():
         # A few tasks draw their model when they are built: a fixed seed makes that the same body every time.
         return suite.load(domain, task, task_kwargs={"random": 0})
@@ -280,9 +248,3 @@ def _checked_camera(physics: Physics, config: EnvConfig) -> int:
     if config.camera >= physics.model.ncam:
         raise UserError(f"camera {config.camera} does not exist; {config.domain} has {physics.model.ncam} cameras")
     return config.camera
-
-
-def _unknown(what: str, name: str, available: Iterable[str]) -> str:
-    choices = sorted(available)
-    nearest = difflib.get_close_matches(name, choices, n=1, cutoff=0.0)[0]
-    return f"unknown {what} {name!r}; available: {', '.join(choices)}. Did you mean {nearest!r}?"

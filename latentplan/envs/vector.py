@@ -1,4 +1,4 @@
-"""One environment or several at once, all from the same settings."""
+"""Several environments behind one `step`, all from the same settings."""
 
 from __future__ import annotations
 
@@ -14,32 +14,14 @@ import numpy as np
 from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv, VectorEnv
 from gymnasium.wrappers import TimeLimit
 
-from latentplan.config import USER_DOMAIN, EnvConfig, UserError
-from latentplan.envs.suite import SuiteEnv
+from latentplan.config import EnvConfig
+from latentplan.envs.registry import make_env
 from latentplan.envs.user import make_from
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
 _THREAD_SETTINGS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
-
-
-def make_env(config: EnvConfig, seed: int | None = None) -> SuiteEnv:
-    """The environment that the settings name.
-
-    Args:
-        config: Domain, task, action repeat, camera and render quality.
-        seed: Start of its random stream; None draws one from the system.
-
-    Raises:
-        UserError: Domain, task or camera do not exist, or nothing can render.
-    """
-    if config.domain == USER_DOMAIN:
-        raise UserError(
-            "this agent learned in an environment of your own, which a command cannot make: play it from Python, "
-            "agent = load_agent(DIR)"
-        )
-    return SuiteEnv(config, seed)
 
 
 def make_vector_env(
