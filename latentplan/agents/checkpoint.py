@@ -1,4 +1,4 @@
-"""Checkpoints: a folder with weights, settings and metrics, checked when it is read."""
+"""Checkpoints: folders with the weights, settings and metrics of an agent, checked when they are read."""
 
 from __future__ import annotations
 
@@ -32,16 +32,16 @@ REQUIRED = ("domain", "task", "env_frames", "discount", "action_dim", "config", 
 
 
 def save_checkpoint(folder: Path, model: WorldModel, config: Config, info: dict[str, Any]) -> None:
-    """Write an agent: float16 weights and a description, each replaced whole.
+    """Writes a checkpoint: float16 weights and a description; each file is replaced whole.
 
     Args:
-        folder: Made when missing.
-        model: What to keep; optimizer state is not part of an agent.
+        folder: Folder of the checkpoint, made where it is missing.
+        model: The world model.
         config: Settings of the run.
-        info: Facts beside them: domain, task, discount, env_frames, metrics and the like.
+        info: Further facts for the description: domain, task, discount, env_frames, metrics and the like.
 
     Raises:
-        FloatingPointError: A weight is not finite, or beyond what float16 holds.
+        FloatingPointError: A weight is not finite in float16; the folder is left as it was.
     """
     folder.mkdir(parents=True, exist_ok=True)
     part = folder / f"{WEIGHTS}.part"
@@ -59,13 +59,13 @@ def save_checkpoint(folder: Path, model: WorldModel, config: Config, info: dict[
 
 
 def read_info(path: str | Path) -> dict[str, Any]:
-    """What a checkpoint says of itself: domain, task, env_frames, config, metrics and so on.
+    """The description of a checkpoint: domain, task, env_frames, config, metrics and so on.
 
     Args:
         path: A checkpoint, or a run folder (its best checkpoint, else its last).
 
     Raises:
-        UserError: There is no checkpoint at the path, or it is not one of this program's.
+        UserError: There is no checkpoint at the path, or another program wrote it.
     """
     folder = resolve_checkpoint(path)
     try:
@@ -82,10 +82,14 @@ def read_info(path: str | Path) -> dict[str, Any]:
 
 
 def load_model(path: str | Path, device: str = "cpu") -> tuple[WorldModel, Config, dict[str, Any]]:
-    """The world model of a checkpoint, its settings, and what it says of itself.
+    """The world model of a checkpoint, the settings of its run, and the description (see `read_info`).
+
+    Args:
+        path: A checkpoint, or a run folder.
+        device: `cpu` or `cuda`.
 
     Raises:
-        UserError: The checkpoint is missing, foreign or damaged, or the device cannot be used.
+        UserError: The checkpoint is missing or damaged, another program wrote it, or the device cannot be used.
     """
     info, folder = read_info(path), resolve_checkpoint(path)
     weights = folder / WEIGHTS
@@ -157,10 +161,10 @@ def load_agent(path: str | Path, mode: str = "planner", device: str = "cpu", **s
 
 
 def resolve_checkpoint(path: str | Path) -> Path:
-    """The checkpoint folder that a path means: itself, or the best or last one of a run.
+    """The folder of the checkpoint at a path: the path itself, or the best or last checkpoint of a run folder.
 
     Raises:
-        UserError: There is none.
+        UserError: There is no checkpoint at the path.
     """
     root = Path(path)
     folder = _find(root)
@@ -173,12 +177,12 @@ def resolve_checkpoint(path: str | Path) -> Path:
 
 
 def _not_finite(state: dict[str, torch.Tensor]) -> str | None:
-    """The name of the first of these that holds NaN or infinity."""
+    """The name of the first tensor that holds NaN or infinity; None where all are finite."""
     return next((name for name, value in state.items() if not bool(torch.isfinite(value).all())), None)
 
 
 def _find(root: Path) -> Path | None:
-    """The root itself, or the best or last checkpoint of the run in it; None where there is none."""
+    """The root where it is a checkpoint, else the best or last checkpoint of the run in it; None without either."""
     for folder in (root, root / "checkpoints" / "best", root / "checkpoints" / "last"):
         if (folder / INFO).is_file() and (folder / WEIGHTS).is_file():
             return folder
@@ -186,7 +190,7 @@ def _find(root: Path) -> Path | None:
 
 
 def _suggestion(name: str, known: dict[str, str]) -> str:
-    """What to give in place of a name: the nearest of those known, else all of them."""
+    """The end of an error message about a name: the nearest known name, else all known names."""
     nearest = difflib.get_close_matches(name, known, n=1)
     if nearest:
         return f"; did you mean {known[nearest[0]]}?"
