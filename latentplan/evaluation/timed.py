@@ -1,16 +1,16 @@
-"""Episodes in a world that does not wait: time passes in the simulator while the agent thinks.
+"""Episodes in a world that does not wait: time passes in the simulator while the agent decides.
 
-Time is counted, not slept. One decision of the environment lasts one period of 1000 / `control_hz` milliseconds, and
-a thought of d milliseconds takes d of them from the world:
+Time is counted on a virtual clock, without sleeping. One decision of the environment lasts one period of
+1000 / `control_hz` milliseconds. A decision that takes d milliseconds has these effects:
 
-- Decisions begin at the boundaries between periods, with the frame of that moment.
-- What was decided acts d milliseconds later, from the simulator's nearest substep on. Until then the last action
-  holds, and at an episode's start zeros, clamped into the bounds.
-- An agent that still thinks at a boundary misses it: it never sees that frame, the old action holds on, and it
-  decides next at the first boundary at which it has finished. Each boundary missed is a deadline miss.
-- A plan made beside the decisions is there once it has been asked for and its own duration has passed; it takes
-  nothing from the decisions, as on a processor of its own.
-- Rendering and simulating cost nothing.
+- It begins at a boundary between two periods, with the frame of that moment.
+- Its action takes effect d milliseconds later, from the simulator's nearest substep on. Until then the previous action
+  holds; at the start of an episode the action is zeros, clamped into the bounds.
+- At each boundary during the decision the agent misses a deadline: it does not see that frame, and the previous action
+  goes on. The next decision begins at the first boundary after the end of the present one.
+- A plan computed beside the decisions is ready when its own duration has passed since its request. It takes no time
+  from the decisions, as if it were computed on a processor of its own.
+- Rendering and simulation take no time.
 """
 
 from __future__ import annotations
@@ -31,11 +31,16 @@ from latentplan.evaluation.episodes import Action, Frame, OnStep, Outcome, play_
 from latentplan.evaluation.statistics import Episode, EpisodeRecord, latency_percentiles, summarize
 
 WARM_UP_DECISIONS = 2
-_ROUNDING = 1e-9  # periods; a thought that ends with a period has not missed its end, whatever its last digit says
+_ROUNDING = 1e-9  # periods; a decision that ends with a period meets its deadline in spite of rounding
 
 
 class ScheduledEnv(Protocol):
-    """An environment whose action can change within a decision; see `SuiteEnv.step_schedule`."""
+    """An environment whose action can change within a decision; see `SuiteEnv.step_schedule`.
+
+    Attributes:
+        substeps_per_decision: Steps of the simulator in one decision.
+        action_space: A Box (action,).
+    """
 
     substeps_per_decision: int
     action_space: Any
@@ -54,44 +59,44 @@ class ScheduledEnv(Protocol):
 
 
 class Motors:
-    """What the body is told while the agent thinks.
+    """The actions that the body executes while the agent decides.
 
     Args:
-        rest: Action that holds until the first one acts, (action,).
-        substeps: The simulator's substeps in one period.
+        rest: Action that holds until the first decision takes effect, (action,).
+        substeps: Substeps of the simulator in one period.
     """
 
     def __init__(self, rest: Action, substeps: int) -> None:
         self.substeps = substeps
         self._held = self._coming = rest
-        self._wait = 0  # substeps until what comes takes over
-        self._thought = 0.0  # periods until it is thought through
+        self._wait = 0  # substeps until the coming action takes effect
+        self._remaining = 0.0  # periods until the decision ends
 
     @property
     def is_waiting(self) -> bool:
-        """Whether an action is still being thought about."""
-        return self._thought > _ROUNDING
+        """Whether the agent is still deciding."""
+        return self._remaining > _ROUNDING
 
     @property
     def latest(self) -> Action:
-        """The last action decided, whether or not it acts already, (action,)."""
+        """The action of the latest decision, (action,), whether or not it has taken effect yet."""
         return self._coming
 
     def order(self, action: Action, late_periods: float) -> None:
-        """Lets an action (action,) take over, so many periods from now."""
+        """Replaces the present action by `action`, (action,), after so many periods."""
         self._held, self._coming = self._coming, action
-        self._wait, self._thought = math.floor(late_periods * self.substeps + 0.5), late_periods
+        self._wait, self._remaining = math.floor(late_periods * self.substeps + 0.5), late_periods
 
     def next_period(self) -> list[tuple[Action, int]]:
-        """The actions of the coming period and their substeps."""
+        """The actions of the coming period, each with its number of substeps, in order."""
         before = min(self._wait, self.substeps)
-        self._wait, self._thought = self._wait - before, self._thought - 1.0
+        self._wait, self._remaining = self._wait - before, self._remaining - 1.0
         parts = [(self._held, before), (self._coming, self.substeps - before)]
         return [(action, count) for action, count in parts if count > 0]
 
 
 def load_timed_agent(path: str | Path, mode: str, clock: VirtualClock, device: str = "cpu", **settings: Any) -> Agent:
-    """A trained agent as `load_agent` gives it, except that plans made beside its decisions come by the clock.
+    """A trained agent as from `load_agent`; plans computed beside its decisions are charged by the clock.
 
     Raises:
         UserError: The checkpoint, the mode or a setting cannot be used.
@@ -104,14 +109,17 @@ def load_timed_agent(path: str | Path, mode: str, clock: VirtualClock, device: s
 def iterate_timed_episodes(
     env: ScheduledEnv, agent: Agent, seeds: Sequence[int], clock: VirtualClock, *, on_step: OnStep | None = None
 ) -> Iterator[Episode]:
-    """Plays one episode per seed while the clock runs, each as soon as it has ended.
+    """One episode per seed, played while the clock runs; each comes as soon as it has ended.
 
     Args:
         env: Environment of uint8 frames (height, width, channel); it stays open.
         agent: Reset, and its random stream restarted, before every episode.
         seeds: Seed of each episode's start, see `episode_seed`.
-        clock: That charges the agent's thoughts; also the executor of the plans that it makes beside them.
+        clock: Charges the agent's decisions; also the clock of `load_timed_agent`, where the agent came from there.
         on_step: Called at every boundary between periods, missed or not, and once more when an episode has ended.
+
+    Raises:
+        UserError: The environment gave a reward that is not finite.
     """
     if seeds and clock.control_hz is not None and not clock.latency.is_replayed:
         _warm_up(env, agent, seeds[0])
@@ -120,11 +128,11 @@ def iterate_timed_episodes(
 
 
 def summarize_timed(episodes: Sequence[Episode], clock: VirtualClock) -> dict[str, Any]:
-    """What `summarize` tells, and how the agent kept up with the world, as plain values for JSON.
+    """The result of `summarize`, and figures of real time, as plain values for JSON.
 
     Returns:
-        Besides: `plan_age_ms` (`p50`, `p95`, `p99`; None without a plan),
-        `deadline_misses`, `control_hz` and `latency`. In a world that waits, age, rate and latency are None.
+        The keys of `summarize`, and `plan_age_ms` (`p50`, `p95` and `p99`; None without a plan), `deadline_misses`,
+        `control_hz` and `latency`. In a world that waits `plan_age_ms`, `control_hz` and `latency` are None.
     """
     ages = np.concatenate([episode.plan_age_ms for episode in episodes])
     waits = clock.control_hz is None
@@ -138,10 +146,10 @@ def summarize_timed(episodes: Sequence[Episode], clock: VirtualClock) -> dict[st
 
 
 class RunningWorld:
-    """A world whose time goes on by a virtual clock while the agent decides; see the top of this module.
+    """A world whose time is told by a virtual clock while the agent decides; see the top of this module.
 
     Args:
-        env: The environment; where the clock stands still only its `step` is used.
+        env: The environment. Where the clock stands still `step` alone is called, not `step_schedule`.
         clock: Charges the agent's decisions and plans.
     """
 
@@ -150,14 +158,14 @@ class RunningWorld:
         self._is_running = clock.control_hz is not None
         self._motors = Motors(_rest(env), env.substeps_per_decision if self._is_running else 1)
         self._periods = 0
-        self._plan_began_ms = 0.0  # when the frame of the present plan was seen
+        self._plan_began_ms = 0.0  # time at which the present plan's first frame was seen
 
     def begin(self, seed: int) -> None:
         """Restarts the clock."""
         self.clock.restart(seed)
 
     def decide(self, agent: Agent, frame: Frame) -> Action:
-        """The agent's latest action, (action,): a new one, unless the agent is still busy with an earlier frame."""
+        """The agent's latest action, (action,); a new one unless the agent is still deciding on an earlier frame."""
         self.clock.advance(self._periods)
         if self._motors.is_waiting:
             self.record.deadline_misses += 1
@@ -188,14 +196,14 @@ class RunningWorld:
 
 
 def _rest(env: ScheduledEnv) -> Action:
-    """Zeros, clamped into the bounds."""
+    """An action of zeros, clamped into the bounds."""
     space = env.action_space
     rest: Action = np.zeros(space.shape, np.float32).clip(space.low, space.high)
     return rest
 
 
 def _warm_up(env: ScheduledEnv, agent: Agent, seed: int) -> None:
-    """Lets libraries do what they do at a first call, which no robot would leave to its first decision."""
+    """Makes a few decisions that are not counted, because libraries prepare themselves at a first call."""
     frame, _ = env.reset(seed=seed)
     agent.reset()
     for _ in range(WARM_UP_DECISIONS):
