@@ -94,9 +94,7 @@ class PixelEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         self._decisions = 0
         self.action_repeat = action_repeat
         limit = env.spec.max_episode_steps if env.spec is not None else None
-        if limit is None and env.has_wrapper_attr(
-            "_max_episode_steps"
-        ):  # of a `TimeLimit` around an environment without a spec
+        if limit is None and env.has_wrapper_attr("_max_episode_steps"):  # a `TimeLimit`, but no spec
             limit = env.get_wrapper_attr("_max_episode_steps")
         if rate := env.metadata.get("render_fps"):
             self.metadata = {**PixelEnv.metadata, "render_fps": rate / action_repeat}

@@ -183,7 +183,7 @@ class Replay:
         """Replaces the stored beliefs of some rows by newer beliefs.
 
         Args:
-            rows: Indices in the replay, (batch, time). Of a row that occurs more than once the last chosen belief counts.
+            rows: Indices in the replay, (batch, time). Of a row that occurs twice the last chosen belief counts.
             deter: The newer beliefs, (batch, time, deter).
             chosen: The beliefs to store, bool (batch, time).
         """

@@ -12,7 +12,7 @@ CONFIG = Config(
 
 
 def make_model():
-    """Untrained, but with rewards to plan for and an actor with preferences."""
+    """An untrained world model whose predicted rewards and actor's modes differ between states."""
     torch.manual_seed(0)
     model = WorldModel(CONFIG.model, action_dim=2)
     with torch.no_grad():

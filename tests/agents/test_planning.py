@@ -1,4 +1,4 @@
-"""Agents: frames in, bounded actions out, and a past that belongs to each environment alone."""
+"""Planner, actor and random agent: shapes and bounds of actions, random streams, resets, exploration."""
 
 import dataclasses
 
@@ -35,7 +35,7 @@ def film():
 
 
 @pytest.mark.parametrize("make", AGENTS)
-def test_frames_become_bounded_float32_actions(make, model, film):
+def test_act_returns_bounded_float32_actions(make, model, film):
     agent = make(model)
     assert agent.num_actions == 2 and agent.config is CONFIG
     action = agent.act(film[0, 0])
@@ -46,22 +46,22 @@ def test_frames_become_bounded_float32_actions(make, model, film):
 
 
 @pytest.mark.parametrize("make", AGENTS)
-def test_one_environment_alone_acts_as_in_a_batch_of_one(make, model, film):
+def test_act_gives_a_single_frame_the_action_of_a_batch_of_one(make, model, film):
     alone, batched = make(model, seed=3), make(model, seed=3)
     for frames in film:
         assert np.array_equal(alone.act(frames[0]), batched.act(frames[:1])[0])
 
 
 @pytest.mark.parametrize("make", AGENTS)
-def test_environments_of_a_batch_do_not_feel_each_other(make, model, film):
+def test_act_gives_each_environment_of_a_batch_its_own_action(make, model, film):
     for frames in film:
         together, alone = make(model, seed=3), make(model, seed=3)
-        # A batch may be summed in another order than a row alone, and in bfloat16 that can swap two of the elites.
+        # A batch is summed in another order than a single row, which in bfloat16 can exchange two elites.
         assert np.allclose(together.act(frames)[1], alone.act(frames[1]), atol=0.1)
 
 
 @pytest.mark.parametrize("make", AGENTS)
-def test_the_same_stream_gives_the_same_actions(make, model, film):
+def test_act_repeats_with_the_seed(make, model, film):
     agent = make(model)
     histories = []
     for seed in (5, 5):
@@ -72,7 +72,7 @@ def test_the_same_stream_gives_the_same_actions(make, model, film):
 
 
 @pytest.mark.parametrize("make", AGENTS)
-def test_resetting_forgets_the_past(make, model, film):
+def test_reset_forgets_the_past(make, model, film):
     agent, fresh = make(model), make(model)
     for frames in film:
         agent.act(frames)
@@ -83,7 +83,7 @@ def test_resetting_forgets_the_past(make, model, film):
 
 
 @pytest.mark.parametrize("make", AGENTS)
-def test_a_masked_reset_forgets_only_there(make, model, film):
+def test_masked_reset_forgets_the_past_of_masked_environments_only(make, model, film):
     agent, kept, fresh = make(model), make(model), make(model)
     for frames in film[:3]:
         agent.act(frames)
@@ -99,7 +99,7 @@ def test_a_masked_reset_forgets_only_there(make, model, film):
 
 
 @pytest.mark.parametrize("make", AGENTS)
-def test_a_mask_of_other_environments_is_refused_and_changes_nothing(make, model, film):
+def test_reset_refuses_a_mask_of_another_length_and_changes_nothing(make, model, film):
     agent = make(model)
     agent.act(film[0])
     with pytest.raises(ValueError, match="a mask of 2 for 3"):
@@ -107,7 +107,7 @@ def test_a_mask_of_other_environments_is_refused_and_changes_nothing(make, model
     agent.act(film[0])
 
 
-def test_a_masked_reset_forgets_the_plan_only_there(model, film):
+def test_masked_reset_forgets_the_plans_of_masked_environments_only(model, film):
     agent = make_planner(model)
     agent.act(film[0])
     agent.reset(np.array([False, True, False]))
@@ -115,7 +115,7 @@ def test_a_masked_reset_forgets_the_plan_only_there(model, film):
 
 
 @pytest.mark.parametrize("make", AGENTS)
-def test_masked_resets_add_up(make, model, film):
+def test_masked_resets_add_up_until_the_next_decision(make, model, film):
     agent, fresh = make(model), make(model)
     agent.act(film[0])
     agent.reset(np.array([True, False, False]))
@@ -125,7 +125,7 @@ def test_masked_resets_add_up(make, model, film):
     assert torch.allclose(agent.state.stoch[:2], fresh.state.stoch[:2], atol=1e-5)
 
 
-def test_the_belief_follows_the_action_that_was_executed(model, film):
+def test_belief_is_updated_with_the_executed_action(model, film):
     noisy = make_planner(model, noise_std=0.5)
     action = noisy.act(film[0])
     before = noisy.state
@@ -134,13 +134,13 @@ def test_the_belief_follows_the_action_that_was_executed(model, film):
     assert all(torch.allclose(left, right, atol=1e-5) for left, right in zip(noisy.state, expected, strict=True))
 
 
-def test_exploration_noise_moves_actions_and_stays_within_bounds(model, film):
+def test_exploration_noise_changes_actions_within_the_bounds(model, film):
     plain, noisy = make_planner(model).act(film[0]), make_planner(model, noise_std=5.0).act(film[0])
     assert not np.allclose(plain, noisy)
     assert np.abs(noisy).max() <= 1.0
 
 
-def test_an_exploring_actor_samples_and_another_does_not(model, film):
+def test_actor_samples_only_when_it_explores(model, film):
     firm, free = make_actor(model), make_actor(model, explore=True)
     actions = {True: [], False: []}
     for seed in (0, 1):
@@ -164,7 +164,7 @@ def test_an_exploring_actor_samples_and_another_does_not(model, film):
         np.zeros((1, 2, 64, 64, 3), np.uint8),
     ],
 )
-def test_what_is_no_frame_is_refused(make, model, frame):
+def test_act_and_encode_refuse_arrays_that_are_no_frames(make, model, frame):
     agent = make(model)
     with pytest.raises(ValueError, match=r"frames must be uint8 \(64, 64, 3\), got"):
         agent.act(frame)
@@ -173,7 +173,7 @@ def test_what_is_no_frame_is_refused(make, model, frame):
 
 
 @pytest.mark.parametrize("make", AGENTS)
-def test_another_number_of_environments_needs_a_reset(make, model, film):
+def test_act_refuses_another_batch_size_without_a_reset(make, model, film):
     agent = make(model)
     agent.act(film[0])
     with pytest.raises(ValueError, match=r"call reset\(\)"):
@@ -183,7 +183,7 @@ def test_another_number_of_environments_needs_a_reset(make, model, film):
 
 
 @pytest.mark.parametrize("make", AGENTS)
-def test_encoding_gives_the_latent_and_leaves_no_trace(make, model, film):
+def test_encode_gives_the_latent_and_changes_no_state(make, model, film):
     agent, other = make(model, seed=1), make(model, seed=1)
     latent = agent.encode(film[0, 0])
     assert latent.shape == (32,) and latent.dtype == np.float32
@@ -192,7 +192,7 @@ def test_encoding_gives_the_latent_and_leaves_no_trace(make, model, film):
     assert np.array_equal(agent.act(film[0]), other.act(film[0]))
 
 
-def test_a_planner_pictures_where_its_plan_ends(model, film):
+def test_imagine_gives_a_picture_when_there_is_a_plan(model, film):
     agent = make_planner(model)
     assert agent.imagine() is None
     agent.act(film[0])
@@ -202,14 +202,14 @@ def test_a_planner_pictures_where_its_plan_ends(model, film):
     assert agent.imagine() is None
 
 
-def test_acting_changes_no_weight(model, film):
+def test_act_changes_no_weight(model, film):
     before = {name: value.clone() for name, value in model.state_dict().items()}
     make_planner(model).act(film[0])
     assert all(torch.equal(value, before[name]) for name, value in model.state_dict().items())
     assert all(parameter.grad is None for parameter in model.parameters())
 
 
-def test_random_actions_fill_the_bounds_and_repeat_with_their_seed(film):
+def test_random_agent_fills_the_bounds_and_repeats_with_its_seed(film):
     agent = RandomAgent(2, seed=4)
     actions = np.stack([agent.act(film[0]) for _ in range(100)])
     assert actions.shape == (100, 3, 2) and actions.dtype == np.float32
@@ -220,19 +220,19 @@ def test_random_actions_fill_the_bounds_and_repeat_with_their_seed(film):
 
 
 def _noises(agent, frames, decisions):
-    """The noise of each decision, (decision, batch, action), where the agent's own choice is known."""
+    """The agent's exploration noise of each decision, (decision, batch, action)."""
     return torch.stack([agent.noise.draw(torch.zeros(frames, 2), agent.generator) for _ in range(decisions)])
 
 
 @pytest.mark.parametrize("correlation", [0.0, 0.8])
-def test_noise_keeps_its_variance_and_has_the_correlation_asked_for(correlation, model):
+def test_noise_has_variance_1_and_the_given_correlation(correlation, model):
     noise = _noises(make_actor(model, explore=True, noise_correlation=correlation), 2000, 20)
     assert noise.var() == pytest.approx(1.0, abs=0.03)
     lags = [(noise[lag:] * noise[: 20 - lag]).mean().item() for lag in (1, 2)]
     assert lags == pytest.approx([correlation, correlation**2], abs=0.03)
 
 
-def test_a_new_episode_forgets_the_noise_of_the_last(model, film):
+def test_noise_is_independent_of_the_past_when_an_episode_begins(model, film):
     kept, reset = (make_actor(model, explore=True, noise_correlation=0.99, seed=3) for _ in range(2))
     for agent in (kept, reset):
         agent.act(film[0])
@@ -244,7 +244,7 @@ def test_a_new_episode_forgets_the_noise_of_the_last(model, film):
     assert not torch.allclose(first[0], reset.noise.last[0], atol=0.3)
 
 
-def test_a_planner_without_time_acts_by_its_actor_and_says_so(model, film):
+def test_planning_agent_acts_by_the_actor_when_the_deadline_is_too_short(model, film):
     settings = dataclasses.replace(CONFIG.planner, deadline_ms=1e5)
     agent, actor = make_planner(model, planner=settings), make_actor(model)
     for frame in film[:3, 0]:
@@ -259,6 +259,6 @@ def test_a_planner_without_time_acts_by_its_actor_and_says_so(model, film):
 
 
 @pytest.mark.parametrize("make", AGENTS)
-def test_frames_may_be_flipped_views(make, model, film):
+def test_act_takes_flipped_views_of_frames(make, model, film):
     flipped = film[0, 0][::-1]
     assert np.array_equal(make(model, seed=3).act(flipped), make(model, seed=3).act(flipped.copy()))

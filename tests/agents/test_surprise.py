@@ -1,4 +1,4 @@
-"""Where a frame surprises the model, its plans are not trusted."""
+"""The actor replaces the plan where a frame surprises the model."""
 
 import dataclasses
 
@@ -28,7 +28,7 @@ def model():
 
 @pytest.fixture
 def frames():
-    """Of two environments."""
+    """Frames of two environments."""
     return np.random.default_rng(0).integers(0, 256, (2, 64, 64, 3), dtype=np.uint8)
 
 
@@ -36,7 +36,7 @@ def make_planner(model, **settings):
     return PlanningAgent(model, CONFIG, 0.9, planner=dataclasses.replace(CONFIG.planner, **settings))
 
 
-def test_surprise_counts_standard_deviations_from_what_was_predicted(model):
+def test_surprise_is_half_the_squared_distance_in_standard_deviations(model):
     deter = torch.randn(2, 16, generator=torch.Generator().manual_seed(0))
     prior = model.dynamics.prior(deter)
     away = prior.std * torch.tensor([[0.0], [2.0]]) * (torch.arange(32) == 5)
@@ -46,7 +46,7 @@ def test_surprise_counts_standard_deviations_from_what_was_predicted(model):
 
 
 @pytest.mark.parametrize("limit", [5.0, 1.0, 0.5])
-def test_where_a_frame_surprises_the_model_the_actor_acts(model, frames, monkeypatch, limit):
+def test_planning_agent_acts_by_the_actor_when_a_frame_exceeds_the_surprise_limit(model, frames, monkeypatch, limit):
     surprise = torch.tensor([3.0, 0.7])
     monkeypatch.setattr(WorldModel, "surprise", lambda self, state: surprise)
     planner, actor = make_planner(model), ActorAgent(model, CONFIG)
@@ -62,7 +62,7 @@ def test_where_a_frame_surprises_the_model_the_actor_acts(model, frames, monkeyp
 
 
 @pytest.mark.parametrize("asked", ASKED)
-def test_what_the_actor_knows_nothing_of_is_planned_for_whatever_surprises(model, frames, asked):
+def test_planning_agent_ignores_surprise_when_an_objective_or_constraint_is_set(model, frames, asked):
     planner = make_planner(model)
     limited = make_planner(model, surprise_limit=1e-6)
     for agent in (planner, limited):
