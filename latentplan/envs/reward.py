@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from latentplan.envs.true_quantities import clause_degree, scales
+from latentplan.config.quantities import scales
+from latentplan.envs.true_quantities import clause_degree
 from latentplan.objectives.expression import evaluate
 from latentplan.objectives.parser import parse_reward
 

@@ -12,12 +12,13 @@ import numpy as np
 from gymnasium.error import ResetNeeded
 
 from latentplan.config import EnvConfig, UserError
+from latentplan.config.quantities import scales
 from latentplan.envs.gl import explain_gl_errors, require_backend
 from latentplan.envs.registry import default_task, unknown_name
 from latentplan.envs.render import FrameRenderer, draw_floor_behind
 from latentplan.envs.reward import ObjectiveReward
 from latentplan.envs.substeps import control_step, split_schedule
-from latentplan.envs.true_quantities import measure, scales, true_values
+from latentplan.envs.true_quantities import measure, true_values
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
@@ -42,7 +43,7 @@ class SuiteEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         decisions_per_episode: Decisions until the time limit.
         domain: Domain of the suite.
         record_quantities: Whether the `info` of a step holds the true values after each of its control steps:
-            `quantities`, float64 (control step, quantity) in the order of `quantity_names`, and `rewards`, float64
+            `quantities`, float64 (control step, quantity) in the order of `scales(domain)`, and `rewards`, float64
             (control step,).
         labels: Names of the quantities in `info["labels"]`, each with its scale.
         substeps_per_decision: Steps of the simulator per decision: the finest resolution at which actions change.

@@ -10,14 +10,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from latentplan.config.quantities import scales
-
 if TYPE_CHECKING:
     from collections.abc import Callable
 
     from dm_control.mujoco import Physics
-
-__all__ = ["clause_degree", "measure", "quantity_names", "scales", "true_values"]
 
 _WALKER_STAND_HEIGHT = 1.2
 _WALKER_SPEEDS = (1.0, 8.0, -1.0)  # walk, run, backward
@@ -28,18 +24,8 @@ _FINGER_SPIN_SPEED = 15.0
 _PENDULUM_COSINE = np.cos(np.deg2rad(8))
 
 
-def quantity_names(domain: str, task: str) -> tuple[str, ...]:
-    """The named quantities of a domain, then the rewards of its tasks as `task.NAME`; empty where none are named.
-
-    Args:
-        domain: Domain of `dm_control.suite`.
-        task: Not used: every task of a domain has the same quantities, because the body is the same.
-    """
-    return tuple(scales(domain))
-
-
 def measure(domain: str, physics: Physics) -> np.ndarray:
-    """The true values of the present state in the order of `quantity_names`, float32 (quantity,)."""
+    """The true values of the present state in the order of `scales(domain)`, float32 (quantity,)."""
     return true_values(domain, physics).astype(np.float32)
 
 

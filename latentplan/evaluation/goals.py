@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from latentplan.config import EnvConfig
 from latentplan.config.quantities import scales
-from latentplan.envs.true_quantities import clause_degree, quantity_names
+from latentplan.envs.true_quantities import clause_degree
 from latentplan.objectives.expression import (
     Clause,
     Expression,
@@ -120,7 +120,7 @@ class ScoredEnv(gymnasium.Wrapper[Any, Any, Any, Any]):
         self.worth: list[float] = []
         self.clauses: list[tuple[str, bool]] = []
         self._on_objective = on_objective
-        self._names = quantity_names(env.domain, "")
+        self._names = tuple(scales(env.domain))
         self._pictures = {path: read_goal(path) for phase in goals.phases for path in _goal_paths(phase.objective)}
         self._present: Phase | None = None
         self._num_frames = self._num_violated = 0

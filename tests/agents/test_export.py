@@ -1,7 +1,6 @@
 """The exported actor: a file that gives the agent's actions without this package."""
 
 import json
-import resource
 import sys
 from contextlib import contextmanager
 
@@ -165,6 +164,8 @@ def test_export_help_imports_no_torch(run_python):
 @contextmanager
 def largest_file(size):
     """Lets this process write no file beyond a size in bytes, as on a full disk."""
+    import resource  # Unix only
+
     before = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (size, before[1]))
     try:

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from latentplan.config import EnvConfig
-from latentplan.config.quantities import QUANTITIES, TASK_PREFIX
+from latentplan.config.quantities import QUANTITIES, TASK_PREFIX, scales
 from latentplan.envs import make_env
-from latentplan.envs.true_quantities import clause_degree, measure, quantity_names, scales, true_values
+from latentplan.envs.true_quantities import clause_degree, measure, true_values
 
 NOT_IN_THE_SUITE = {("walker", "backward"), ("cheetah", "backward")}
 REWARDS = [
@@ -24,7 +24,7 @@ def load(domain, task):
 
 
 def value(domain, physics, name):
-    return true_values(domain, physics)[quantity_names(domain, "").index(name)]
+    return true_values(domain, physics)[list(scales(domain)).index(name)]
 
 
 @pytest.mark.parametrize(("domain", "task"), [pair for pair in REWARDS if pair not in NOT_IN_THE_SUITE])
@@ -76,7 +76,7 @@ def test_task_quantity_backward_mirrors_the_forward_reward(domain, forward):
 def test_measure_gives_one_value_per_name(domain):
     env = load(domain, REWARDS[[pair[0] for pair in REWARDS].index(domain)][1])
     env.reset()
-    names, values = quantity_names(domain, "any"), measure(domain, env.physics)
+    names, values = tuple(scales(domain)), measure(domain, env.physics)
     assert (values.shape, values.dtype) == ((len(names),), np.float32)
     assert len(set(names)) == len(names)
     assert all(name.removeprefix(TASK_PREFIX).isidentifier() for name in names)
@@ -90,7 +90,7 @@ def test_true_values_are_those_of_the_body():
         with env.physics.reset_context():
             env.physics.named.data.qpos["slider"], env.physics.named.data.qpos["hinge_1"] = 0.7, angle
             env.physics.data.qvel[:] = (0.3, -4.0)
-        names, values = quantity_names("cartpole", "swingup"), true_values("cartpole", env.physics)
+        names, values = scales("cartpole"), true_values("cartpole", env.physics)
         found = dict(zip(names, values, strict=True))
         wrapped = (angle + np.pi) % (2 * np.pi) - np.pi
         expected = {"cart": 0.7, "pole_angle": wrapped, "upright": np.cos(angle), "cart_speed": 0.3, "pole_speed": -4.0}
@@ -99,7 +99,7 @@ def test_true_values_are_those_of_the_body():
 
 def test_measure_is_empty_for_a_domain_without_quantities():
     env = load("acrobot", "swingup")
-    assert quantity_names("acrobot", "swingup") == ()
+    assert scales("acrobot") == {}
     assert measure("acrobot", env.physics).shape == (0,)
 
 
