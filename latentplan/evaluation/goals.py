@@ -14,7 +14,7 @@ import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
-from latentplan.config import EnvConfig
+from latentplan.config import EnvConfig, UserError
 from latentplan.config.quantities import scales
 from latentplan.envs.true_quantities import clause_degree
 from latentplan.objectives.expression import (
@@ -112,7 +112,12 @@ class ScoredEnv(gymnasium.Wrapper[Any, Any, Any, Any]):
             env: The environment; it has to report true quantities.
             goals: The goals to score.
             on_objective: Called with the present objective when an episode begins and when the objective changes.
+
+        Raises:
+            UserError: The environment does not report true quantities.
         """
+        if not hasattr(env, "record_quantities"):
+            raise UserError("goals are scored by true quantities, which this environment does not report")
         super().__init__(env)
         self._suite_env, self.substeps_per_decision = env, env.substeps_per_decision
         env.record_quantities = True
@@ -219,7 +224,7 @@ def score_env(env: SuiteEnv, goals: Goals, planner: Any | None) -> ScoredEnv:
         planner: A planning agent, which then pursues the goals; None for an agent that does not plan.
 
     Raises:
-        UserError: The agent does not predict a quantity that a goal names.
+        UserError: The environment does not report true quantities, or the agent does not predict one that a goal names.
     """
     if planner is None:
         return ScoredEnv(env, goals)

@@ -26,6 +26,7 @@ import numpy as np
 from latentplan.agents.base import Agent
 from latentplan.agents.checkpoint import load_agent
 from latentplan.agents.modes import MODES
+from latentplan.config import UserError
 from latentplan.evaluation.clock import VirtualClock, VirtualExecutor
 from latentplan.evaluation.episodes import Action, Frame, OnStep, Outcome, play_episode
 from latentplan.evaluation.statistics import Episode, EpisodeRecord, latency_percentiles, summarize
@@ -119,8 +120,11 @@ def iterate_timed_episodes(
         on_step: Called at every boundary between periods, missed or not, and once more when an episode has ended.
 
     Raises:
-        UserError: The environment gave a reward that is not finite.
+        UserError: The environment gave a reward that is not finite, or its action cannot change within a decision while
+            the clock runs.
     """
+    if clock.control_hz is not None and not hasattr(env, "step_schedule"):
+        raise UserError("the action of this environment cannot change within a decision: leave out --control-hz")
     if seeds and clock.control_hz is not None and not clock.latency.is_replayed:
         _warm_up(env, agent, seeds[0])
     for index, seed in enumerate(seeds):

@@ -9,11 +9,12 @@ import torch
 
 from latentplan.agents.actor import ActorAgent
 from latentplan.agents.background import BackgroundAgent
-from latentplan.config import Config, ModelConfig, PlannerConfig, UserError
+from latentplan.config import Config, PlannerConfig, UserError
 from latentplan.models import WorldModel
+from tests.agents.small_agents import SIZES
 
 CONFIG = Config(
-    model=ModelConfig(deter_dim=16, hidden_dim=16, encoder_channels=(8, 8), decoder_channels=2, num_bins=15),
+    model=SIZES,
     planner=PlannerConfig(horizon=4, num_samples=16, num_elites=4, num_iterations=2, num_policy_samples=2),
 )
 

@@ -12,12 +12,11 @@ from latentplan.agents.actor import ActorAgent
 from latentplan.agents.checkpoint import load_agent, save_checkpoint
 from latentplan.agents.export import export_actor
 from latentplan.commands.main import main
-from latentplan.config import Config, ModelConfig, UserError
+from latentplan.config import Config, UserError
 from latentplan.models import WorldModel
+from tests.agents.small_agents import SIZES
 
-CONFIG = Config(
-    model=ModelConfig(deter_dim=16, hidden_dim=16, encoder_channels=(8, 8), decoder_channels=2, num_bins=15)
-)
+CONFIG = Config(model=SIZES)
 
 
 @pytest.fixture(scope="module")

@@ -9,11 +9,12 @@ import torch
 from latentplan.agents.actor import ActorAgent
 from latentplan.agents.gated import SIGNALS, GatedAgent, RunningScale
 from latentplan.agents.planning import PlanningAgent
-from latentplan.config import Config, ModelConfig, PlannerConfig
+from latentplan.config import Config, PlannerConfig
 from latentplan.models import WorldModel
+from tests.agents.small_agents import SIZES
 
 CONFIG = Config(
-    model=ModelConfig(deter_dim=16, hidden_dim=16, encoder_channels=(8, 8), decoder_channels=2, num_bins=15),
+    model=SIZES,
     planner=PlannerConfig(
         horizon=3, num_samples=8, num_elites=3, num_iterations=3, warm_start_iterations=1, num_policy_samples=0
     ),

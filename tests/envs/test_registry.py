@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from latentplan.agents.random import RandomAgent
 from latentplan.commands import evaluate
 from latentplan.config import (
     CollectionConfig,
@@ -22,6 +23,10 @@ from latentplan.config import (
 from latentplan.config.files import compose
 from latentplan.config.suites import SUITES, Suite
 from latentplan.envs import default_task, make_env
+from latentplan.evaluation.clock import VirtualClock
+from latentplan.evaluation.goals import read_goals, score_env
+from latentplan.evaluation.latency import Latency
+from latentplan.evaluation.timed import iterate_timed_episodes
 from latentplan.training import train
 
 LAMP = EnvConfig(suite="lamps", domain="lamp", action_repeat=2)
@@ -52,6 +57,14 @@ def test_make_env_calls_the_factory_of_the_suite():
 def test_unknown_names_are_refused_before_anything_is_made(config, message):
     with pytest.raises(UserError, match=message):
         compose({"env": config}, {}, "cpu")
+
+
+def test_optional_features_are_refused_when_the_environment_lacks_them():
+    env = make_env(LAMP, seed=0)
+    with pytest.raises(UserError, match="cannot change within a decision"):
+        next(iterate_timed_episodes(env, RandomAgent(1), [0], VirtualClock(50.0, Latency())))
+    with pytest.raises(UserError, match="does not report"):
+        score_env(env, read_goals("return", None, "lamp"), None)
 
 
 def test_domains_of_a_suite_are_known_to_the_settings():
