@@ -57,7 +57,7 @@ def sample(replay, batch_size=64, length=3, seed=0):
     return replay.gather(replay.draw(batch_size, length, np.random.default_rng(seed)))
 
 
-def told(batch):
+def frame_values(batch):
     """Time, episode and lane, read from each frame, (batch, time + 1) each."""
     assert (batch.frames == batch.frames[:, :, :1, :1]).all()
     return batch.frames[:, :, 0, 0].float().unbind(-1)

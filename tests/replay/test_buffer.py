@@ -9,11 +9,11 @@ import torch
 from latentplan.config import UserError
 from latentplan.replay import memory
 from latentplan.replay.buffer import Replay, replay_bytes
-from tests.replay.replay_clock import CPU, Clock, filled, make_replay, sample, told
+from tests.replay.replay_clock import CPU, Clock, filled, frame_values, make_replay, sample
 
 
 def assert_aligned(batch):
-    time, episode, lane = told(batch)
+    time, episode, lane = frame_values(batch)
     assert (time.diff(dim=1) == 1.0).all()
     assert (episode == episode[:, :1]).all() and (lane == lane[:, :1]).all()
     assert torch.allclose(batch.actions[..., 0], (time[:, :-1] + 0.5) / 256)
@@ -42,7 +42,7 @@ def test_sample_is_aligned_and_never_crosses_episodes(ring, length):
 @pytest.mark.parametrize("ring", RINGS)
 def test_draw_reaches_every_sequence_that_is_held(ring):
     replay, length = filled(**ring), 3
-    drawn = {tuple(start) for start in torch.stack(told(sample(replay, 1000, length)), -1)[:, 0].tolist()}
+    drawn = {tuple(start) for start in torch.stack(frame_values(sample(replay, 1000, length)), -1)[:, 0].tolist()}
     rows = replay.frames[:, 0, 0].float()
     held = {tuple(row) for row in rows.tolist()} if len(replay) == len(rows) else None
     lanes, lengths = ring.get("lanes", 1), ring.get("lengths", (7, 4, 9))
@@ -87,12 +87,12 @@ def test_draw_repeats_with_its_random_stream():
 def test_refresh_writes_beliefs_to_the_rows_of_the_batch():
     replay = filled(capacity=40, lanes=2, lengths=(7, 4, 9, 6))
     batch = sample(replay)
-    time, episode, lane = told(batch)
+    time, episode, lane = frame_values(batch)
     replay.refresh(
         batch.rows, torch.stack([time * 2.0, episode + 100.0 * lane], -1), torch.ones_like(batch.rows, dtype=torch.bool)
     )
     again = sample(replay, seed=1)
-    time, episode, lane = (part[:, 0] for part in told(again))
+    time, episode, lane = (part[:, 0] for part in frame_values(again))
     refreshed = torch.isin(again.rows[:, 0], batch.rows)
     assert refreshed.any()
     expected = torch.stack([time * 2.0, episode + 100.0 * lane], -1)
