@@ -62,6 +62,6 @@ def find_suite(name: str) -> Suite:
     Raises:
         UserError: There is no such suite.
     """
-    if name not in SUITES:
+    if name not in tuple(SUITES):  # a settings file may hold a value that is no text
         raise UserError(f"unknown suite {name!r}; available: {', '.join(SUITES)}")
     return SUITES[name]

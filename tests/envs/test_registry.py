@@ -52,6 +52,8 @@ def test_make_env_calls_the_factory_of_the_suite():
         ({"suite": "lamp"}, "unknown suite 'lamp'; available: dm_control, lamps"),
         ({"suite": "lamps", "domain": "walker"}, "unknown domain 'walker'; available: lamp"),
         ({"domain": "lamp"}, "unknown domain 'lamp'"),
+        ({"domain": ["walker"]}, r"unknown domain \['walker'\]"),
+        ({"suite": ["lamps"]}, r"unknown suite \['lamps'\]"),
     ],
 )
 def test_unknown_names_are_refused_before_anything_is_made(config, message):
