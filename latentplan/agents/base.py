@@ -146,7 +146,7 @@ class ModelAgent:
         raise AssertionError("a subclass of ModelAgent defines _choose")
 
     def _picture(self, state: State, actions: Tensor) -> np.ndarray:
-        """The decoded end of the first environment's plan, uint8 (32, 32, 3), for plans (batch, horizon, action)."""
+        """The decoded end of a plan (batch, horizon, action), uint8 (32, 32, 3), of the first environment."""
         first = State(*(part[:1] for part in unturned(state)))
         self.steps_ahead = actions.shape[1]
         _, last = self.model.rollout(first, actions[:1].to(first.deter.dtype))
@@ -165,7 +165,7 @@ class ModelAgent:
         )
 
     def _encode_goal(self, path: str) -> Tensor:
-        """The latents of the turns of a goal image, (turn, latent)."""
+        """The latents of a picture's turns, (turn, latent)."""
         return self._glance(turned(self._check(read_goal(path)[None]), self._turns))
 
     def _glance(self, frames: Tensor) -> Tensor:
@@ -173,7 +173,7 @@ class ModelAgent:
         return self.model.see(self.model.dynamics.initial(len(frames)).deter, frames).stoch
 
     def _believe(self, frames: Tensor) -> State:
-        if self.state is None or self.model.device.type != "cpu":  # on other devices the weights are a copy
+        if self.state is None or self.model.device.type != "cpu":  # elsewhere the weights do not follow the model's
             self._weights = reflex.lay_out(self.model)
         if self.state is not None and len(self.state.deter) != len(frames):
             raise ValueError(f"got {len(frames)} frames after {len(self.state.deter)}: call reset() between batches")

@@ -82,9 +82,9 @@ class PlanningAgent(ModelAgent):
         return self._picture(self.state, self.controller.plan.actions)
 
     def planned_action(self) -> np.ndarray | None:
-        """Mean and std of the last plan's first action, side by side, float32 (batch, 2 action); None without a plan.
+        """Mean and std of the last plan's first action side by side, float32 (batch, 2 action); None without a plan.
 
-        The row of an environment is zeros where no candidate had a finite return.
+        Zeros where the search found nothing finite.
         """
         plan = self.controller.plan
         if plan is None:

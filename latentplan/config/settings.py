@@ -25,6 +25,7 @@ class EnvConfig:
     """What is controlled, and how it is seen.
 
     Attributes:
+        suite: Suite that the domain belongs to, see `latentplan/config/suites.py`.
         domain: Domain of `dm_control.suite`.
         task: Task of the domain; None picks the domain's usual one.
         action_repeat: Simulator control steps per decision.
@@ -36,7 +37,6 @@ class EnvConfig:
         num_envs: Environments that collect at once; more than one runs each in its own process.
         objective: Expression over the body's quantities that pays in place of the task's reward, once per control step,
             such as `speed -> 2.0 and height > 1.1`; None leaves the task's.
-        suite: Suite that the domain belongs to, see `latentplan/config/suites.py`.
     """
 
     domain: str = "walker"

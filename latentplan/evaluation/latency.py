@@ -52,10 +52,10 @@ class Latency:
 
 
 def read_clock_flags(flags: Mapping[str, str]) -> tuple[float | None, Latency]:
-    """Control rate and latency from the flags `--control-hz` and `--latency`; a rate of None is a world that waits.
+    """What `--control-hz` and `--latency` ask for; a rate of None is a world that waits.
 
     Raises:
-        UserError: The rate is no number above 0, the latency cannot be read, or a latency is given without a rate.
+        UserError: The rate is no number above 0, the latency cannot be read, or it is given without a rate.
     """
     if "--control-hz" not in flags:
         if "--latency" in flags:

@@ -38,9 +38,9 @@ class Rows:
         rewards: Rewards that arrived with the next frame, float32 (n,).
         continues: 1 unless the episode ended in a terminal state with the next frame, float32 (n,).
         is_first: Whether an episode starts at this row, bool (n,).
-        labels: True quantities at each frame, float32 (n, label); label is 0 where the simulator reports none.
-        plan: Mean and std of the planner's first action at each frame, float32 (n, 2 action); zeros where the planner
-            did not act. None stands for zeros everywhere.
+        labels: True quantities at each frame, float32 (n, label); none of them without a simulator that tells.
+        plan: Mean and std of the planner's first action there, float32 (n, 2 action); zeros where it did not act.
+            None stands for zeros everywhere.
     """
 
     frames: np.ndarray
@@ -67,7 +67,7 @@ class Batch(NamedTuple):
         rewards: rewards[t] arrived with frames[t + 1], (batch, time).
         continues: 1 where the episode went on at frames[t + 1], 0 where that is a terminal state, (batch, time).
         labels: True quantities at each frame, (batch, time + 1, label).
-        rows: Index of each frame in the replay, (batch, time + 1), for `Replay.refresh`.
+        rows: Where each frame lives in replay, (batch, time + 1), for `Replay.refresh`.
         plan: Mean and std of the planner's action at frames[t], (batch, time, 2 action); zeros where it did not act.
     """
 
@@ -307,5 +307,5 @@ def read_saved(path: Path, device: torch.device | str = "cpu", keys: Sequence[st
 
 
 def replay_bytes(num_rows: int, action_dim: int, deter_dim: int, num_labels: int = 0) -> int:
-    """Size of a replay of `num_rows` rows, in bytes."""
+    """Memory that a replay of `num_rows` rows takes, in bytes."""
     return num_rows * (FRAME_BYTES + 2 * deter_dim + 4 * (3 * action_dim + num_labels) + 4 + 4 + 8 + 1)

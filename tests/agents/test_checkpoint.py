@@ -11,13 +11,12 @@ from safetensors.torch import load_file, save_file
 
 from latentplan.agents.checkpoint import load_agent, load_model, read_info, resolve_checkpoint, save_checkpoint
 from latentplan.agents.planning import PlanningAgent
-from latentplan.config import Config, EnvConfig, PlannerConfig, UserError
+from latentplan.config import Config, EnvConfig, ModelConfig, PlannerConfig, UserError
 from latentplan.models import WorldModel
-from tests.agents.small_agents import SIZES
 
 CONFIG = Config(
     env=EnvConfig(domain="cartpole", task="swingup"),
-    model=SIZES,
+    model=ModelConfig(deter_dim=16, hidden_dim=16, encoder_channels=(8, 8), decoder_channels=2, num_bins=15),
     planner=PlannerConfig(horizon=3, num_samples=16, num_elites=4, num_iterations=2, num_policy_samples=2),
 )
 INFO = {"domain": "cartpole", "task": "swingup", "env_frames": 1000, "discount": 0.9, "metrics": [{"planner": 1.5}]}

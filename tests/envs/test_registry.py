@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from latentplan.agents.random import RandomAgent
-from latentplan.commands import evaluate
+from latentplan.commands.main import main
 from latentplan.config import (
     CollectionConfig,
     Config,
@@ -95,7 +95,7 @@ def test_train_and_evaluate_play_a_registered_suite(tmp_path):
         assert int(list(csv.DictReader(file))[-1]["env_frames"]) >= 160
     result = tmp_path / "result.json"
     flags = ["--checkpoint", tmp_path / "run", "--episodes", 1, "--mode", "actor", "--json", result, "--threads", 1]
-    assert evaluate.main([str(flag) for flag in flags]) == 0
+    assert main(["eval", *map(str, flags)]) == 0
     played = json.loads(result.read_text())
     assert (played["domain"], played["task"]) == ("lamp", "bright")
     assert 0.0 <= played["mean_return"] <= 40.0 and sum(played["action_source"].values()) == 20
