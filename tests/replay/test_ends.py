@@ -10,7 +10,7 @@ from tests.replay.replay_clock import Clock, filled, make_replay, sample
 
 def batch_of(continues):
     """A batch of which only `continues` is given."""
-    return Batch(*[torch.empty(0)] * 4, continues, *[torch.empty(0)] * 3)
+    return Batch(**{**dict.fromkeys(Batch._fields, torch.empty(0)), "continues": continues})
 
 
 def test_draw_reaches_terminal_states_at_their_true_rate():
