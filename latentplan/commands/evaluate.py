@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from latentplan.envs.suite import SuiteEnv
     from latentplan.evaluation.clock import VirtualClock
     from latentplan.evaluation.goals import Goals, ScoredEnv
-    from latentplan.evaluation.timed import TimedEpisode
+    from latentplan.evaluation.statistics import Episode
 
 ON_ONE_THREAD = ("actor", "background")  # more would only wait for each other at a single frame
 
@@ -94,7 +94,7 @@ def _play_and_report(
 
     scored = env if isinstance(env, ScoredEnv) else None
     seeds = [episode_seed(request.seed, index) for index in range(request.episodes)]
-    episodes: list[TimedEpisode] = []
+    episodes: list[Episode] = []
     interrupted = False
     with contextlib.ExitStack() as stack:
         on_step = None

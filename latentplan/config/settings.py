@@ -25,6 +25,7 @@ class EnvConfig:
     """What is controlled, and how it is seen.
 
     Attributes:
+        suite: Suite that the domain belongs to, see `latentplan/config/suites.py`.
         domain: Domain of `dm_control.suite`.
         task: Task of the domain; None picks the domain's usual one.
         action_repeat: Simulator control steps per decision.
@@ -46,6 +47,7 @@ class EnvConfig:
     floor: str = "suite"
     num_envs: int = 1
     objective: str | None = None
+    suite: str = "dm_control"
 
     def __post_init__(self) -> None:
         at_least(self, action_repeat=1, num_envs=1, camera=-1)

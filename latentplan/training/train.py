@@ -73,7 +73,9 @@ def train(config: Config, make_env: EnvFactory | None = None) -> Result:
         if config.env.objective is not None:
             raise UserError("env.objective needs a domain of the suite; an environment of your own pays its own reward")
         domain, task = USER_DOMAIN, getattr(make_env, "__name__", type(make_env).__name__)
-    config = replace(config, env=replace(config.env, domain=domain, task=task or default_task(domain)))
+    config = replace(
+        config, env=replace(config.env, domain=domain, task=task or default_task(domain, config.env.suite))
+    )
     if config.run.run_dir is None:
         stamp = datetime.now().strftime("%Y%m%d-%H%M%S")
         name = f"{config.env.domain}-{config.env.task}-seed{config.run.seed}-{stamp}"

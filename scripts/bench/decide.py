@@ -31,7 +31,7 @@ from latentplan.config.files import build_config
 if TYPE_CHECKING:
     import torch
 
-    from latentplan.agents.checkpoint import Agent
+    from latentplan.agents.base import Agent
     from latentplan.models import WorldModel
 
 FLAGS = {
@@ -98,7 +98,7 @@ def measure_decisions(agent: Agent, batch: int, decisions: int) -> dict[str, Any
         agent.act(frames)
         if index >= WARM_UP_DECISIONS:
             milliseconds.append(1000.0 * (time.perf_counter() - started))
-    with counted_model_steps(agent.model) as counts:  # type: ignore[union-attr]
+    with counted_model_steps(agent.model) as counts:  # type: ignore[attr-defined]
         agent.act(frames)
     return {"decision_ms": latency_percentiles(np.asarray(milliseconds)), "model_steps": counts["rows"] // batch}
 

@@ -15,6 +15,7 @@ import torch
 
 from latentplan.agents.actor import ActorAgent
 from latentplan.agents.base import ModelAgent
+from latentplan.agents.modes import make_agent
 from latentplan.agents.planning import PlanningAgent
 from latentplan.agents.random import RandomAgent
 from latentplan.config import Config, derive_seed
@@ -106,9 +107,8 @@ class Collector:
             ("actor", True): ActorAgent(self.model, config, explore=True, noise_correlation=correlation),
             ("actor", False): ActorAgent(self.model, config),
         }
-        self._judged: dict[str, ModelAgent] = {
-            "planner": PlanningAgent(self.model, config, discount),
-            "actor": ActorAgent(self.model, config),
+        self._judged: dict[str, Any] = {
+            mode: make_agent(mode, self.model, config, discount) for mode in ("planner", "actor")
         }
         self._random = RandomAgent(action_dim)
         self._frames: np.ndarray | None = None
