@@ -98,8 +98,8 @@ class Experience(lightning.Callback):
         settings, state = self.config.collection, self.state
         decisions = min(settings.round_decisions, self._decisions_left())
         if decisions > 0:
-            behaviour, noisy, goal = turn(settings, state.rounds, state.env_frames)
-            self.worker.submit("collect", weights, behaviour, decisions, state.rounds, noisy, goal)
+            behaviour, goal = choose_behaviour(settings, state.rounds, state.env_frames)
+            self.worker.submit("collect", weights, behaviour, decisions, state.rounds, goal)
             self._asked_round = True
 
     def _decisions_left(self) -> int:
@@ -130,25 +130,27 @@ def weights_of(model: WorldModel) -> dict[str, np.ndarray]:
     return {name: value.detach().cpu().numpy().copy() for name, value in model.state_dict().items()}
 
 
-def turn(settings: CollectionConfig, rounds: int, env_frames: int) -> tuple[str, bool, str | None]:
-    """Who collects after so many rounds and simulator frames, whether with noise, and for which goal if for one.
+def choose_behaviour(settings: CollectionConfig, rounds: int, env_frames: int) -> tuple[str, str | None]:
+    """Chooses the behaviour of the next collection round, and its goal.
 
-    Planner and actor take turns in the rounds without a goal; all three share the noise evenly.
+    With `behaviour` "both", planner and actor alternate in the rounds without a goal.
+
+    Args:
+        settings: Settings of collection.
+        rounds: Rounds collected before.
+        env_frames: Simulator frames collected before.
+
+    Returns:
+        "planner" or "actor", and the expression that the planner pursues instead of the reward, or None.
     """
-    goals, share = 0, settings.goal_share
+    num_goals, share = 0, settings.goal_share
     if share > 0.0 and env_frames >= settings.goals_after:
-        goals = int(rounds * share)
-        if int((rounds + 1) * share) > goals:
-            return "planner", _has_noise(settings, goals), settings.goals[goals % len(settings.goals)]
-    own, behaviour = rounds - goals, settings.behaviour
-    if behaviour == "both":
-        own, who = divmod(own, 2)
-        behaviour = ("planner", "actor")[who]
-    return behaviour, _has_noise(settings, own), None
-
-
-def _has_noise(settings: CollectionConfig, own: int) -> bool:
-    return int((own + 1) * settings.noise_share) > int(own * settings.noise_share)
+        num_goals = int(rounds * share)
+        if int((rounds + 1) * share) > num_goals:
+            return "planner", settings.goals[num_goals % len(settings.goals)]
+    if settings.behaviour == "both":
+        return ("planner", "actor")[(rounds - num_goals) % 2], None
+    return settings.behaviour, None
 
 
 class Save(lightning.Callback):

@@ -91,21 +91,15 @@ class Collector:
         self.discount = discount = config.learning.discount or _discount_for(self._decisions)
         self.labels: dict[str, float] = getattr(self._eval_env.unwrapped, "labels", {})
         self.model = WorldModel(config.model, action_dim, self.labels).to(device)
-        noise, correlation = config.collection.noise_std, config.collection.noise_correlation
-        planners = {
-            (who, noisy): PlanningAgent(
-                self.model, config, discount, noise_std=noise if noisy else 0.0, noise_correlation=correlation
-            )
-            for who in ("planner", "goal")
-            for noisy in (True, False)
-        }
+        noise_std, correlation = config.collection.noise_std, config.collection.noise_correlation
+        planner, for_goals = (
+            PlanningAgent(self.model, config, discount, noise_std=noise_std, noise_correlation=correlation)
+            for _ in range(2)
+        )
         for goal in config.collection.goals:
-            planners["goal", True].set_objective(goal)  # to be refused now, if at all
-        self._agents: dict[tuple[str, bool], ModelAgent] = {
-            **planners,
-            ("actor", True): ActorAgent(self.model, config, explore=True, noise_correlation=correlation),
-            ("actor", False): ActorAgent(self.model, config),
-        }
+            for_goals.set_objective(goal)  # an expression that cannot be pursued is refused before the run starts
+        actor = ActorAgent(self.model, config, explore=True, noise_correlation=correlation)
+        self._agents: dict[str, ModelAgent] = {"planner": planner, "actor": actor, "goal": for_goals}
         self._judged: dict[str, ModelAgent] = {
             "planner": PlanningAgent(self.model, config, discount),
             "actor": ActorAgent(self.model, config),
@@ -135,7 +129,6 @@ class Collector:
         behaviour: str,
         decisions: int,
         counter: int,
-        noisy: bool = True,
         goal: str | None = None,
     ) -> Collected:
         """Take `decisions` decisions in all, with new weights; continues the episodes of the last round.
@@ -145,10 +138,9 @@ class Collector:
             behaviour: `planner` or `actor`.
             decisions: Rounded up to a multiple of the number of environments.
             counter: Number of the round, from which its random stream derives.
-            noisy: Whether it explores, or acts as it is evaluated.
             goal: What the planner pursues in place of the reward; its plans are not kept for the actor to imitate.
         """
-        agent = self._random if weights is None else self._agents[behaviour if goal is None else "goal", noisy]
+        agent = self._random if weights is None else self._agents[behaviour if goal is None else "goal"]
         if weights is not None:
             self._load(weights)
         if isinstance(agent, PlanningAgent) and goal is not None:

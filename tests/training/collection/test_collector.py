@@ -6,7 +6,7 @@ import torch
 
 from latentplan.config import CollectionConfig, UserError
 from latentplan.models import WorldModel
-from latentplan.training.callbacks import turn
+from latentplan.training.callbacks import choose_behaviour
 from latentplan.training.collection.collector import Collector
 
 
@@ -126,37 +126,20 @@ def test_collection_follows_from_seed_round_and_weights(make_collector, tiny, be
     assert np.abs(one.actions).max() <= 1.0
 
 
+def test_choose_behaviour_gives_goals_their_share_and_alternates_planner_and_actor():
+    settings = CollectionConfig(behaviour="both", goals=("a", "b"), goal_share=0.2, goals_after=1000)
+    chosen = [choose_behaviour(settings, rounds, 100 * rounds) for rounds in range(60)]
+    assert chosen[:10] == [("planner", None), ("actor", None)] * 5  # no goals before 1,000 frames
+    assert [goal for _, goal in chosen[10:] if goal] == ["a", "b"] * 5
+    assert {behaviour for behaviour, goal in chosen if goal} == {"planner"}
+    others = [behaviour for behaviour, goal in chosen[10:] if goal is None]
+    assert others == ["planner", "actor"] * 20
+
+
 @pytest.mark.parametrize("behaviour", ["planner", "actor"])
-def test_a_round_without_noise_acts_as_agents_are_judged(make_collector, tiny, behaviour):
-    """Noise or none, nothing else differs: the noiseless round is that of an agent that has no noise to add."""
-    weights = weights_of(tiny(""))
-    noiseless, explored = (
-        make_collector().collect(weights, behaviour, 12, 3, noisy).rows[0] for noisy in (False, True)
-    )
-    assert not np.array_equal(noiseless.actions, explored.actions)
-    if behaviour == "planner":
-        (expected,) = make_collector(collection={"noise_std": 0.0}).collect(weights, behaviour, 12, 3).rows
-        assert np.array_equal(noiseless.actions, expected.actions)
-    else:  # the mode of the actor is a function of the frame and the past alone
-        (other,) = make_collector().collect(weights, behaviour, 12, 3, False).rows
-        assert np.array_equal(noiseless.actions, other.actions) and (np.abs(noiseless.actions) < 0.1).all()
-
-
-def _turns(count, **settings):
-    return [turn(CollectionConfig(**settings), rounds, 100 * rounds)[:2] for rounds in range(count)]
-
-
-def test_goals_take_their_share_in_turn_and_leave_the_rest_as_it_was():
-    settings = CollectionConfig(behaviour="both", noise_share=0.5, goals=("a", "b"), goal_share=0.2, goals_after=1000)
-    turns = [turn(settings, rounds, 100 * rounds) for rounds in range(60)]
-    assert all(goal is None for _, _, goal in turns[:10])
-    pursued = [entry for entry in turns[10:] if entry[2] is not None]
-    assert [goal for _, _, goal in pursued] == ["a", "b"] * 5
-    assert {who for who, _, _ in pursued} == {"planner"} and sum(noisy for _, noisy, _ in pursued) == 5
-    others = [entry[:2] for entry in turns[10:] if entry[2] is None]
-    assert {entry: others.count(entry) for entry in others} == {
-        (who, noisy): 10 for who in ("planner", "actor") for noisy in (True, False)
-    }
+def test_choose_behaviour_keeps_a_single_behaviour(behaviour):
+    settings = CollectionConfig(behaviour=behaviour)
+    assert {choose_behaviour(settings, rounds, 0) for rounds in range(5)} == {(behaviour, None)}
 
 
 def test_a_share_of_no_goals_is_refused():
@@ -164,17 +147,6 @@ def test_a_share_of_no_goals_is_refused():
         CollectionConfig(goal_share=0.1)
     with pytest.raises(ValueError, match="need a goal_share"):
         CollectionConfig(goals=("upright",))
-
-
-def test_planner_and_actor_share_the_noise_evenly():
-    assert _turns(4, behaviour="actor") == [("actor", True)] * 4
-    assert _turns(4, behaviour="planner", noise_share=0.0) == [("planner", False)] * 4
-    turns = _turns(40, behaviour="both", noise_share=0.25)
-    assert {name: [who for who, _ in turns].count(name) for name in ("planner", "actor")} == {
-        "planner": 20,
-        "actor": 20,
-    }
-    assert [sum(noisy for who, noisy in turns if who == name) for name in ("planner", "actor")] == [5, 5]
 
 
 @pytest.fixture
@@ -196,13 +168,13 @@ def test_a_round_for_a_goal_plans_for_it_and_leaves_nothing_to_imitate(make_cart
     both = make_cart(goals=goals, goal_share=0.5, noise_std=0.0)
     weights = {name: value.numpy().copy() for name, value in both.model.state_dict().items()}
     plain, *pursued = (
-        make_cart(goals=goals, goal_share=0.5, noise_std=0.0).collect(weights, "planner", 8, 0, True, goal).rows[0]
+        make_cart(goals=goals, goal_share=0.5, noise_std=0.0).collect(weights, "planner", 8, 0, goal).rows[0]
         for goal in (None, *goals)
     )
     assert (plain.plan != 0.0).any() and all((rows.plan == 0.0).all() for rows in pursued)
     assert not np.array_equal(plain.actions, pursued[0].actions)
     assert not np.array_equal(pursued[0].actions, pursued[1].actions)
-    both.collect(weights, "planner", 8, 0, True, goals[0])
+    both.collect(weights, "planner", 8, 0, goals[0])
     (after,) = both.collect(weights, "planner", 8, 1).rows
     assert (after.plan != 0.0).any()
 
