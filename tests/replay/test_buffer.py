@@ -234,7 +234,7 @@ def test_a_replay_beyond_the_free_memory_is_refused(monkeypatch):
 
 def test_the_memory_a_replay_takes_is_what_its_arrays_hold():
     replay = make_replay(capacity=10, lanes=3)
-    arrays = [replay.frames, replay.deter, replay.actions, replay.rewards, replay.continues, replay.labels, replay.plan]
+    arrays = [replay.frames, replay.deter, replay.actions, replay.rewards, replay.continues, replay.labels]
     held = sum(array.numel() * array.element_size() for array in arrays) + replay.episode.nbytes + replay.is_end.nbytes
     assert held == replay.num_bytes
 

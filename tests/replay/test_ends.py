@@ -25,7 +25,7 @@ def test_terminal_states_are_drawn_as_often_as_they_come():
 
 def test_what_follows_a_terminal_state_is_not_refreshed_nor_within():
     continues = torch.tensor([[1.0, 0.0, 1.0, 0.0], [1.0, 1.0, 1.0, 1.0], [0.0, 1.0, 1.0, 1.0]])
-    batch = Batch(*[torch.empty(0)] * 4, continues, *[torch.empty(0)] * 3)
+    batch = Batch(*[torch.empty(0)] * 4, continues, *[torch.empty(0)] * 2)
     assert batch.within.tolist() == [[1, 1, 0, 0], [1, 1, 1, 1], [1, 0, 0, 0]]
 
 

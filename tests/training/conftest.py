@@ -118,7 +118,6 @@ def batch():
         continues=torch.ones(4, 5),
         labels=torch.zeros(4, 6, 0),
         rows=torch.arange(24).reshape(4, 6),
-        plan=torch.zeros(4, 5, 2),
     )
 
 

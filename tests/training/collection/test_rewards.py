@@ -19,7 +19,7 @@ def test_a_reward_that_replay_cannot_hold_is_refused(reward):
 
 def test_rewards_that_add_up_to_too_much_are_told_of_once():
     check = RewardCheck(1, 0.99)
-    with pytest.warns(RuntimeWarning, match="scale them"):
+    with pytest.warns(RuntimeWarning, match="scale the rewards down"):
         for _ in range(300):
             check(np.array([100.0]), NONE)
     with warnings.catch_warnings():

@@ -15,7 +15,7 @@ from latentplan.training.learner.graphed import WARM_UP_UPDATES, GraphedLearner
 from latentplan.training.learner.module import Learner
 from latentplan.training.learner.optimization import take_up
 
-SETTINGS = {"turned_share": 0.5, "random_shift": 2, "imitation_scale": 0.1}
+SETTINGS = {"turned_share": 0.5, "random_shift": 2}
 LABELS = {"height": 0.5, "task.stand": 0.5}
 
 
@@ -51,7 +51,6 @@ def filled(device):
         continues=np.ones(40, np.float32),
         is_first=np.arange(40) % 20 == 0,
         labels=rng.normal(size=(40, 2)).astype(np.float32),
-        plan=rng.uniform(0.1, 0.5, (40, 2)).astype(np.float32),
     )
     replay.add(0, rows)
     return replay
@@ -158,7 +157,7 @@ def watched(tiny, monkeypatch):
 def test_nothing_is_read_back_from_the_gpu(watched):
     with NothingRead():
         outputs = watched.update(torch.Generator())
-    assert {"reconstruction", "probe", "actor", "imitation", "model_grad_norm", "behaviour_grad_norm"} <= set(outputs)
+    assert {"reconstruction", "probe", "actor", "value", "model_grad_norm", "behaviour_grad_norm"} <= set(outputs)
 
 
 @pytest.mark.parametrize("part", ["descent", "number", "choice"])
