@@ -21,7 +21,7 @@ from latentplan.config.files import dump_config, read_config
 from latentplan.envs import default_task
 from latentplan.models import WorldModel
 from latentplan.replay.buffer import Replay
-from latentplan.training.callbacks import Experience, Restore, Save, Stop, weights_of
+from latentplan.training.callbacks import Experience, Record, Restore, Save, Stop, weights_of
 from latentplan.training.collection.collector import Description, EnvFactory
 from latentplan.training.collection.process import Worker, make_worker
 from latentplan.training.console import Progress
@@ -29,7 +29,6 @@ from latentplan.training.folder import claim, refuse_used
 from latentplan.training.learner.batches import ReplayBatches, ReplayData
 from latentplan.training.learner.curriculum import Curriculum
 from latentplan.training.learner.graphed import make_learner
-from latentplan.training.record import Record
 from latentplan.training.resources import choose_device, choose_threads, replay_capacity, set_up_torch
 from latentplan.training.state import INTERRUPTED, RunState, load_state, restore
 

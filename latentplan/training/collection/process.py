@@ -120,7 +120,7 @@ def _serve(connection: Connection, factory: EnvFactory | None, config: Config, t
     import signal
 
     signal.signal(signal.SIGTERM, lambda *_: sys.exit())  # an ordinary exit also ends the environments' processes
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches the whole process group; only the learner reacts to it
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches the whole group; only the learner reacts
     torch.set_num_threads(threads)
     collector: Collector | None = None
     while True:

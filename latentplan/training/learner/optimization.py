@@ -49,7 +49,7 @@ def _clipped_gradient(optimizer: torch.optim.Optimizer, loss: Tensor, max_norm: 
     return torch.nn.utils.clip_grad_norm_(parameters, max_norm)
 
 
-def take_up(optimizer: torch.optim.Optimizer, saved: dict[str, Any]) -> None:
+def load_optimizer_state(optimizer: torch.optim.Optimizer, saved: dict[str, Any]) -> None:
     """Give an optimizer the state that was saved of another one; whether a graph may record it stays its own matter.
 
     That depends on the device, and a run may go on on another.

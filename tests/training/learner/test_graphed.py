@@ -13,7 +13,7 @@ from latentplan.replay.buffer import Replay, Rows
 from latentplan.training.learner import augmentation
 from latentplan.training.learner.graphed import WARM_UP_UPDATES, GraphedLearner
 from latentplan.training.learner.module import Learner
-from latentplan.training.learner.optimization import take_up
+from latentplan.training.learner.optimization import load_optimizer_state
 
 SETTINGS = {"turned_share": 0.5, "random_shift": 2}
 LABELS = {"height": 0.5, "task.stand": 0.5}
@@ -205,6 +205,6 @@ def test_an_optimizer_goes_on_on_another_device_as_that_device_wants_it():
     saved.step()
     state = saved.state_dict()
     state["param_groups"][0]["capturable"] = True
-    take_up(goes_on, state)
+    load_optimizer_state(goes_on, state)
     assert goes_on.param_groups[0]["capturable"] is False
     assert torch.equal(goes_on.state[weight]["exp_avg"], saved.state[weight]["exp_avg"])
