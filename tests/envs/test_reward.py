@@ -53,6 +53,6 @@ def test_what_is_no_function_of_quantities_is_refused(objective):
 
 def test_an_environment_of_the_users_own_pays_its_own_reward(tmp_path):
     settings = Config(env=config("cart > 0"), run=RunConfig(frames=100, run_dir=str(tmp_path / "run")))
-    with pytest.raises(UserError, match="pays its own reward"):
+    with pytest.raises(UserError, match="returns its own reward"):
         train(settings, make_env=lambda: None)
     assert not (tmp_path / "run").exists()

@@ -57,9 +57,7 @@ def test_record_writes_each_metric_of_the_learner_to_csv_and_tensorboard(tmp_pat
     experience = SimpleNamespace(episode_returns=[4.0, 6.0])
     record = Record(tmp_path / "metrics.csv", state, experience, SimpleNamespace(episode_return=None))
     names = ("reconstruction", "model_grad_norm", "surprise", "behaviour_grad_norm")
-    learner = SimpleNamespace(
-        updates=7, metrics={name: torch.tensor(float(place)) for place, name in enumerate(names)}
-    )
+    learner = SimpleNamespace(updates=7, metrics={name: torch.tensor(float(place)) for place, name in enumerate(names)})
     logger = TensorBoardLogger(tmp_path, name="tensorboard", version="")
     record.on_train_epoch_end(SimpleNamespace(logger=logger), learner)
     logger.finalize("success")

@@ -94,9 +94,9 @@ class Collector:
         self.discount = discount = config.learning.discount or _discount_for(self._decisions)
         self.labels: dict[str, float] = getattr(self._eval_env.unwrapped, "labels", {})
         self.model = WorldModel(config.model, action_dim, self.labels).to(device)
-        noise_std, correlation = config.collection.noise_std, config.collection.noise_correlation
+        noise, correlation = config.collection.noise_std, config.collection.noise_correlation
         planner, for_goals = (
-            PlanningAgent(self.model, config, discount, noise_std=noise_std, noise_correlation=correlation)
+            PlanningAgent(self.model, config, discount, noise_std=noise, noise_correlation=correlation)
             for _ in range(2)
         )
         for goal in config.collection.goals:
