@@ -70,7 +70,9 @@ def train(config: Config, make_env: EnvFactory | None = None) -> Result:
     domain, task = config.env.domain, config.env.task
     if make_env is not None:
         if config.env.objective is not None:
-            raise UserError("env.objective needs a domain of the suite; an environment of your own returns its own reward")
+            raise UserError(
+                "env.objective needs a domain of the suite; an environment of your own returns its own reward"
+            )
         domain, task = USER_DOMAIN, getattr(make_env, "__name__", type(make_env).__name__)
     config = replace(config, env=replace(config.env, domain=domain, task=task or default_task(domain)))
     if config.run.run_dir is None:

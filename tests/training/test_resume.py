@@ -118,10 +118,10 @@ def test_resume_continues_a_run_interrupted_before_it_learned(tiny, dot, tmp_pat
 
 def test_resume_keeps_the_new_budget_of_an_interrupted_extension(short, dot, tmp_path, interrupting):
     folder = shutil.copytree(short.run_dir, tmp_path / "run")
-    stopped = resume(folder, frames=75, make_env=interrupting(dot, at_step=10).make)
-    assert stopped.exit_code == INTERRUPTED and saved_state(folder)["run"]["env_frames"] < 75
+    stopped = resume(folder, frames=90, make_env=interrupting(dot, at_step=10).make)
+    assert stopped.exit_code == INTERRUPTED and saved_state(folder)["run"]["env_frames"] < 90
     resume(folder, make_env=dot)
-    assert saved_state(folder)["run"]["env_frames"] == 75
+    assert saved_state(folder)["run"]["env_frames"] == 90
 
 
 def test_resume_repeats_a_run_that_crashed_before_its_first_save(finished, tiny, dot, tmp_path):
