@@ -39,7 +39,7 @@ TINY = Config(
 
 
 class Dot(gymnasium.Env):
-    """A dot in a picture of 16 x 16, pushed sideways by the action; the reward is 1 in the middle and 0 at the border."""
+    """A dot in a picture of 16 x 16, pushed sideways by actions; the reward is 1 in the middle and 0 at the border."""
 
     observation_space = gymnasium.spaces.Box(0, 255, (16, 16, 3), np.uint8)
     action_space = gymnasium.spaces.Box(-1.0, 1.0, (1,), np.float32)
