@@ -24,6 +24,7 @@ from latentplan.models import WorldModel
 from latentplan.replay.buffer import Batch, Replay
 from latentplan.training import resume, train
 from latentplan.training.learner.module import Learner
+from latentplan.training.learner.registry import BEHAVIOUR_LOSSES, WORLD_MODEL_LOSSES
 
 TINY = Config(
     env=EnvConfig(action_repeat=1),
@@ -153,3 +154,14 @@ def learner(model, tiny):
     """A learner of that model."""
     replay = Replay(24, 1, 16, 1, torch.device("cpu"))
     return Learner(model, tiny("").learning, 0.9, replay, seed=0)
+
+
+@pytest.fixture
+def restored_losses():
+    """Removes the losses that a test registers."""
+    registries = (WORLD_MODEL_LOSSES, BEHAVIOUR_LOSSES)
+    before = [dict(losses) for losses in registries]
+    yield
+    for losses, entries in zip(registries, before, strict=True):
+        losses.clear()
+        losses.update(entries)

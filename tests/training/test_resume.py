@@ -12,6 +12,7 @@ import torch
 
 from latentplan.training import callbacks, resume, train
 from latentplan.training.collection.process import LocalWorker
+from latentplan.training.learner.registry import WORLD_MODEL_LOSSES, register
 from latentplan.training.train import INTERRUPTED, _Run
 from tests.training.run_folder import epochs_of, rows_of, saved_state
 
@@ -56,18 +57,20 @@ def test_resume_makes_as_many_updates_as_one_long_run(finished, extended):
     assert updates[0] == updates[1]
 
 
-def test_resume_keeps_a_loss_that_was_removed_and_adds_a_new_one_to_the_metrics(extended, dot, tmp_path):
-    """A file of a version with another loss keeps that column; the present losses follow as further columns."""
+def test_resume_keeps_the_column_of_a_removed_loss_and_adds_the_column_of_a_new_one(
+    extended, dot, tmp_path, restored_losses
+):
     folder = shutil.copytree(extended.run_dir, tmp_path / "run")
-    lines = (folder / "metrics.csv").read_text().splitlines()
-    older = [line.replace(",overshooting", ",imitation") for line in lines]
-    (folder / "metrics.csv").write_text("".join(f"{line}\r\n" for line in older))
+    header, *lines = (folder / "metrics.csv").read_text().splitlines()
+    header = header.replace(",overshooting", ",imitation")  # as if an earlier version had had that loss instead
+    (folder / "metrics.csv").write_text("".join(f"{line}\r\n" for line in (header, *lines)))
+    register(WORLD_MODEL_LOSSES, "largest_reward")(lambda predicted: predicted.batch.rewards.abs().max())
     resume(folder, frames=105, make_env=dot)
     *rows, last = epochs_of(folder)
-    assert list(rows[0]) == [*older[0].split(","), "overshooting"]
-    before = epochs_of(extended.run_dir)
-    assert [row["imitation"] for row in rows] == [row["overshooting"] for row in before]
-    assert {row["overshooting"] for row in rows} == {""} == {last["imitation"]} and float(last["overshooting"]) > 0.0
+    assert list(last) == [*header.split(","), "overshooting", "largest_reward"]
+    assert [row["imitation"] for row in rows] == [row["overshooting"] for row in epochs_of(extended.run_dir)]
+    assert {row["overshooting"] for row in rows} == {row["largest_reward"] for row in rows} == {""}
+    assert last["imitation"] == "" and float(last["overshooting"]) > 0.0 and 0.0 < float(last["largest_reward"]) <= 1.0
 
 
 def test_final_evaluation_is_not_counted_in_the_minutes(short, dot, tmp_path, monkeypatch):

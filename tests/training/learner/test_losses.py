@@ -1,17 +1,11 @@
 """The losses: their values, their gradients, and the scales that weigh them."""
 
-import dataclasses
-
 import pytest
 import torch
 
-from latentplan.config import LearningConfig
 from latentplan.models import Gaussian, State, WorldModel, kl_divergence
-from latentplan.training.learner import losses, module
 from latentplan.training.learner.losses import imagine, imitation_loss, lambda_return, roll_out, world_model_loss
 from latentplan.training.learner.optimization import return_scale
-
-REMOVED = {"imitation_scale"}  # until config/learning.py drops the setting
 
 
 def stream():
@@ -69,41 +63,6 @@ def test_world_model_loss_is_the_sum_of_its_losses_times_their_scales(model, bat
     assert loss.item() == pytest.approx(sum(scale * parts[name].item() for name, scale in scales.items()), rel=1e-5)
     assert states.deter.shape == (4, 6, 16) and states.stoch.shape == (4, 6, 32)
     assert not any(part.requires_grad for part in states)
-
-
-def test_every_scale_setting_weighs_a_loss():
-    """`entropy_scale` weighs a term within the actor's loss; every other scale belongs to a registered loss."""
-    settings = {field.name for field in dataclasses.fields(LearningConfig) if field.name.endswith("_scale")}
-    used = {loss.scale for loss in (losses.WORLD_MODEL_LOSSES | losses.BEHAVIOUR_LOSSES).values()}
-    assert settings - REMOVED == (used - {None}) | {"entropy_scale"}
-
-
-def test_register_refuses_a_name_that_is_taken_and_a_scale_without_setting():
-    with pytest.raises(ValueError, match="already a loss 'reward'"):
-        losses.register(losses.BEHAVIOUR_LOSSES, "reward")
-    with pytest.raises(ValueError, match="'surprise' is weighed by 'surprise_scale', which is no setting"):
-        losses.register(losses.WORLD_MODEL_LOSSES, "surprise", "surprise_scale")
-
-
-def test_registered_losses_enter_both_sums(learner, batch, monkeypatch):
-    """The added losses are 1 for the world model, and 2 with the scale 3 for behaviour."""
-    before = world_model_loss(learner.model, batch, learner.config, stream())
-    behaviour_before, _ = learner._behaviour_loss(before, batch, stream())
-    learner.return_range.zero_()
-    for name in ("WORLD_MODEL_LOSSES", "BEHAVIOUR_LOSSES"):
-        monkeypatch.setattr(losses, name, dict(getattr(losses, name)))
-    monkeypatch.setattr(module, "BEHAVIOUR_LOSSES", losses.BEHAVIOUR_LOSSES)
-    learner.config = dataclasses.replace(learner.config, reward_scale=3.0)
-    losses.register(losses.WORLD_MODEL_LOSSES, "one")(lambda predicted: predicted.batch.rewards.new_ones(()))
-    losses.register(losses.BEHAVIOUR_LOSSES, "two", "reward_scale")(
-        lambda behaviour: behaviour.returns.new_full((), 2.0)
-    )
-    rewards = before.parts["reward"] + before.parts["open_loop_reward"]
-    after = world_model_loss(learner.model, batch, learner.config, stream())
-    assert after.loss.item() == pytest.approx((before.loss + 1.0 + 2.0 * rewards).item(), rel=1e-5)
-    behaviour_after, parts = learner._behaviour_loss(before, batch, stream())
-    assert behaviour_after.item() == pytest.approx(behaviour_before.item() + 6.0, rel=1e-5)
-    assert (after.parts["one"], parts["two"]) == (1.0, 2.0)
 
 
 def test_overshooting_predicts_with_the_prior_mean_from_detached_starts(model, batch, tiny):
