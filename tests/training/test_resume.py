@@ -110,7 +110,7 @@ def test_resume_continues_a_run_interrupted_before_it_learned(tiny, dot, tmp_pat
             if not self.is_gone:
                 return super().result()
             os.kill(os.getpid(), signal.SIGTERM)
-            raise RuntimeError("the process that collects has ended unexpectedly")
+            raise RuntimeError("the collection process ended unexpectedly")
 
     with monkeypatch.context() as patch:
         patch.setattr("latentplan.training.collection.process.LocalWorker", Gone)

@@ -16,15 +16,16 @@ from latentplan.models.heads import ScalarHead
 from latentplan.replay.buffer import Batch, Replay
 from latentplan.training.learner.augmentation import quarter_turns
 from latentplan.training.learner.losses import (
+    BEHAVIOUR_LOSSES,
     Behaviour,
     Learned,
     Replayed,
     imagine,
     lambda_return,
+    weighted_sum,
     world_model_loss,
 )
 from latentplan.training.learner.optimization import average, descend, follow, keep_freed_memory, return_scale
-from latentplan.training.learner.registry import BEHAVIOUR_LOSSES, weighted_sum
 from latentplan.training.learner.snapshot import Snapshot
 
 MODEL, BEHAVIOUR = 0, 1  # the two halves of an update, of its parameters and of its optimizers
