@@ -9,19 +9,19 @@ from latentplan.config.checks import above_zero, at_least, within
 
 @dataclass(frozen=True)
 class DistillConfig:
-    """Settings with which the actor learns to act as the planner (DAgger, Ross et al. 2011).
+    """Teaching the actor what the planner does.
 
     Attributes:
-        rounds: Rounds of collecting, training and selecting.
-        episodes: Episodes collected per round.
-        minutes: Minutes after which no further round begins; None sets no such limit.
-        planner_rounds: First rounds, in which the planner acts (behavioural cloning); in later rounds the actor acts.
+        rounds: Rounds of driving, labelling and learning.
+        episodes: Episodes driven per round.
+        minutes: No round begins after so many minutes; None leaves it to `rounds`.
+        planner_rounds: First rounds that the planner drives (behavioural cloning); in the others the actor does.
         updates: Updates of the actor per round.
         batch_size: Beliefs per update.
         learning_rate: Adam step of the actor.
-        relabel_share: Share of the stored beliefs that each round plans again, oldest labels first, in [0, 1].
-        plan_batch: Beliefs planned in one batch.
-        evaluation_episodes: Episodes that select the best round, and also episodes, from other starts, that test it.
+        relabel_share: Share of the stored beliefs, those with the oldest labels, that each round plans again.
+        plan_batch: Beliefs per call of the planner.
+        evaluation_episodes: Episodes that choose between rounds; as many, on other starts, judge the one chosen.
         seed: Seed of every random stream.
     """
 

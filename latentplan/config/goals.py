@@ -1,4 +1,4 @@
-"""Settings of goal conditioning."""
+"""Settings of learning goals."""
 
 from __future__ import annotations
 
@@ -9,17 +9,17 @@ from latentplan.config.checks import above_zero, at_least
 
 @dataclass(frozen=True)
 class GoalsConfig:
-    """Settings with which a trained agent learns to pursue goals that are named after training.
+    """Teaching a trained agent to pursue goals that are named later.
 
     Attributes:
-        updates: Total number of updates.
-        minutes: Minutes after which no further update begins; None sets no such limit.
-        starts: Imagined rollouts per update, each from its own replayed belief and for its own goal.
-        horizon: Model steps of each rollout.
-        hidden_dim: Width of the hidden layers of goal actor and goal value.
-        learning_rate: Adam step of goal actor and goal value.
-        entropy_scale: Weight of the actor's entropy in nats, in units of the spread of returns.
-        play_decisions: Decisions that an agent without the replay of its run plays first.
+        updates: Updates in all.
+        minutes: No update begins after so many minutes; None leaves it to `updates`.
+        starts: Imagined rollouts per update, each from a replayed belief and for a goal of its own.
+        horizon: Steps of each.
+        hidden_dim: Width of the hidden layers of the actor and the value.
+        learning_rate: Adam step of both.
+        entropy_scale: What a nat of the actor's entropy counts, of the spread of returns.
+        play_decisions: Decisions that the agent plays to begin from, where it comes without the replay of its run.
         seed: Seed of every random stream.
     """
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import torch
 
-from latentplan.config import UserError
+from latentplan.config import UserError, make_folder
 from latentplan.replay.buffer import Replay, read_saved
 
 if TYPE_CHECKING:
@@ -75,9 +75,15 @@ def save_state(folder: Path, state: RunState, learner: dict[str, Any], optimizer
         replay: The replay; its new rows are appended to the saved ones.
     """
     replay.save(folder / "replay")
-    part = folder / f"{STATE_FILE}.part"
-    torch.save({"run": state.to_dict(), "learner": learner, "optimizers": optimizers}, part)
-    part.replace(folder / STATE_FILE)
+    save_whole({"run": state.to_dict(), "learner": learner, "optimizers": optimizers}, folder / STATE_FILE)
+
+
+def save_whole(saved: dict[str, Any], path: Path) -> None:
+    """Writes a file with `torch.save` and replaces an earlier one in one step, so that no crash leaves half a file."""
+    make_folder(path.parent)
+    part = path.with_name(f"{path.name}.part")
+    torch.save(saved, part)
+    part.replace(path)
 
 
 def load_state(folder: Path, device: torch.device) -> tuple[RunState, dict[str, Any], list[Any]]:

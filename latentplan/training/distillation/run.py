@@ -27,7 +27,7 @@ from latentplan.agents.actor import ActorAgent
 from latentplan.agents.base import ModelAgent
 from latentplan.agents.checkpoint import load_model, read_info, resolve_checkpoint, save_checkpoint
 from latentplan.agents.planning import PlanningAgent
-from latentplan.config import USER_DOMAIN, DistillConfig, PlannerConfig, UserError, derive_seed, make_folder, to_dict
+from latentplan.config import USER_DOMAIN, DistillConfig, PlannerConfig, UserError, derive_seed, to_dict
 from latentplan.envs import make_env, make_from
 from latentplan.evaluation.episodes import OnStep, Step, episode_seed, iterate_episodes
 from latentplan.evaluation.statistics import confidence_interval
@@ -38,7 +38,7 @@ from latentplan.training.console import StatusLine
 from latentplan.training.distillation.labels import Demonstrations, first_actions, plan_actions
 from latentplan.training.distillation.student import Student
 from latentplan.training.folder import DISTILLATION_FILE, lock_folder, refuse_used
-from latentplan.training.state import INTERRUPTED
+from latentplan.training.state import INTERRUPTED, save_whole
 from latentplan.training.train import Result
 
 NUM_STAGES = 3  # per round: collect, train, select
@@ -386,7 +386,7 @@ class _Distillation:
             "student": self.student.state_dict(),
             "best": self.best,
         }
-        _save_distillation(self.folder, saved)
+        save_whole(saved, self.folder / DISTILLATION_FILE)
 
     def _is_spent(self) -> bool:
         """Whether the budget allows no further round; a round that has begun is finished."""
@@ -400,15 +400,6 @@ class _Distillation:
     def _show(self, activity: str) -> None:
         round_index = min(self.state.stage // NUM_STAGES + 1, self.settings.rounds)
         self.line.update(f"round {round_index} of {self.settings.rounds} | {activity} | {self._minutes():.1f} min")
-
-
-def _save_distillation(folder: Path, saved: dict[str, Any]) -> None:
-    """Replaces the saved distillation of a folder in one step."""
-    path = folder / DISTILLATION_FILE
-    make_folder(path.parent)
-    part = path.with_suffix(".part")
-    torch.save(saved, part)
-    part.replace(path)
 
 
 def _load_distillation(folder: Path) -> dict[str, Any]:

@@ -22,7 +22,7 @@ from latentplan.training.console import StatusLine
 from latentplan.training.folder import GOALS_FILE, lock_folder, refuse_used
 from latentplan.training.goal_conditioning.learner import GoalLearner
 from latentplan.training.goal_conditioning.play import play
-from latentplan.training.state import INTERRUPTED
+from latentplan.training.state import INTERRUPTED, save_whole
 from latentplan.training.train import Result
 
 SAVE_SECONDS = 300.0
@@ -151,8 +151,7 @@ def _learn(run: Path, folder: Path, settings: GoalsConfig, device: str, saved: d
         save_checkpoint(folder, model, config, info | {"goals": facts | {"from_sha256": info["sha256"]}})
         about = {"run": str(run.resolve()), "source": str(source.resolve()), "sha256": info["sha256"]}
         state = {"settings": to_dict(settings), "minutes": minutes(), "learner": learner.state_dict()}
-        torch.save(about | state, folder / f"{GOALS_FILE}.part")
-        (folder / f"{GOALS_FILE}.part").replace(folder / GOALS_FILE)
+        save_whole(about | state, folder / GOALS_FILE)
 
     with line, _stop_on_signals() as should_stop:
         while learner.updates < settings.updates and not (should_stop() or minutes() >= (settings.minutes or math.inf)):
