@@ -149,18 +149,18 @@ def world_model_loss(model: WorldModel, batch: Batch, config: LearningConfig, ge
         open_loop_logits = model.reward_head(open_loop)
         continue_logits = model.continue_head(features[:, 1:]).squeeze(-1)
     prediction = Prediction(
-        model,
-        batch,
-        config,
-        features,
-        posterior,
-        prior,
-        patches,
-        reward_logits,
-        continue_logits,
-        open_loop,
-        open_loop_logits,
-        overshooting,
+        model=model,
+        batch=batch,
+        config=config,
+        features=features,
+        posterior=posterior,
+        prior=prior,
+        patches=patches,
+        reward_logits=reward_logits,
+        continue_logits=continue_logits,
+        open_loop=open_loop,
+        open_loop_reward_logits=open_loop_logits,
+        open_loop_divergence=overshooting,
         is_seen=torch.cat([torch.ones_like(batch.within[:, :1]), batch.within], 1),
     )
     loss, parts = weighted_sum(WORLD_MODEL_LOSSES, prediction, config)
