@@ -17,8 +17,9 @@ def test_lock_folder_refuses_a_second_lock_until_the_first_is_released(tmp_path)
 
 
 def test_lock_folder_is_released_when_its_process_is_killed(tmp_path):
-    held = multiprocessing.get_context("spawn").Event()
-    process = multiprocessing.get_context("spawn").Process(target=_hold, args=(tmp_path, held))
+    context = multiprocessing.get_context("fork")  # the child imports nothing and starts no thread
+    held = context.Event()
+    process = context.Process(target=_hold, args=(tmp_path, held))
     process.start()
     assert held.wait(60)
     with pytest.raises(UserError), lock_folder(tmp_path):
