@@ -81,17 +81,6 @@ class PlanningAgent(ModelAgent):
             return None
         return self._picture(self.state, self.controller.plan.actions)
 
-    def planned_action(self) -> np.ndarray | None:
-        """Mean and std of the last plan's first action side by side, float32 (batch, 2 action); None without a plan.
-
-        Zeros where the search found nothing finite.
-        """
-        plan = self.controller.plan
-        if plan is None:
-            return None
-        planned = torch.cat(plan.action_distribution(self.controller.planner.min_std), -1)
-        return planned.masked_fill(plan.info["is_fallback"][:, None], 0.0).float().cpu().numpy()
-
     def _choose(self, state: State) -> Tensor:
         with self.model.trunk_precision():
             action = self.controller.act(state)

@@ -23,7 +23,7 @@ from latentplan.replay.memory import check_memory
 FRAME_SHAPE = (64, 64, 3)
 FRAME_BYTES = 64 * 64 * 3
 SAMPLING_ROUNDS = 1000
-COLUMNS = ("deter", "actions", "rewards", "continues", "labels", "plan")
+COLUMNS = ("deter", "actions", "rewards", "continues", "labels")
 LOADED_AT_ONCE = 1024
 
 
@@ -39,8 +39,6 @@ class Rows:
         continues: 1 unless the episode ended in a terminal state with the next frame, float32 (n,).
         is_first: Whether an episode starts at this row, bool (n,).
         labels: True quantities at each frame, float32 (n, label); none of them without a simulator that tells.
-        plan: Mean and std of the planner's first action there, float32 (n, 2 action); zeros where it did not act.
-            None stands for zeros everywhere.
     """
 
     frames: np.ndarray
@@ -50,11 +48,6 @@ class Rows:
     continues: np.ndarray
     is_first: np.ndarray
     labels: np.ndarray
-    plan: np.ndarray | None = None
-
-    def __post_init__(self) -> None:
-        if self.plan is None:
-            self.plan = np.zeros((len(self.frames), 2 * self.actions.shape[-1]), np.float32)
 
 
 class Batch(NamedTuple):
@@ -68,7 +61,6 @@ class Batch(NamedTuple):
         continues: 1 where the episode went on at frames[t + 1], 0 where that is a terminal state, (batch, time).
         labels: True quantities at each frame, (batch, time + 1, label).
         rows: Where each frame lives in replay, (batch, time + 1), for `Replay.refresh`.
-        plan: Mean and std of the planner's action at frames[t], (batch, time, 2 action); zeros where it did not act.
     """
 
     frames: Tensor
@@ -78,7 +70,6 @@ class Batch(NamedTuple):
     continues: Tensor
     labels: Tensor
     rows: Tensor
-    plan: Tensor
 
     @property
     def within(self) -> Tensor:
@@ -122,7 +113,6 @@ class Replay:
         self.rewards = torch.zeros(total, device=device)
         self.continues = torch.ones(total, device=device)
         self.labels = torch.zeros(total, num_labels, device=device)
-        self.plan = torch.zeros(total, 2 * action_dim, device=device)
         self.episode = np.full((num_lanes, self.lane_size), -1, dtype=np.int64)
         self.is_end = np.zeros((num_lanes, self.lane_size), dtype=bool)  # rows whose action led to a terminal state
         self.written = np.zeros(num_lanes, dtype=np.int64)
@@ -176,7 +166,6 @@ class Replay:
             continues=self.continues[acted],
             labels=self.labels[rows],
             rows=rows,
-            plan=self.plan[acted],
         )
 
     def refresh(self, rows: Tensor, deter: Tensor, chosen: Tensor) -> None:
@@ -308,4 +297,4 @@ def read_saved(path: Path, device: torch.device | str = "cpu", keys: Sequence[st
 
 def replay_bytes(num_rows: int, action_dim: int, deter_dim: int, num_labels: int = 0) -> int:
     """Memory that a replay of `num_rows` rows takes, in bytes."""
-    return num_rows * (FRAME_BYTES + 2 * deter_dim + 4 * (3 * action_dim + num_labels) + 4 + 4 + 8 + 1)
+    return num_rows * (FRAME_BYTES + 2 * deter_dim + 4 * (action_dim + num_labels) + 4 + 4 + 8 + 1)

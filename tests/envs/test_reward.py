@@ -53,6 +53,6 @@ def test_make_env_refuses_objectives_that_are_no_function_of_quantities(objectiv
 
 def test_train_refuses_an_objective_reward_in_a_users_environment(tmp_path):
     settings = Config(env=config("cart > 0"), run=RunConfig(frames=100, run_dir=str(tmp_path / "run")))
-    with pytest.raises(UserError, match="pays its own reward"):
+    with pytest.raises(UserError, match="returns its own reward"):
         train(settings, make_env=lambda: None)
     assert not (tmp_path / "run").exists()

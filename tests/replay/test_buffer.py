@@ -234,7 +234,7 @@ def test_replay_refuses_more_than_nine_tenths_of_the_free_memory(monkeypatch):
 
 def test_replay_bytes_equals_the_size_of_the_arrays():
     replay = make_replay(capacity=10, lanes=3)
-    arrays = [replay.frames, replay.deter, replay.actions, replay.rewards, replay.continues, replay.labels, replay.plan]
+    arrays = [replay.frames, replay.deter, replay.actions, replay.rewards, replay.continues, replay.labels]
     held = sum(array.numel() * array.element_size() for array in arrays) + replay.episode.nbytes + replay.is_end.nbytes
     assert held == replay.num_bytes
 
