@@ -20,6 +20,7 @@ from latentplan.agents.random import RandomAgent
 from latentplan.config import Config, PlannerConfig, UserError, from_dict, to_dict
 from latentplan.config.planner import override_planner
 from latentplan.models import WorldModel
+from latentplan.models.fast import accelerate
 
 Agent = PlanningAgent | ActorAgent | RandomAgent
 WEIGHTS = "weights.safetensors"
@@ -114,7 +115,7 @@ def load_model(path: str | Path, device: str = "cpu") -> tuple[WorldModel, Confi
     if broken := _not_finite(state):
         raise UserError(f"{weights} cannot be used: {broken} is not finite")
     try:
-        return model.to(device), config, info
+        return accelerate(model.to(device)), config, info
     except (AssertionError, RuntimeError) as error:
         raise UserError(f"device {device!r} cannot be used: {str(error).splitlines()[0]}") from None
 

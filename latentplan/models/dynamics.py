@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from latentplan.models.heads import NormedLinear
+from latentplan.models.heads import NormedLinear, sample_action
 
 MIN_STD = 0.1
 UPDATE_SHIFT = 1.0  # below which the update gate starts: states last
@@ -33,43 +34,34 @@ class Gaussian(NamedTuple):
     std: Tensor
 
 
-class Rssm(nn.Module):
-    """Latent dynamics: one step, the prior without a frame, the posterior with one, and whole sequences."""
+class Dynamics(nn.Module):
+    """How latent states change: subclasses define single steps, this class the sequences made of them.
 
-    def __init__(self, latent_dim: int, deter_dim: int, hidden_dim: int, action_dim: int, embedding_dim: int) -> None:
-        super().__init__()
-        self.latent_dim, self.deter_dim = latent_dim, deter_dim
-        self.input = NormedLinear(latent_dim + action_dim, hidden_dim)
-        self.gates = nn.Linear(hidden_dim + deter_dim, 3 * deter_dim, bias=False)
-        self.gates_norm = nn.LayerNorm(3 * deter_dim)
-        self.prior_hidden = NormedLinear(deter_dim, hidden_dim)
-        self.prior_output = nn.Linear(hidden_dim, 2 * latent_dim)
-        self.posterior_deter = nn.Linear(deter_dim, embedding_dim, bias=False)
-        self.posterior_norm = nn.LayerNorm(embedding_dim)
-        self.posterior_output = nn.Linear(embedding_dim, 2 * latent_dim)
+    A subclass sets `latent_dim` and `deter_dim`, and defines `advance`, `prior` and `posterior`.
+    """
+
+    latent_dim: int
+    deter_dim: int
 
     def initial(self, rows: int) -> State:
-        """The state before anything was seen or done: zeros."""
-        weight = self.prior_output.weight
+        """The state before the first frame and the first action: zeros."""
+        weight = next(self.parameters())
         return State(weight.new_zeros(rows, self.deter_dim), weight.new_zeros(rows, self.latent_dim))
 
     def advance(self, state: State, action: Tensor) -> Tensor:
         """The next deterministic state (rows, deter) after action (rows, action)."""
-        hidden = self.input(torch.cat([state.stoch, action], -1))
-        gates = self.gates_norm(self.gates(torch.cat([hidden, state.deter.to(hidden.dtype)], -1)))
-        return next_deter(gates, state.deter)
+        raise NotImplementedError
 
     def prior(self, deter: Tensor) -> Gaussian:
-        """What the latent will be, judged from the past alone, for deter (..., deter)."""
-        return gaussian(self.prior_output(self.prior_hidden(deter)))
+        """The distribution of the latent given the past alone, for deter (..., deter)."""
+        raise NotImplementedError
 
     def posterior(self, deter: Tensor, embedding: Tensor) -> Gaussian:
-        """What the latent is, given deter (..., deter) and the frame's embedding (..., embedding)."""
-        hidden = functional.silu(self.posterior_norm(self.posterior_deter(deter) + embedding))
-        return gaussian(self.posterior_output(hidden))
+        """The distribution of the latent given deter (..., deter) and the frame's embedding (..., embedding)."""
+        raise NotImplementedError
 
     def observe(self, embeddings: Tensor, actions: Tensor, deter: Tensor, noise: Tensor) -> tuple[State, Gaussian]:
-        """Follow a sequence of frames.
+        """Filter a sequence of frames into beliefs.
 
         Args:
             embeddings: Of the frames, (batch, time + 1, embedding).
@@ -83,7 +75,7 @@ class Rssm(nn.Module):
         deters: list[Tensor] = []
         stochs: list[Tensor] = []
         posteriors: list[Gaussian] = []
-        # Unbound at once: the gradient of each slice by itself would be a whole tensor of zeros.
+        # Unbound once: the gradient of a single slice would be a whole tensor of zeros, for every step.
         for time, (embedding, draws) in enumerate(zip(embeddings.unbind(1), noise.unbind(1), strict=True)):
             if time > 0:
                 deter = self.advance(State(deter, stochs[-1]), actions[:, time - 1])
@@ -94,8 +86,8 @@ class Rssm(nn.Module):
         means, stds = (torch.stack(part, 1) for part in zip(*posteriors, strict=True))
         return State(torch.stack(deters, 1), torch.stack(stochs, 1)), Gaussian(means, stds)
 
-    def follow(self, start: State, actions: Tensor) -> tuple[Tensor, Gaussian]:
-        """Predict without looking: each step goes on from the mean of the prior.
+    def predict(self, start: State, actions: Tensor) -> tuple[Tensor, Gaussian]:
+        """Predict open loop, without frames: each step continues from the mean of the prior.
 
         Args:
             start: States, (rows, ...) each.
@@ -111,6 +103,73 @@ class Rssm(nn.Module):
             state = State(deters[-1], priors[-1].mean)
         means, stds = (torch.stack(part, 1) for part in zip(*priors, strict=True))
         return torch.stack(deters, 1), Gaussian(means, stds)
+
+    def imagine(
+        self,
+        policy: Callable[[Tensor], tuple[Tensor, Tensor]],
+        start: State,
+        action_noise: Tensor,
+        noise: Tensor,
+        decay: float = 1.0,
+    ) -> tuple[Tensor, Tensor]:
+        """Imagine with samples of a policy and of the prior; gradients flow through the dynamics.
+
+        The policy reads each state without a gradient, so that an action is credited through the dynamics alone
+        (Hafner et al. 2020, section 3).
+
+        Args:
+            policy: Mean and std of the action, (rows, action) each, for features (rows, feature).
+            start: Rows of states.
+            action_noise: Standard normal draws for the actions, (horizon, rows, action).
+            noise: Standard normal draws for the latents, (horizon, rows, latent).
+            decay: Share of a state's gradient that a step passes back to the state before, in [0, 1]. Gradients through
+                contacts grow from step to step until they carry no information (Schrittwieser et al. 2020, appendix G,
+                halve them).
+
+        Returns:
+            Features, the start first, (horizon + 1, rows, feature), and std of the actions, (horizon, rows, action).
+        """
+        state, features, stds = start, [start.features], []
+        for action_draws, draws in zip(action_noise.unbind(), noise.unbind(), strict=True):
+            mean, std = policy(features[-1].detach())
+            stds.append(std)
+            decayed = State(*(_decay_gradient(part, decay) for part in state))
+            deter = self.advance(decayed, sample_action(mean, std, action_draws))
+            prior = self.prior(deter)
+            state = State(deter, torch.addcmul(prior.mean, prior.std, draws))
+            features.append(state.features)
+        return torch.stack(features), torch.stack(stds)
+
+
+class Rssm(Dynamics):
+    """A GRU with a layer norm on its gates beside a Gaussian latent."""
+
+    def __init__(self, latent_dim: int, deter_dim: int, hidden_dim: int, action_dim: int, embedding_dim: int) -> None:
+        super().__init__()
+        self.latent_dim, self.deter_dim = latent_dim, deter_dim
+        self.input = NormedLinear(latent_dim + action_dim, hidden_dim)
+        self.gates = nn.Linear(hidden_dim + deter_dim, 3 * deter_dim, bias=False)
+        self.gates_norm = nn.LayerNorm(3 * deter_dim)
+        self.prior_hidden = NormedLinear(deter_dim, hidden_dim)
+        self.prior_output = nn.Linear(hidden_dim, 2 * latent_dim)
+        self.posterior_deter = nn.Linear(deter_dim, embedding_dim, bias=False)
+        self.posterior_norm = nn.LayerNorm(embedding_dim)
+        self.posterior_output = nn.Linear(embedding_dim, 2 * latent_dim)
+
+    def advance(self, state: State, action: Tensor) -> Tensor:
+        """See `Dynamics.advance`."""
+        hidden = self.input(torch.cat([state.stoch, action], -1))
+        gates = self.gates_norm(self.gates(torch.cat([hidden, state.deter.to(hidden.dtype)], -1)))
+        return next_deter(gates, state.deter)
+
+    def prior(self, deter: Tensor) -> Gaussian:
+        """See `Dynamics.prior`."""
+        return gaussian(self.prior_output(self.prior_hidden(deter)))
+
+    def posterior(self, deter: Tensor, embedding: Tensor) -> Gaussian:
+        """See `Dynamics.posterior`."""
+        hidden = functional.silu(self.posterior_norm(self.posterior_deter(deter) + embedding))
+        return gaussian(self.posterior_output(hidden))
 
 
 def kl_divergence(left: Gaussian, right: Gaussian) -> Tensor:
@@ -131,3 +190,8 @@ def gaussian(raw: Tensor) -> Gaussian:
     """The latent's distribution, for what a layer returned (..., 2 latent); std in 0.1 to 2.1."""
     mean, raw_std = raw.float().chunk(2, -1)
     return Gaussian(mean, 2.0 * torch.sigmoid(raw_std / 2.0) + MIN_STD)
+
+
+def _decay_gradient(values: Tensor, share: float) -> Tensor:
+    """The same values; a share of their gradient passes."""
+    return values if share == 1.0 else values.detach().lerp(values, share)

@@ -2,20 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Hashable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import AbstractContextManager
-from typing import Any
 
 import torch
 from torch import Tensor, nn
 
 from latentplan.config import ModelConfig
 from latentplan.config.quantities import TASK_PREFIX
+from latentplan.models.backend import Backend
 from latentplan.models.decoder import Decoder
 from latentplan.models.dynamics import Rssm, State
 from latentplan.models.encoder import Encoder
-from latentplan.models.fast import compiled as fused
-from latentplan.models.fast.rollout import Weights, follow_actor, imagine, lay_out
 from latentplan.models.goal_heads import GoalHeads
 from latentplan.models.heads import Actor, Mlp, ScalarHead, sample_action
 
@@ -50,11 +48,7 @@ class WorldModel(nn.Module):
         self.continue_head = Mlp(features, config.hidden_dim, 1)
         self.value_head = ScalarHead(features, config.hidden_dim, config.num_bins)
         self.actor = Actor(features, config.hidden_dim, action_dim)
-        self._kept: tuple[Hashable, Weights] | None = None
-        parts = (self.dynamics, self.reward_head, self.value_head, self.actor)
-        self._places = [
-            (module._parameters, name) for part in parts for module in part.modules() for name in module._parameters
-        ]  # of the parameters that imagination reads: walking through the modules takes longer than a step
+        self.backend = Backend()
         self.register_buffer("label_scales", torch.tensor(list(self.labels.values())), persistent=False)
         if self.labels:
             self.probe_head = Mlp(features, max(1, config.hidden_dim // PROBE_SHARE), len(self.labels))
@@ -74,8 +68,8 @@ class WorldModel(nn.Module):
 
     @property
     def trunk_dtype(self) -> torch.dtype:
-        """bfloat16 on a CPU; float32 on a GPU, where converting operands takes longer than such small products save."""
-        return torch.bfloat16 if self.device.type == "cpu" else torch.float32
+        """Precision of the matrix products outside the last layers of heads, as the backend asks for it."""
+        return self.backend.trunk_dtype
 
     @property
     def device(self) -> torch.device:
@@ -143,21 +137,16 @@ class WorldModel(nn.Module):
         return State(deter, self.dynamics.posterior(deter, self.encoder(frames)).mean)
 
     def step(self, state: State, action: Tensor) -> tuple[State, Tensor]:
-        """Imagine one decision: the next state, and the reward (rows,) that arrives with it."""
-        with self.trunk_precision():
-            following = self._advance_mean(state, action)
-            return following, self.reward_head.mean(self.reward_head(following.features))
+        """The state after action (rows, action), by the mean of the prior, and the reward (rows,) it brings."""
+        return self.backend.step(self, state, action)
 
     def fast_step(self, state: State, action: Tensor) -> tuple[State, Tensor]:
-        """`step`, compiled where that can be, for rows in dim 0 and without gradients."""
-        if self._packed() is None:
-            return self.step(state, action)
-        rewards, following = self.rollout(state, action.unsqueeze(1))
-        return following, rewards.squeeze(1)
+        """The same as `step` up to rounding, faster, for rows in dim 0 and without gradients."""
+        return self.backend.fast_step(self, state, action)
 
     def rollout(self, state: State, actions: Tensor) -> tuple[Tensor, State]:
-        """Imagine action sequences (rows, horizon, action): rewards (rows, horizon) and the last state."""
-        return imagine(self._weights(), state, actions)
+        """Rewards (rows, horizon) along action sequences (rows, horizon, action), and the last state."""
+        return self.backend.rollout(self, state, actions)
 
     def propose(self, state: State, num: int, horizon: int, generators: Sequence[torch.Generator]) -> Tensor:
         """What the actor does from each state, its mode first and then samples, (batch num, horizon, action).
@@ -175,15 +164,11 @@ class WorldModel(nn.Module):
         noise = torch.stack(draws)
         noise[:, 0] = 0.0
         repeated = State(*(part.repeat_interleave(num, 0) for part in state))
-        return follow_actor(self._weights(), repeated, noise.flatten(0, 1))
+        return self.backend.propose(self, repeated, noise.flatten(0, 1))
 
     def value(self, state: State) -> Tensor:
         """Expected discounted return from a state on, (rows,)."""
-        packed = self._packed() if state.deter.ndim == 2 else None
-        if packed is not None:
-            return fused.judge(packed, *state)
-        with self.trunk_precision():
-            return self.value_head.mean(self.value_head(state.features))
+        return self.backend.value(self, state)
 
     def policy(self, state: State, generator: torch.Generator | None = None) -> Tensor:
         """The actor's action (rows, action): a sample when a generator is given, else its mode."""
@@ -198,32 +183,6 @@ class WorldModel(nn.Module):
         with self.trunk_precision():
             return torch.sigmoid(self.continue_head(state.features)).squeeze(-1)
 
-    def __getstate__(self) -> dict[str, Any]:
-        return {**self.__dict__, "_kept": None}  # it points into memory
-
-    def _packed(self) -> fused.Packed | None:
-        """What compiled steps and values read; None where torch has to do it, or gradients could be asked for."""
-        return None if torch.is_grad_enabled() else self._weights().packed
-
-    def _weights(self) -> Weights:
-        """Weights laid out for imagination; gradients do not pass through them.
-
-        They are laid out anew when one was written to in place or replaced. Writing through `parameter.data`, and
-        replacing whole modules, goes unseen.
-        """
-        kind, kept = self.device.type, self._kept
-        with self.trunk_precision():
-            dtype = torch.get_autocast_dtype(kind) if torch.is_autocast_enabled(kind) else torch.float32
-        parameters = [place[name] for place, name in self._places]
-        read = [parameter for parameter in parameters if parameter is not None]
-        if read[0].is_inference():  # torch does not count what changes these
-            return lay_out(self.dynamics, self.reward_head, self.value_head, self.actor, dtype)
-        key = (dtype, *((parameter.data_ptr(), parameter._version) for parameter in read))
-        if kept is None or kept[0] != key:
-            kept = (key, lay_out(self.dynamics, self.reward_head, self.value_head, self.actor, dtype))
-            self._kept = kept
-        return kept[1]
-
     def surprise(self, state: State) -> Tensor:
         """How far the latents of beliefs lie from what was predicted of them, in nats, (rows,).
 
@@ -231,7 +190,3 @@ class WorldModel(nn.Module):
         """
         prior = self.dynamics.prior(state.deter)
         return 0.5 * ((state.stoch - prior.mean) / prior.std).square().sum(-1)
-
-    def _advance_mean(self, state: State, action: Tensor) -> State:
-        deter = self.dynamics.advance(state, action)
-        return State(deter, self.dynamics.prior(deter).mean)

@@ -93,14 +93,14 @@ def rollout(packed: Packed, deter: Tensor, stoch: Tensor, actions: Tensor) -> tu
     return rewards, deter, stoch
 
 
-def follow(packed: Packed, deter: Tensor, stoch: Tensor, noise: Tensor) -> Tensor:
+def propose(packed: Packed, deter: Tensor, stoch: Tensor, noise: Tensor) -> Tensor:
     """The actor's actions, float32 (rows, time, action), for standard normal draws of the same shape."""
     actions = _own(noise)
     _call(packed, _own(deter), _own(stoch), actions)
     return actions
 
 
-def judge(packed: Packed, deter: Tensor, stoch: Tensor) -> Tensor:
+def value(packed: Packed, deter: Tensor, stoch: Tensor) -> Tensor:
     """The value of states, float32 (rows,)."""
     values = torch.empty(len(deter))
     _call(packed, _own(deter), _own(stoch), torch.empty(len(deter), 0, 0), values=values)

@@ -139,7 +139,7 @@ def drawn_back(
     return torch.cat([of_mean, of_std * gate * (1.0 - gate)], -1)
 
 
-def felt(raw: Tensor, noise: Tensor, deter: Tensor) -> tuple[Tensor, Tensor]:
+def features(raw: Tensor, noise: Tensor, deter: Tensor) -> tuple[Tensor, Tensor]:
     """A latent (rows, latent), and the features that it makes with deter."""
     mean, std = gaussian(raw)
     stoch = mean + std * noise

@@ -15,7 +15,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from latentplan.models.dynamics import Rssm, State
-from latentplan.models.fast import compiled as fused
+from latentplan.models.fast import compiled
 from latentplan.models.fast.library import Norm, expectation, gates, norm_silu
 from latentplan.models.heads import Actor, Mlp, NormedLinear, ScalarHead, action_distribution
 
@@ -45,7 +45,7 @@ class Weights(NamedTuple):
     actor: Trunk
     actor_output: Tensor
     actor_shift: Tensor
-    packed: fused.Packed | None = None
+    packed: compiled.Packed | None = None
 
 
 @torch.no_grad()
@@ -95,7 +95,7 @@ def lay_out(dynamics: Rssm, head: ScalarHead, critic: ScalarHead, actor: Actor, 
         actor_output=actor.mlp.output.weight.t().contiguous(),
         actor_shift=actor.mlp.output.bias.clone(),
     )
-    return weights._replace(packed=fused.pack(weights, (trunk(critic.mlp), *logits(critic))))
+    return weights._replace(packed=compiled.pack(weights, (trunk(critic.mlp), *logits(critic))))
 
 
 def imagine(weights: Weights, state: State, actions: Tensor) -> tuple[Tensor, State]:
@@ -107,7 +107,7 @@ def imagine(weights: Weights, state: State, actions: Tensor) -> tuple[Tensor, St
         actions: In [-1, 1], (rows, time, action).
     """
     if weights.packed is not None and not asks_for_gradients(*state, actions):
-        rewards, *last = fused.rollout(weights.packed, *state, actions)
+        rewards, *last = compiled.rollout(weights.packed, *state, actions)
         return rewards, State(*last)
     block = ROWS_PER_THREAD * torch.get_num_threads() if actions.device.type == "cpu" else len(actions)
     with torch.autocast(actions.device.type, enabled=False):
@@ -117,7 +117,7 @@ def imagine(weights: Weights, state: State, actions: Tensor) -> tuple[Tensor, St
     return rewards, State(deters, stochs)
 
 
-def follow_actor(weights: Weights, state: State, noise: Tensor) -> Tensor:
+def propose(weights: Weights, state: State, noise: Tensor) -> Tensor:
     """The actions that the actor takes along the mean of the prior, float32 (rows, time, action).
 
     Args:
@@ -126,7 +126,7 @@ def follow_actor(weights: Weights, state: State, noise: Tensor) -> Tensor:
         noise: Standard normal draws for its samples, zeros for its mode, (rows, time, action).
     """
     if weights.packed is not None and not asks_for_gradients(*state, noise):
-        return fused.follow(weights.packed, *state, noise)
+        return compiled.propose(weights.packed, *state, noise)
     deter, stoch = state.deter.float(), state.stoch.to(weights.gates.dtype)
     rounded, actions = deter.to(stoch.dtype), []
     with torch.autocast(noise.device.type, enabled=False):

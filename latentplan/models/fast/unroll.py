@@ -41,30 +41,21 @@ class Weights(NamedTuple):
     output_bias: Tensor
 
 
-def pays(tensor: Tensor) -> bool:
-    """Whether this is faster than autograd where a tensor lives. On a CPU it takes as long."""
-    return tensor.is_cuda
-
-
 def observe(
     dynamics: Rssm, embeddings: Tensor, actions: Tensor, deter: Tensor, noise: Tensor
 ) -> tuple[State, Gaussian]:
-    """`Rssm.observe`, as it pays; gradients reach the weights and the embeddings."""
-    if not pays(noise):
-        return dynamics.observe(embeddings, actions, deter, noise)
+    """`Rssm.observe`; gradients reach the weights and the embeddings."""
     deter, *latent = _Unrolled.apply(embeddings, actions, deter, None, noise, *_weights(dynamics, prior=False))
     return State(deter, latent[0]), Gaussian(*latent[1:])
 
 
-def follow(dynamics: Rssm, start: State, actions: Tensor) -> tuple[Tensor, Gaussian]:
-    """`Rssm.follow`, as it pays; here gradients reach the weights alone."""
-    if not pays(actions):
-        return dynamics.follow(start, actions)
+def predict(dynamics: Rssm, start: State, actions: Tensor) -> tuple[Tensor, Gaussian]:
+    """`Rssm.predict`; gradients reach the weights alone."""
     deter, _, *prior = _Unrolled.apply(None, actions, start.deter, start.stoch, None, *_weights(dynamics, prior=True))
     return deter, Gaussian(*prior)
 
 
-def dream(
+def imagine(
     dynamics: Rssm, actor: Actor, start: State, action_noise: Tensor, noise: Tensor, decay: float
 ) -> tuple[Tensor, Tensor]:
     """Follow samples of an actor and of the prior; gradients reach the actor, along the dynamics.
@@ -85,13 +76,13 @@ def dream(
         for action_draws, draws in zip(action_noise.unbind(), noise.unbind(), strict=True):
             joined = run(pointwise.acted, _outputs(actor.mlp, features[-1]), action_draws, stoch)
             deter = steps.advance(joined, deter)
-            stoch, seen = run(pointwise.felt, steps.read(deter, None), draws, deter)
+            stoch, seen = run(pointwise.features, steps.read(deter, None), draws, deter)
             features.append(seen)
         stacked = torch.stack(features)
     # The actor's own gradient is no recurrence: it is asked once more, about all states at once.
     mean, std = actor(stacked[:-1])
     actions = sample_action(mean, std, action_noise)
-    return _Dreamt.apply(actions, stacked, steps, noise, decay), std
+    return _Imagined.apply(actions, stacked, steps, noise, decay), std
 
 
 def _outputs(mlp: Mlp, features: Tensor) -> Tensor:
@@ -263,7 +254,7 @@ class _Unrolled(torch.autograd.Function):
         return (seen, None, None, None, None, *gradients.of_weights())
 
 
-class _Dreamt(torch.autograd.Function):
+class _Imagined(torch.autograd.Function):
     """The features that were dreamt (horizon + 1, rows, feature), as what they are of actions (horizon, rows, ...)."""
 
     @staticmethod

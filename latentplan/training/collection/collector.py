@@ -21,6 +21,7 @@ from latentplan.config import Config, derive_seed
 from latentplan.envs import make_env, make_from, make_vector_env, render_info
 from latentplan.evaluation.episodes import episode_seed, run_episodes
 from latentplan.models import WorldModel
+from latentplan.models.fast import accelerate
 from latentplan.models.symmetry import unturned
 from latentplan.replay.buffer import Rows
 from latentplan.reporting.film import filming_if_possible
@@ -90,7 +91,7 @@ class Collector:
         self._decisions: int | None = getattr(self._eval_env.unwrapped, "decisions_per_episode", None)
         self.discount = discount = config.learning.discount or _discount_for(self._decisions)
         self.labels: dict[str, float] = getattr(self._eval_env.unwrapped, "labels", {})
-        self.model = WorldModel(config.model, action_dim, self.labels).to(device)
+        self.model = accelerate(WorldModel(config.model, action_dim, self.labels).to(device))
         noise, correlation = config.collection.noise_std, config.collection.noise_correlation
         planners = {
             (who, noisy): PlanningAgent(

@@ -4,8 +4,9 @@ from torch import nn
 
 from latentplan.config import ModelConfig
 from latentplan.models.dynamics import State
+from latentplan.models.fast import CpuBackend
 from latentplan.models.fast import compiled as fused
-from latentplan.models.fast.rollout import follow_actor, imagine, lay_out
+from latentplan.models.fast.rollout import imagine, lay_out, propose
 from latentplan.models.world_model import WorldModel
 
 ROWS, TIME, ACTION = 70, 4, 3  # three blocks, the last one of six rows
@@ -17,6 +18,7 @@ def build(config=SIZES):
     model = WorldModel(config, ACTION)
     for parameter in model.parameters():
         nn.init.normal_(parameter, std=parameter.shape[-1] ** -0.5)
+    model.backend = CpuBackend()
     return model
 
 
@@ -30,7 +32,7 @@ def start(rows=ROWS):
 
 def weights_of(model):
     with torch.no_grad(), model.trunk_precision():
-        return model._weights()
+        return model.backend._weights(model)
 
 
 WEIGHTS = weights_of(build())
@@ -45,14 +47,14 @@ def asked(name):
         rewards, last = imagine(weights, State(*(part[rows] for part in state)), actions[rows].clamp(-1.0, 1.0))
         return rewards, *last
 
-    def followed(weights, rows=slice(None)):
-        return (follow_actor(weights, State(*(part[rows] for part in state)), actions[rows]),)
+    def proposed(weights, rows=slice(None)):
+        return (propose(weights, State(*(part[rows] for part in state)), actions[rows]),)
 
-    return {"imagine": imagined, "follow": followed}[name]
+    return {"imagine": imagined, "propose": proposed}[name]
 
 
 @compiled
-@pytest.mark.parametrize("name", ["imagine", "follow"])
+@pytest.mark.parametrize("name", ["imagine", "propose"])
 def test_the_compiled_rollout_is_as_near_to_float32_as_torch_in_bfloat16(name):
     model, ask = build(), asked(name)
     with torch.no_grad(), torch.autocast("cpu", enabled=False):
@@ -64,7 +66,7 @@ def test_the_compiled_rollout_is_as_near_to_float32_as_torch_in_bfloat16(name):
 
 
 @compiled
-@pytest.mark.parametrize("name", ["imagine", "follow"])
+@pytest.mark.parametrize("name", ["imagine", "propose"])
 def test_a_row_does_not_depend_on_who_shares_the_call(name):
     ask = asked(name)
     for whole, part, alone in zip(ask(WEIGHTS), ask(WEIGHTS, slice(30, 68)), ask(WEIGHTS, slice(40, 41)), strict=True):
@@ -114,7 +116,7 @@ def test_nan_stays_nan_and_stays_in_its_row():
     others = [row for row in range(ROWS) if row != 40]
     assert rewards[40, 0].isfinite() and rewards[40, 1:].isnan().all() and last.deter[40].isnan().all()
     assert rewards[others].isfinite().all() and last.stoch[others].isfinite().all()
-    assert follow_actor(WEIGHTS, start(), actions)[40, 1:, 0].isnan().all()
+    assert propose(WEIGHTS, start(), actions)[40, 1:, 0].isnan().all()
 
 
 @compiled
@@ -122,7 +124,7 @@ def test_what_is_given_is_left_as_it_was():
     state, actions = start(), draw(ROWS, TIME, ACTION)
     copies = [tensor.clone() for tensor in (*state, actions)]
     imagine(WEIGHTS, state, actions)
-    follow_actor(WEIGHTS, state, actions)
+    propose(WEIGHTS, state, actions)
     assert all(torch.equal(left, right) for left, right in zip((*state, actions), copies, strict=True))
 
 

@@ -27,7 +27,7 @@ Norm = tuple[Tensor, Tensor]  # scale and shift
 Hidden = tuple[Tensor, Norm]  # weight (out, in) and the norm behind it
 
 
-class Reflex(NamedTuple):
+class FrameWeights(NamedTuple):
     """The weights that seeing and acting need.
 
     Attributes:
@@ -56,7 +56,7 @@ class Reflex(NamedTuple):
 
 
 @torch.no_grad()
-def lay_out(model: WorldModel) -> Reflex:
+def lay_out(model: WorldModel) -> FrameWeights:
     """The weights of a world model.
 
     On the CPU they share its memory and so follow whatever changes it in place; to that end the convolutions' weights
@@ -64,7 +64,7 @@ def lay_out(model: WorldModel) -> Reflex:
     """
     encoder, dynamics, latent = model.encoder, model.dynamics, model.dynamics.latent_dim
     output = dynamics.posterior_output
-    return Reflex(
+    return FrameWeights(
         patches=_affine(encoder.patches),
         convolutions=tuple(_convolution(layer) for layer in encoder.convolutions if isinstance(layer, nn.Conv2d)),
         embedding=_affine(encoder.linear),
@@ -78,39 +78,41 @@ def lay_out(model: WorldModel) -> Reflex:
     )
 
 
-def see(reflex: Reflex, deter: Tensor, frames: Tensor) -> State:
+def see(weights: FrameWeights, deter: Tensor, frames: Tensor) -> State:
     """The belief with posterior mean for deter (rows, deter) and uint8 frames (rows, 64, 64, 3)."""
-    product = functional.linear(deter, reflex.posterior_deter) + _embed(reflex, frames)
-    return State(deter, functional.linear(pointwise.norm_silu(product, *reflex.posterior_norm), *reflex.posterior_mean))
+    product = functional.linear(deter, weights.posterior_deter) + _embed(weights, frames)
+    return State(
+        deter, functional.linear(pointwise.norm_silu(product, *weights.posterior_norm), *weights.posterior_mean)
+    )
 
 
-def advance(reflex: Reflex, state: State, action: Tensor) -> Tensor:
+def advance(weights: FrameWeights, state: State, action: Tensor) -> Tensor:
     """The deterministic state (rows, deter) after action (rows, action) in [-1, 1]."""
-    hidden = _layer(torch.cat([state.stoch, action], -1), reflex.input)
-    weight, norm = reflex.gates
+    hidden = _layer(torch.cat([state.stoch, action], -1), weights.input)
+    weight, norm = weights.gates
     product = functional.linear(torch.cat([hidden, state.deter], -1), weight)
     return pointwise.gated(product, *norm, state.deter)
 
 
-def act(reflex: Reflex, state: State) -> tuple[Tensor, Tensor]:
+def act(weights: FrameWeights, state: State) -> tuple[Tensor, Tensor]:
     """Mean in [-1, 1] and std of the actor's action, (rows, action) each."""
     hidden = state.features
-    for layer in reflex.actor:
+    for layer in weights.actor:
         hidden = _layer(hidden, layer)
-    return action_distribution(functional.linear(hidden, *reflex.action))
+    return action_distribution(functional.linear(hidden, *weights.action))
 
 
-def _embed(reflex: Reflex, frames: Tensor) -> Tensor:
+def _embed(weights: FrameWeights, frames: Tensor) -> Tensor:
     """Embeddings (rows, embedding) of uint8 frames (rows, 64, 64, 3)."""
     # Sizes come from `shape`: `len` would build the number of rows into an exported program.
     rows, side = frames.shape[0], FRAME_SIZE // PATCH
     patches = frames.reshape(rows, side, PATCH, side, 3 * PATCH).transpose(2, 3).reshape(rows, side * side, -1)
-    pixels = patches.to(reflex.patches[0].dtype).mul_(1.0 / 255.0).sub_(0.5)
-    tokens = functional.silu(functional.linear(pixels, *reflex.patches))
-    for weight, shift in reflex.convolutions:
+    pixels = patches.to(weights.patches[0].dtype).mul_(1.0 / 255.0).sub_(0.5)
+    tokens = functional.silu(functional.linear(pixels, *weights.patches))
+    for weight, shift in weights.convolutions:
         windows = _windows(tokens.reshape(rows, side, side, -1))
         tokens, side = functional.silu(functional.linear(windows, weight, shift)), side // STRIDE
-    return functional.linear(tokens.reshape(rows, -1), *reflex.embedding)
+    return functional.linear(tokens.reshape(rows, -1), *weights.embedding)
 
 
 def _windows(picture: Tensor) -> Tensor:
