@@ -4,6 +4,7 @@ import torch
 
 from latentplan.config import Config, ModelConfig, PlannerConfig
 from latentplan.models import WorldModel
+from latentplan.models.fast import accelerate
 
 CONFIG = Config(
     model=ModelConfig(deter_dim=16, hidden_dim=16, encoder_channels=(8, 8), decoder_channels=2, num_bins=15),
@@ -14,7 +15,7 @@ CONFIG = Config(
 def make_model():
     """Untrained, but with rewards to plan for and an actor with preferences."""
     torch.manual_seed(0)
-    model = WorldModel(CONFIG.model, action_dim=2)
+    model = accelerate(WorldModel(CONFIG.model, action_dim=2))
     with torch.no_grad():
         model.reward_head.mlp.output.weight.normal_(std=0.3)
         model.actor.mlp.output.weight.normal_(std=0.3)

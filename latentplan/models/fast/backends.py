@@ -44,7 +44,8 @@ class ConvertedWeights:
         key = (dtype, *((parameter.data_ptr(), parameter._version) for parameter in parameters))
         kept = self._kept  # read once: another thread may replace it
         if kept is None or kept[0] != key:
-            kept = self._kept = (key, self._convert(model, dtype))
+            with torch.inference_mode(False):  # tensors made in inference mode could not be used for gradients later
+                kept = self._kept = (key, self._convert(model, dtype))
         return kept[1]
 
     def _parameters(self, model: WorldModel) -> list[Tensor]:
