@@ -27,7 +27,7 @@ from torch.utils._pytree import tree_flatten, tree_unflatten
 from latentplan.agents.base import ModelAgent
 from latentplan.agents.checkpoint import load_model
 from latentplan.config import UserError, output_file
-from latentplan.models import State, WorldModel
+from latentplan.models import Rssm, State, WorldModel
 from latentplan.models.fast import one_frame
 from latentplan.models.symmetry import turned
 
@@ -93,6 +93,10 @@ def export_actor(agent_or_checkpoint: ModelAgent | str | Path, path: str | Path,
         model = agent_or_checkpoint.model
     else:
         model, _, _ = load_model(agent_or_checkpoint)
+    if not isinstance(model.dynamics, Rssm):
+        raise UserError(
+            f"only agents with dynamics of the class Rssm can be exported, got {type(model.dynamics).__name__}"
+        )
     part = target.with_name(f".{target.name}.part")
     try:
         _write(_trace(model), model, part, format)
