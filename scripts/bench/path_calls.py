@@ -52,9 +52,8 @@ def learner_calls(model: WorldModel, learning: LearningConfig) -> Calls:
     starts = _states(model, batch * max(1, time // windows))
     following = _actions(model, len(starts.deter), windows)
     first, horizon = _states(model, learning.imagination_starts), learning.imagination_horizon
-    draws = [
-        torch.randn(horizon, len(first.deter), size, device=device) for size in (model.action_dim, sizes.latent_dim)
-    ]
+    action_noise = torch.randn(horizon, len(first.deter), model.action_dim, device=device)
+    latent_noise = torch.randn(horizon, len(first.deter), sizes.latent_dim, device=device)
     slow = [parameter.detach().clone() for parameter in model.parameters()]
     latest = [parameter.detach() for parameter in model.parameters()]
 
@@ -66,7 +65,7 @@ def learner_calls(model: WorldModel, learning: LearningConfig) -> Calls:
         _descend((deters,), prior)
 
     def imagine(model: WorldModel) -> None:
-        _descend(model.backend.imagine(model, first, *draws, learning.gradient_decay))
+        _descend(model.backend.imagine(model, first, action_noise, latent_noise, learning.gradient_decay))
 
     return {
         "observation, gradients written out": observe,
