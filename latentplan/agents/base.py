@@ -11,7 +11,7 @@ from torch import Tensor
 from latentplan.agents.noise import CorrelatedNoise
 from latentplan.config import Config
 from latentplan.models import State, WorldModel
-from latentplan.models.symmetry import TurnedModel, flat, folded, per_turn, turned, unturned
+from latentplan.models.symmetry import TurnedModel, first_turn, flat, folded, per_turn, turned
 from latentplan.objectives.expression import Expression
 from latentplan.objectives.image import read_goal
 from latentplan.objectives.objective import plan_goals
@@ -111,7 +111,7 @@ class ModelAgent:
 
     def _picture(self, state: State, actions: Tensor) -> np.ndarray:
         """The decoded end of a plan (batch, horizon, action), uint8 (32, 32, 3), of the first environment."""
-        first = State(*(part[:1] for part in unturned(state)))
+        first = State(*(part[:1] for part in first_turn(state)))
         self.steps_ahead = actions.shape[1]
         _, last = self.model.rollout(first, actions[:1].to(first.deter.dtype))
         return self.model.decoder.picture(last.features.float())[0].cpu().numpy()

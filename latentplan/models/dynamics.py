@@ -1,4 +1,4 @@
-"""RSSM: a deterministic GRU state beside a Gaussian latent (Hafner et al. 2019, section 3)."""
+"""Latent dynamics: the RSSM, a deterministic GRU state beside a Gaussian latent (Hafner et al. 2019, section 3)."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from torch.nn import functional
 from latentplan.models.heads import NormedLinear, sample_action
 
 MIN_STD = 0.1
-UPDATE_SHIFT = 1.0  # below which the update gate starts: states last
+UPDATE_SHIFT = 1.0  # subtracted before the update gate's sigmoid, so that untrained states change slowly
 
 
 class State(NamedTuple):
-    """Where the model believes the world is: `deter` (rows, deter) and `stoch` (rows, latent)."""
+    """A latent state: `deter` (rows, deter), which remembers the past, and `stoch` (rows, latent)."""
 
     deter: Tensor
     stoch: Tensor
@@ -64,8 +64,8 @@ class Dynamics(nn.Module):
         """Filter a sequence of frames into beliefs.
 
         Args:
-            embeddings: Of the frames, (batch, time + 1, embedding).
-            actions: Taken between them, in [-1, 1], (batch, time, action).
+            embeddings: Embeddings of the frames, (batch, time + 1, embedding).
+            actions: Actions between the frames, in [-1, 1], (batch, time, action).
             deter: Deterministic state at the first frame, (batch, deter).
             noise: Standard normal draws for the latents, (batch, time + 1, latent).
 
@@ -91,7 +91,7 @@ class Dynamics(nn.Module):
 
         Args:
             start: States, (rows, ...) each.
-            actions: In [-1, 1], (rows, time, action).
+            actions: Actions in [-1, 1], (rows, time, action).
 
         Returns:
             Deterministic states and priors after each action, (rows, time, ...) each.
@@ -180,14 +180,14 @@ def kl_divergence(left: Gaussian, right: Gaussian) -> Tensor:
 
 
 def next_deter(gates: Tensor, deter: Tensor) -> Tensor:
-    """The deterministic state (rows, deter) that normed gates (rows, 3 deter) lead to: reset, candidate and update."""
+    """The next deterministic state (rows, deter) from normed reset, candidate and update gates (rows, 3 deter)."""
     reset, candidate, update = gates.chunk(3, -1)
     candidate = torch.tanh(torch.sigmoid(reset) * candidate)
     return torch.lerp(deter, candidate.to(deter.dtype), torch.sigmoid(update - UPDATE_SHIFT).to(deter.dtype))
 
 
 def gaussian(raw: Tensor) -> Gaussian:
-    """The latent's distribution, for what a layer returned (..., 2 latent); std in 0.1 to 2.1."""
+    """The latent's distribution from a layer's output (..., 2 latent); std in [0.1, 2.1]."""
     mean, raw_std = raw.float().chunk(2, -1)
     return Gaussian(mean, 2.0 * torch.sigmoid(raw_std / 2.0) + MIN_STD)
 

@@ -17,20 +17,23 @@ from latentplan.models.encoder import Encoder
 from latentplan.models.goal_heads import GoalHeads
 from latentplan.models.heads import Actor, Mlp, ScalarHead, sample_action
 
-PROBE_SHARE = 3  # quantities lie near the surface of the latent: a narrow head reads them
+PROBE_SHARE = 3  # the probe has a third of the other heads' width: quantities are easy to predict from the latent
 
 
 class WorldModel(nn.Module):
-    """Everything an agent needs to see, imagine, judge and act.
+    """Encoder, latent dynamics, decoder and heads.
+
+    The methods `step`, `fast_step`, `rollout`, `propose`, `value`, `policy` and `continues` are the planner's protocol.
+    They continue from the mean of the prior, so that a plan's return depends on its actions alone.
 
     Args:
-        config: Sizes.
+        config: Sizes of the networks.
         action_dim: Size of the action, taken from the environment.
-        labels: Quantities to read off the latent, and the typical size of each.
-        goal_dim: Width of the heads for goals (`GoalHeads`), which learn when all else has; 0 for none.
+        labels: Names and typical sizes of the quantities that `probe` predicts from the latent.
+        goal_dim: Width of the heads for goals (`GoalHeads`), which are trained after everything else; 0 for none.
 
-    The methods `step`, `rollout`, `value`, `policy` and `continues` are the planner's protocol. They follow the
-    mean of the prior, so that a plan's return is a function of its actions alone.
+    Attributes:
+        backend: Computes what has to be fast; plain torch, unless `latentplan.models.fast.accelerate` chose another.
     """
 
     label_scales: Tensor
@@ -57,11 +60,11 @@ class WorldModel(nn.Module):
             self.add_goal_heads(goal_dim)
 
     def trunk_precision(self, *, cache: bool = True) -> AbstractContextManager[None]:
-        """Autocast to `trunk_dtype` for the products in the trunk; heads leave it by themselves.
+        """A context in which matrix products use `trunk_dtype`; the last layers of heads stay in float32.
 
         Args:
-            cache: Whether converted weights are kept while it lasts. All threads share one store, which each empties
-                when it leaves: what learns in two threads must not use it, or rounding would depend on timing.
+            cache: Whether autocast keeps converted weights until the context ends. All threads share this cache and
+                empty it on exit, so two learning threads must not use it: rounding would depend on timing.
         """
         dtype = self.trunk_dtype
         return torch.autocast(self.device.type, dtype, enabled=dtype != torch.float32, cache_enabled=cache)
@@ -73,17 +76,17 @@ class WorldModel(nn.Module):
 
     @property
     def device(self) -> torch.device:
-        """Where the parameters live."""
+        """The device of the parameters."""
         return self.dynamics.prior_output.weight.device
 
     @property
     def label_names(self) -> tuple[str, ...]:
-        """What `probe` reads, in order; empty where the environment told no quantities."""
+        """The quantities that `probe` predicts, in order; empty for an environment without quantities."""
         return tuple(self.labels)
 
     @property
     def goal_names(self) -> tuple[str, ...]:
-        """The quantities that goals can name, in the order of `goal_quantities`: all but the tasks' rewards."""
+        """The quantities that goals can name, in the order of `goal_quantities`: all labels but rewards of tasks."""
         return tuple(name for name in self.labels if not name.startswith(TASK_PREFIX))
 
     @property
@@ -92,7 +95,7 @@ class WorldModel(nn.Module):
         return self.label_scales[: len(self.goal_names)]
 
     def add_goal_heads(self, goal_dim: int) -> None:
-        """Put fresh heads for goals beside what is there.
+        """Add untrained heads for goals to the model.
 
         Raises:
             ValueError: The model was trained without labels.
@@ -104,36 +107,36 @@ class WorldModel(nn.Module):
         self.goal_dim, self.goal_heads = goal_dim, heads.to(self.device)
 
     def goal_action(self, features: Tensor, code: Tensor) -> tuple[Tensor, Tensor]:
-        """Mean and std of the action, (..., action) each, for the goals of a code; see `GoalHeads.act`."""
+        """Mean and std of the action, (..., action) each, for goals given by their code; see `GoalHeads.act`."""
         mean, std = self.goal_heads.act(features, code, self.actor.mlp(features))
         return mean, std
 
     def goal_quantities(self, features: Tensor) -> Tensor:
-        """The quantities `goal_names` at states with features (..., feature), float32 (..., quantity)."""
+        """Predictions of the quantities `goal_names` for features (..., feature), float32 (..., quantity)."""
         return self.probe(features)[..., : len(self.goal_names)].float()
 
     def probe(self, features: Tensor) -> Tensor:
-        """The quantities `label_names` at states with features (..., feature), in their own units, (..., label).
+        """Predictions of the quantities `label_names` for features (..., feature), in their own units, (..., label).
 
         Raises:
             ValueError: The model was trained without labels.
         """
         if not self.labels:
-            raise ValueError("this model was trained without labels, so no quantity can be read off its latent")
+            raise ValueError("this model was trained without labels, so it predicts no quantities")
         return self.probe_head(features) * self.label_scales
 
     def infer(self, state: State, action: Tensor, frames: Tensor) -> State:
-        """The belief after acting and seeing: posterior mean after `action` (rows, action) led to `frames`.
+        """The belief with the posterior's mean, after `action` and the `frames` that followed.
 
         Args:
-            state: Belief before the action.
-            action: In [-1, 1], (rows, action).
-            frames: uint8 (rows, 64, 64, 3).
+            state: The belief before the action.
+            action: Actions in [-1, 1], (rows, action).
+            frames: Frames after the actions, uint8 (rows, 64, 64, 3).
         """
         return self.see(self.dynamics.advance(state, action), frames)
 
     def see(self, deter: Tensor, frames: Tensor) -> State:
-        """The belief with posterior mean for deter (rows, deter) and uint8 frames (rows, 64, 64, 3)."""
+        """The belief with the posterior's mean for deter (rows, deter) and uint8 frames (rows, 64, 64, 3)."""
         return State(deter, self.dynamics.posterior(deter, self.encoder(frames)).mean)
 
     def step(self, state: State, action: Tensor) -> tuple[State, Tensor]:
@@ -149,13 +152,13 @@ class WorldModel(nn.Module):
         return self.backend.rollout(self, state, actions)
 
     def propose(self, state: State, num: int, horizon: int, generators: Sequence[torch.Generator]) -> Tensor:
-        """What the actor does from each state, its mode first and then samples, (batch num, horizon, action).
+        """Action sequences of the actor from each state, its mode first, then samples, (batch num, horizon, action).
 
         Args:
-            state: Rows (batch,).
-            num: Sequences from each.
+            state: The start of the sequences, (batch, ...).
+            num: Sequences per state.
             horizon: Model steps.
-            generators: One stream per row, so that samples do not depend on who shares the call.
+            generators: One random stream per state, so that samples do not depend on the other states of the call.
         """
         draws = [
             torch.randn(num, horizon, self.action_dim, generator=generator, device=self.device)
@@ -167,7 +170,7 @@ class WorldModel(nn.Module):
         return self.backend.propose(self, repeated, noise.flatten(0, 1))
 
     def value(self, state: State) -> Tensor:
-        """Expected discounted return from a state on, (rows,)."""
+        """The expected discounted return from a state on, (rows,)."""
         return self.backend.value(self, state)
 
     def policy(self, state: State, generator: torch.Generator | None = None) -> Tensor:
@@ -179,14 +182,14 @@ class WorldModel(nn.Module):
         return sample_action(mean, std, torch.randn(mean.shape, generator=generator, device=mean.device))
 
     def continues(self, state: State) -> Tensor:
-        """Probability (rows,) that the episode goes on at a state."""
+        """The probability (rows,) that the episode continues at a state."""
         with self.trunk_precision():
             return torch.sigmoid(self.continue_head(state.features)).squeeze(-1)
 
     def surprise(self, state: State) -> Tensor:
-        """How far the latents of beliefs lie from what was predicted of them, in nats, (rows,).
+        """How far the latents of beliefs lie from the prior, in nats, (rows,).
 
-        Half the squared distance from the prior's mean, in its standard deviations: what a frame told against it.
+        Half the squared distance between the latent and the prior's mean, in standard deviations of the prior.
         """
         prior = self.dynamics.prior(state.deter)
         return 0.5 * ((state.stoch - prior.mean) / prior.std).square().sum(-1)

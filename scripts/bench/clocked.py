@@ -114,7 +114,7 @@ def measure_error(trial: Trial) -> Iterator[Row]:
 
 def _record(agent: Any, env: SuiteEnv, seed: int) -> tuple[list[Any], list[np.ndarray], list[float]]:
     """Beliefs, the actions taken at them, and the rewards that arrived with the next."""
-    from latentplan.models.symmetry import unturned
+    from latentplan.models.symmetry import first_turn
 
     beliefs, actions, rewards = [], [], []
     agent.reset()
@@ -122,7 +122,7 @@ def _record(agent: Any, env: SuiteEnv, seed: int) -> tuple[list[Any], list[np.nd
     over = False
     while not over:
         action = agent.act(frame)
-        beliefs.append(unturned(agent.state))
+        beliefs.append(first_turn(agent.state))
         actions.append(action)
         frame, reward, terminated, truncated, _ = env.step(action)
         rewards.append(reward)

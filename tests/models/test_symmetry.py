@@ -7,7 +7,7 @@ import torch
 
 from latentplan.config import ModelConfig
 from latentplan.models import State, WorldModel
-from latentplan.models.symmetry import QUARTERS, TurnedModel, flat, folded, mean_over_turns, turned, unturned
+from latentplan.models.symmetry import QUARTERS, TurnedModel, first_turn, flat, folded, mean_over_turns, turned
 from latentplan.planning import CEMPlanner
 from latentplan.planning.check import check_model
 from latentplan.planning.objectives import learned_return, risk, terminal_value
@@ -49,7 +49,7 @@ def test_rows_and_beliefs_are_the_same_numbers(beliefs):
     rows = flat(beliefs)
     assert rows.deter.shape == (12, 16)
     assert all(torch.equal(one, other) for one, other in zip(folded(rows, QUARTERS), beliefs, strict=True))
-    assert torch.equal(unturned(beliefs).stoch, beliefs.stoch[:, 0])
+    assert torch.equal(first_turn(beliefs).stoch, beliefs.stoch[:, 0])
     assert all(torch.equal(one, other) for one, other in zip(flat(rows), rows, strict=True))
     assert torch.equal(mean_over_turns(rows.deter, beliefs), beliefs.deter.mean(1))
 
@@ -89,7 +89,7 @@ def test_a_belief_that_is_the_same_from_every_side_is_planned_for_as_one(model, 
     alike = State(*(part[:, :1].expand(-1, QUARTERS, -1).contiguous() for part in beliefs))
     actions = torch.rand(3, 24, 3, 2) * 2 - 1
     one, all_turns = (
-        judged(seen, state, actions) for seen, state in ((model, unturned(alike)), (TurnedModel(model), alike))
+        judged(seen, state, actions) for seen, state in ((model, first_turn(alike)), (TurnedModel(model), alike))
     )
     assert torch.allclose(one, all_turns, atol=2e-2) and one.std() > 0.1
 

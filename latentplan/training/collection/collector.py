@@ -22,7 +22,7 @@ from latentplan.envs import make_env, make_from, make_vector_env, render_info
 from latentplan.evaluation.episodes import episode_seed, run_episodes
 from latentplan.models import WorldModel
 from latentplan.models.fast import accelerate
-from latentplan.models.symmetry import unturned
+from latentplan.models.symmetry import first_turn
 from latentplan.replay.buffer import Rows
 from latentplan.reporting.film import filming_if_possible
 from latentplan.training.collection.rewards import RewardCheck
@@ -220,7 +220,7 @@ class Collector:
         frames, labels, first = self._frames.copy(), self._labels.copy(), self._ended.copy()
         actions = agent.act(frames)
         state = agent.state if isinstance(agent, ModelAgent) else None
-        deter = None if state is None else unturned(state).deter.float().cpu().numpy()
+        deter = None if state is None else first_turn(state).deter.float().cpu().numpy()
         plan = None
         if isinstance(agent, PlanningAgent) and agent.controller.objective is None:
             plan = agent.planned_action()

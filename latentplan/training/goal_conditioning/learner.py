@@ -149,7 +149,7 @@ class GoalLearner:
         reach = torch.cat([torch.ones_like(discounts[:1]), discounts[:-1]]).cumprod(0)
         gains = returns / return_scale(self.return_range, returns.detach()) + settings.entropy_scale * entropies
         with self.model.trunk_precision():
-            logits = heads.judge(features[:-1].detach(), code)
+            logits = heads.value_logits(features[:-1].detach(), code)
         loss = (reach * (heads.value_head.loss(logits, returns.detach()) - gains)).mean()
         descend(self.optimizer, loss, self.learning.max_grad_norm, self.updates)
         self.model.backend.move_towards([*self.target.parameters()], [*heads.parameters()], self.learning.target_rate)

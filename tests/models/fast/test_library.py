@@ -36,7 +36,7 @@ CASES = [(name, dtype) for name in ("norm_silu", "gates") for dtype in DTYPES] +
 
 @compiled
 @pytest.mark.parametrize(("name", "dtype"), CASES)
-def test_the_compiled_kernel_does_what_torch_does(name, dtype, monkeypatch):
+def test_compiled_kernel_equals_torch(name, dtype, monkeypatch):
     ask = asked(name, dtype)
     fused = ask()
     monkeypatch.setattr(kernels, "load", lambda: None)
@@ -47,7 +47,7 @@ def test_the_compiled_kernel_does_what_torch_does(name, dtype, monkeypatch):
 
 
 @pytest.mark.parametrize(("name", "dtype"), CASES)
-def test_rows_do_not_depend_on_each_other(name, dtype):
+def test_kernel_computes_each_row_independently(name, dtype):
     ask = asked(name, dtype)
     for whole, part in zip(ask(), ask(slice(5, 6)), strict=True):
         # Torch takes the end of a tensor another way than its middle, which shows in the last bit.
@@ -55,7 +55,7 @@ def test_rows_do_not_depend_on_each_other(name, dtype):
 
 
 @pytest.mark.parametrize("dtype", DTYPES)
-def test_nan_stays_nan_and_stays_in_its_row(dtype):
+def test_kernel_keeps_nan_in_its_row(dtype):
     product, wide, logits = draw(3, SIZE, dtype=dtype), draw(3, 3 * SIZE, dtype=dtype), draw(3, SIZE)
     for rows in (product, wide, logits):
         rows[1, 7] = float("nan")
@@ -69,21 +69,21 @@ def test_nan_stays_nan_and_stays_in_its_row(dtype):
         assert result[[0, 2]].isfinite().all()
 
 
-def test_extreme_inputs_saturate():
+def test_kernel_saturates_for_extreme_inputs():
     far = torch.tensor([[3e38, -3e38, 0.0], [200.0, -200.0, 0.0]])
     assert kernels.expectation(far, torch.tensor([1.0, 2.0, 3.0])).tolist() == [1.0, 1.0]
     following, _ = kernels.gates(draw(4, 6) * 1e4, (torch.full((6,), 1e4), torch.zeros(6)), draw(4, 2))
     assert following.isfinite().all()
 
 
-def test_only_float32_logits_reach_the_compiled_expectation():
+def test_expectation_uses_torch_for_bfloat16_logits():
     logits, values = draw(3, 5, dtype=torch.bfloat16), draw(5, dtype=torch.bfloat16)
     assert torch.equal(kernels.expectation(logits, values), logits.softmax(-1) @ values)
     with pytest.raises(RuntimeError):
         kernels.expectation(logits, values.float())  # as torch has it; the kernel would read beyond the end
 
 
-def test_gradients_pass_where_they_are_asked_for():
+def test_kernel_passes_gradients_when_inputs_require_them():
     product, deter = draw(4, 6).requires_grad_(), draw(4, 2).requires_grad_()
     before = product.detach().clone()
     following, _ = kernels.gates(product, norm(6), deter)
@@ -93,7 +93,7 @@ def test_gradients_pass_where_they_are_asked_for():
 
 
 @compiled
-def test_a_machine_without_a_compiler_or_with_a_broken_one_goes_on_in_torch(tmp_path):
+def test_load_returns_none_without_a_working_compiler(tmp_path):
     program = "from latentplan.models.fast import library; print(library.load())"
     for settings in ({"CC": "false"}, {"CC": "/nowhere/cc"}, {"LATENTPLAN_KERNELS": "0"}):
         environment = {"XDG_CACHE_HOME": str(tmp_path), "PYTHONPATH": ".", **settings}
@@ -102,7 +102,7 @@ def test_a_machine_without_a_compiler_or_with_a_broken_one_goes_on_in_torch(tmp_
 
 
 @compiled
-def test_without_a_home_torch_does_it(monkeypatch):
+def test_load_returns_none_without_a_home_directory(monkeypatch):
     def nobodys():
         raise RuntimeError("Could not determine home directory.")
 
