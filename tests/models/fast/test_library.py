@@ -1,5 +1,4 @@
-import subprocess
-import sys
+"""Compiled kernels compute what torch computes, and torch computes where they are missing."""
 
 import pytest
 import torch
@@ -8,8 +7,13 @@ from latentplan.models.fast import library as kernels
 
 DTYPES = [torch.bfloat16, torch.float32]
 ROWS, SIZE = 37, 45  # neither is a multiple of what a vector holds
-COMPILED = kernels.load()
-compiled = pytest.mark.skipif(COMPILED is None, reason="no C compiler")
+
+
+@pytest.fixture
+def compiled():
+    """Skips a test where the kernels cannot be compiled."""
+    if kernels.load() is None:
+        pytest.skip("no C compiler")
 
 
 def draw(*shape, dtype=torch.float32, seed=0):
@@ -34,7 +38,7 @@ def asked(name, dtype):
 CASES = [(name, dtype) for name in ("norm_silu", "gates") for dtype in DTYPES] + [("expectation", torch.float32)]
 
 
-@compiled
+@pytest.mark.usefixtures("compiled")
 @pytest.mark.parametrize(("name", "dtype"), CASES)
 def test_compiled_kernel_equals_torch(name, dtype, monkeypatch):
     ask = asked(name, dtype)
@@ -51,7 +55,9 @@ def test_kernel_computes_each_row_independently(name, dtype):
     ask = asked(name, dtype)
     for whole, part in zip(ask(), ask(slice(5, 6)), strict=True):
         # Torch takes the end of a tensor another way than its middle, which shows in the last bit.
-        assert torch.equal(whole[5:6], part) if COMPILED else torch.allclose(whole[5:6], part, rtol=1e-2, atol=1e-6)
+        assert (
+            torch.equal(whole[5:6], part) if kernels.load() else torch.allclose(whole[5:6], part, rtol=1e-2, atol=1e-6)
+        )
 
 
 @pytest.mark.parametrize("dtype", DTYPES)
@@ -92,27 +98,25 @@ def test_kernel_passes_gradients_when_inputs_require_them():
     assert torch.equal(product, before)
 
 
-@compiled
-def test_load_returns_none_without_a_working_compiler(tmp_path):
-    program = "from latentplan.models.fast import library; print(library.load())"
-    for settings in ({"CC": "false"}, {"CC": "/nowhere/cc"}, {"LATENTPLAN_KERNELS": "0"}):
-        environment = {"XDG_CACHE_HOME": str(tmp_path), "PYTHONPATH": ".", **settings}
-        done = subprocess.run([sys.executable, "-c", program], env=environment, capture_output=True, text=True)
-        assert done.stdout.strip() == "None", done.stderr
-
-
-@compiled
-def test_load_returns_none_without_a_home_directory(monkeypatch):
-    def nobodys():
-        raise RuntimeError("Could not determine home directory.")
-
-    monkeypatch.delenv("XDG_CACHE_HOME", raising=False)
-    monkeypatch.setattr(kernels.Path, "home", nobodys)
+@pytest.mark.parametrize("settings", [{"CC": "false"}, {"CC": "/nowhere/cc"}, {"LATENTPLAN_KERNELS": "0"}])
+def test_load_returns_none_without_a_working_compiler(settings, tmp_path, monkeypatch):
+    for name, value in {"XDG_CACHE_HOME": str(tmp_path), **settings}.items():
+        monkeypatch.setenv(name, value)
     assert kernels.load.__wrapped__() is None
 
 
-@compiled
-def test_kernels_are_compiled_once_and_kept(tmp_path, monkeypatch):
+@pytest.mark.usefixtures("compiled")
+def test_load_returns_none_without_a_home_directory(monkeypatch):
+    def unknown_home():
+        raise RuntimeError("Could not determine home directory.")
+
+    monkeypatch.delenv("XDG_CACHE_HOME", raising=False)
+    monkeypatch.setattr(kernels.Path, "home", unknown_home)
+    assert kernels.load.__wrapped__() is None
+
+
+@pytest.mark.usefixtures("compiled")
+def test_compiled_builds_the_library_once_and_keeps_it(tmp_path, monkeypatch):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     first = kernels._compiled()
     made = first.stat().st_mtime_ns
