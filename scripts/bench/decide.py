@@ -112,7 +112,7 @@ def counted_model_steps(model: WorldModel) -> Iterator[dict[str, int]]:
 
         return call
 
-    names = ("step", "rollout")
+    names = ("step", "fast_step", "rollout")
     for name in names:
         setattr(model, name, counting(getattr(model, name)))
     try:

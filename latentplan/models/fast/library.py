@@ -19,9 +19,8 @@ from pathlib import Path
 
 import torch
 from torch import Tensor
-from torch.nn import functional
 
-from latentplan.models.dynamics import next_deter
+from latentplan.models.fast import pointwise
 
 SOURCES = tuple(Path(__file__).with_name(name) for name in ("rows.h", "vectors.h", "kernels.c", "imagine.c"))
 # Sums may be reordered, because compilers cannot vectorize them otherwise; all other rules of IEEE 754 hold.
@@ -40,7 +39,7 @@ def norm_silu(product: Tensor, norm: Norm) -> Tensor:
     scale, shift = norm
     library = _library_for(product, scale, shift)
     if library is None:
-        return functional.silu(functional.layer_norm(product, product.shape[-1:], scale, shift))
+        return pointwise.norm_silu(product, scale, shift)
     rows, size = product.numel() // product.shape[-1], product.shape[-1]
     kernel = getattr(library, f"norm_silu_{DTYPES[product.dtype]}")
     kernel(*_places(product, scale, shift), rows, size, torch.get_num_threads())
@@ -61,8 +60,7 @@ def gates(product: Tensor, norm: Norm, deter: Tensor) -> tuple[Tensor, Tensor]:
     scale, shift = norm
     library = _library_for(product, scale, shift, deter)
     if library is None:
-        normed = functional.layer_norm(product.to(scale.dtype), product.shape[-1:], scale, shift).to(deter.dtype)
-        following = next_deter(normed, deter)
+        following = pointwise.gated(product.to(scale.dtype), scale, shift, deter)
         return following, following.to(product.dtype)
     deter = deter.contiguous()
     following, rounded = torch.empty_like(deter), torch.empty_like(deter, dtype=product.dtype)
