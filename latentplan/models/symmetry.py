@@ -96,7 +96,7 @@ class TurnedModel:
 
     def rollout(self, state: State, actions: Tensor) -> tuple[Tensor, State]:
         """Rewards (batch, horizon) along sequences (batch, horizon, action), means over turns, and the last belief."""
-        last, rewards = self._imagine(lambda *what: self.model.rollout(*what)[::-1], state, actions)
+        last, rewards = self._imagine(lambda *arguments: self.model.rollout(*arguments)[::-1], state, actions)
         return rewards, last
 
     def value(self, state: State) -> Tensor:

@@ -69,7 +69,7 @@ def test_box_view_follows_the_planner_protocol(knowing, state, generator):
         code = knowing.goal_heads.encode(torch.tensor([-math.inf, -1.0]), torch.tensor([math.inf, -1.0]))
         mode, _ = knowing.goal_action(state.features, code)  # not rounded to bfloat16, as `policy` is
         assert torch.allclose(proposals[::4, 0], mode, atol=1e-4)
-        assert torch.allclose(proposals[8:12], alone, atol=1e-2)  # does not feel who shares the call
+        assert torch.allclose(proposals[8:12], alone, atol=1e-2)  # independent of the other states of the call
 
 
 def test_untrained_goal_actor_acts_like_the_task_actor(model, state):

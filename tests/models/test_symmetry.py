@@ -89,21 +89,21 @@ def test_turned_model_scores_equal_turns_like_a_single_belief(model, beliefs):
     alike = State(*(part[:, :1].expand(-1, QUARTERS, -1).contiguous() for part in beliefs))
     actions = torch.rand(3, 24, 3, 2) * 2 - 1
     one, all_turns = (
-        judged(seen, state, actions) for seen, state in ((model, first_turn(alike)), (TurnedModel(model), alike))
+        scores(seen, state, actions) for seen, state in ((model, first_turn(alike)), (TurnedModel(model), alike))
     )
     assert torch.allclose(one, all_turns, atol=2e-2) and one.std() > 0.1
 
 
 def test_turned_model_scores_a_candidate_by_the_mean_over_turns(model, beliefs):
     actions = torch.rand(3, 24, 3, 2) * 2 - 1
-    each = [judged(model, State(*(part[:, turn] for part in beliefs)), actions) for turn in range(QUARTERS)]
-    together = judged(TurnedModel(model), beliefs, actions)
+    each = [scores(model, State(*(part[:, turn] for part in beliefs)), actions) for turn in range(QUARTERS)]
+    together = scores(TurnedModel(model), beliefs, actions)
     assert torch.allclose(together, torch.stack(each).mean(0), atol=2e-2)
     assert not torch.allclose(together, each[0], atol=0.1)
 
 
-def judged(model, state, actions):
-    """What candidates are worth, (batch, sample)."""
+def scores(model, state, actions):
+    """Returns of candidates, (batch, sample)."""
     from latentplan.planning.search.scorer import Scorer
 
     discounts = 0.9 ** torch.arange(actions.shape[2] + 1)

@@ -118,7 +118,7 @@ class CpuBackend(_LaidOutBackend):
         return super().value(model, state) if packed is None else compiled.value(packed, *state)
 
     def _packed(self, model: WorldModel) -> compiled.Packed | None:
-        """Weights for compiled calls; None where torch has to compute, or where gradients could be asked for."""
+        """Weights for compiled calls; None if torch has to compute, or if gradients could be required."""
         return None if torch.is_grad_enabled() else self._weights(model).packed
 
 

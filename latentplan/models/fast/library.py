@@ -60,7 +60,7 @@ def gates(product: Tensor, norm: Norm, deter: Tensor) -> tuple[Tensor, Tensor]:
     scale, shift = norm
     library = _library_for(product, scale, shift, deter)
     if library is None:
-        following = pointwise.gated(product.to(scale.dtype), scale, shift, deter)
+        following = pointwise.update_deter(product.to(scale.dtype), scale, shift, deter)
         return following, following.to(product.dtype)
     deter = deter.contiguous()
     following, rounded = torch.empty_like(deter), torch.empty_like(deter, dtype=product.dtype)

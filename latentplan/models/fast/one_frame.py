@@ -91,7 +91,7 @@ def advance(weights: FrameWeights, state: State, action: Tensor) -> Tensor:
     hidden = _layer(torch.cat([state.stoch, action], -1), weights.input)
     weight, norm = weights.gates
     product = functional.linear(torch.cat([hidden, state.deter], -1), weight)
-    return pointwise.gated(product, *norm, state.deter)
+    return pointwise.update_deter(product, *norm, state.deter)
 
 
 def act(weights: FrameWeights, state: State) -> tuple[Tensor, Tensor]:

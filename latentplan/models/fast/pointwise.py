@@ -51,7 +51,7 @@ def norm_silu(product: Tensor, scale: Tensor, shift: Tensor) -> Tensor:
     return functional.silu(functional.layer_norm(product, product.shape[-1:], scale, shift, NORM_EPS))
 
 
-def norm_silu_beside(product: Tensor, scale: Tensor, shift: Tensor, deter: Tensor) -> Tensor:
+def norm_silu_with_deter(product: Tensor, scale: Tensor, shift: Tensor, deter: Tensor) -> Tensor:
     """`norm_silu` of the product, concatenated with deter, (rows, size + deter)."""
     return torch.cat([norm_silu(product, scale, shift), deter], -1)
 
@@ -66,13 +66,13 @@ def norm_silu_back(gradient: Tensor, product: Tensor, scale: Tensor, shift: Tens
     return _norm_input_back(of_scaled * scale, normed, rstd), of_scaled
 
 
-def gated(product: Tensor, scale: Tensor, shift: Tensor, deter: Tensor) -> Tensor:
+def update_deter(product: Tensor, scale: Tensor, shift: Tensor, deter: Tensor) -> Tensor:
     """The next deter (rows, deter) from reset, candidate and update gates (rows, 3 deter), as in `Rssm.advance`."""
     normed = functional.layer_norm(product, product.shape[-1:], scale, shift, NORM_EPS)
     return next_deter(normed, deter)
 
 
-def gated_back(
+def update_deter_back(
     by_latent: Tensor,
     by_others: Tensor | None,
     directly: Tensor | None,
@@ -91,7 +91,7 @@ def gated_back(
         directly: Gradient through the following step, without its product.
         beside: Gradient of the input of the following step's product, whose last columns belong to deter.
         decay: Share of `directly` and `beside` that passes.
-        product: Product of the gates, as `gated` takes it.
+        product: Product of the gates, as `update_deter` takes it.
         scale: Scale of the norm.
         shift: Shift of the norm.
         deter: The previous deter.
@@ -111,14 +111,16 @@ def gated_back(
     return _norm_input_back(of_scaled * scale, normed, rstd), of_scaled, gradient * (1.0 - update_gate)
 
 
-def drawn(raw: Tensor, noise: Tensor | None, action: Tensor | None) -> tuple[Tensor, Tensor, Tensor, Tensor | None]:
+def sample_latent(
+    raw: Tensor, noise: Tensor | None, action: Tensor | None
+) -> tuple[Tensor, Tensor, Tensor, Tensor | None]:
     """A sample of the latent (its mean without noise), mean, std, and the latent concatenated with the next action."""
     mean, std = gaussian(raw)
     stoch = mean if noise is None else mean + std * noise
     return stoch, mean, std, None if action is None else torch.cat([stoch, action], -1)
 
 
-def drawn_back(
+def sample_latent_back(
     raw: Tensor,
     noise: Tensor | None,
     stoch: Tensor | None,
@@ -139,14 +141,14 @@ def drawn_back(
     return torch.cat([of_mean, of_std * gate * (1.0 - gate)], -1)
 
 
-def features(raw: Tensor, noise: Tensor, deter: Tensor) -> tuple[Tensor, Tensor]:
+def sample_features(raw: Tensor, noise: Tensor, deter: Tensor) -> tuple[Tensor, Tensor]:
     """A sample of the latent, (rows, latent), and the features (rows, deter + latent)."""
     mean, std = gaussian(raw)
     stoch = mean + std * noise
     return stoch, torch.cat([deter, stoch], -1)
 
 
-def acted(raw: Tensor, noise: Tensor, stoch: Tensor) -> Tensor:
+def append_action(raw: Tensor, noise: Tensor, stoch: Tensor) -> Tensor:
     """The latent concatenated with an action sample, for the output of the actor's last layer (rows, 2 action)."""
     return torch.cat([stoch, sample_action(*action_distribution(raw), noise)], -1)
 

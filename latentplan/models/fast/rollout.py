@@ -154,15 +154,15 @@ def _imagine_block(weights: Weights, deter: Tensor, stoch: Tensor, actions: Tens
     steps_at_once = max(1, ROWS_PER_THREAD * torch.get_num_threads() // len(actions))
     pushes = actions.transpose(0, 1).to(dtype).contiguous() @ weights.action  # (time, rows, hidden)
     deter, rounded, stoch = deter.float(), deter.to(dtype), stoch.to(dtype)
-    seen, rewards = [], []
+    features, rewards = [], []
     for push in pushes:
         deter, rounded, stoch = _step(weights, deter, rounded, stoch, push)
-        seen.append(torch.cat([rounded, stoch], -1))
-        if len(seen) == steps_at_once:
-            rewards.append(_rewards(weights, seen))
-            seen = []
-    if seen:
-        rewards.append(_rewards(weights, seen))
+        features.append(torch.cat([rounded, stoch], -1))
+        if len(features) == steps_at_once:
+            rewards.append(_rewards(weights, features))
+            features = []
+    if features:
+        rewards.append(_rewards(weights, features))
     return torch.cat(rewards, 1), deter, stoch.float()
 
 
@@ -181,13 +181,13 @@ def _advance(weights: Weights, deter: Tensor, rounded: Tensor, stoch: Tensor, pu
     return gates(torch.cat([hidden, rounded], -1) @ weights.gates, weights.gates_norm, deter)
 
 
-def _rewards(weights: Weights, seen: list[Tensor]) -> Tensor:
+def _rewards(weights: Weights, per_step: list[Tensor]) -> Tensor:
     """Rewards (rows, step) at the features of some steps, (rows, feature) each."""
-    features = torch.cat(seen)
+    features = torch.cat(per_step)
     for weight, norm in weights.head:
         features = _layer(features, weight, norm)
     logits = torch.addmm(weights.logits_shift, features.float(), weights.logits)
-    return expectation(logits, weights.values).unflatten(0, (len(seen), -1)).t()
+    return expectation(logits, weights.values).unflatten(0, (len(per_step), -1)).t()
 
 
 def _layer(features: Tensor, weight: Tensor, norm: Norm) -> Tensor:

@@ -74,9 +74,9 @@ def imagine(
     steps, deter, stoch, features = _Steps(_weights(dynamics, prior=True)), *start, [start.features]
     with torch.no_grad():
         for action_draws, draws in zip(action_noise.unbind(), noise.unbind(), strict=True):
-            joined = run(pointwise.acted, _outputs(actor.mlp, features[-1]), action_draws, stoch)
+            joined = run(pointwise.append_action, _outputs(actor.mlp, features[-1]), action_draws, stoch)
             deter = steps.advance(joined, deter)
-            stoch, seen = run(pointwise.features, steps.read(deter, None), draws, deter)
+            stoch, seen = run(pointwise.sample_features, steps.read(deter, None), draws, deter)
             features.append(seen)
         stacked = torch.stack(features)
     # The actor's own gradient needs no recurrence: the actor runs once more, on all states at once.
@@ -106,28 +106,28 @@ class _Steps:
 
     def __init__(self, weights: Weights) -> None:
         self.weights = weights
-        self.joined: list[Tensor] = []  # latent and action
-        self.first: list[Tensor] = []  # its product with `input`
-        self.beside: list[Tensor] = []  # its norm and SiLU, concatenated with deter
-        self.gates: list[Tensor] = []  # the product with `gates`
-        self.before: list[Tensor] = []  # deter
-        self.after: list[Tensor] = []
-        self.second: list[Tensor] = []  # its product with `hidden`
-        self.hidden: list[Tensor] = []
-        self.raw: list[Tensor] = []
+        self.joined: list[Tensor] = []  # latent and action, concatenated
+        self.first: list[Tensor] = []  # product of `joined` with the input weights
+        self.beside: list[Tensor] = []  # hidden layer of the input, concatenated with deter
+        self.gates: list[Tensor] = []  # product of `beside` with the weights of the gates
+        self.before: list[Tensor] = []  # deter before the step
+        self.after: list[Tensor] = []  # deter after the step
+        self.second: list[Tensor] = []  # product of `after` with the hidden weights
+        self.hidden: list[Tensor] = []  # hidden layer between deter and latent
+        self.raw: list[Tensor] = []  # raw mean and std of the latent
 
     def advance(self, joined: Tensor, deter: Tensor) -> Tensor:
         """The next deter, for latent and action concatenated."""
         weights = self.weights
         first = joined @ weights.input.T
-        beside = run(pointwise.norm_silu_beside, first, weights.input_scale, weights.input_shift, deter)
+        beside = run(pointwise.norm_silu_with_deter, first, weights.input_scale, weights.input_shift, deter)
         gates = beside @ weights.gates.T
         self.joined.append(joined)
         self.first.append(first)
         self.beside.append(beside)
         self.gates.append(gates)
         self.before.append(deter)
-        return run(pointwise.gated, gates, weights.gates_scale, weights.gates_shift, deter)
+        return run(pointwise.update_deter, gates, weights.gates_scale, weights.gates_shift, deter)
 
     def read(self, deter: Tensor, embedding: Tensor | None) -> Tensor:
         """Raw mean and std of the latent at a deter, (rows, 2 latent), before `gaussian`."""
@@ -160,7 +160,7 @@ class _Gradients:
         """The gradient of a step's deter through its latent, given outer gradients of stoch, mean and std."""
         steps, weights = self.steps, self.steps.weights
         joined = self.joined[-1] if self.joined else None
-        raw = run(pointwise.drawn_back, steps.raw[time], self.noise[time], stoch, mean, std, joined, self.decay)
+        raw = run(pointwise.sample_latent_back, steps.raw[time], self.noise[time], stoch, mean, std, joined, self.decay)
         second = run(
             pointwise.norm_silu_back,
             raw @ weights.output,
@@ -176,7 +176,7 @@ class _Gradients:
         """Backward through a step's GRU, given gradients of its deter through its latent and through other readers."""
         steps, weights = self.steps, self.steps.weights
         gates, normed, directly = run(
-            pointwise.gated_back,
+            pointwise.update_deter_back,
             by_latent,
             deter,
             *self.later,
@@ -238,7 +238,7 @@ class _Unrolled(torch.autograd.Function):
         for time in range(length):
             if joined is not None:
                 deter = steps.advance(joined, deter)
-            *latent, joined = run(pointwise.drawn, steps.read(deter, seen[time]), draws[time], acts[time])
+            *latent, joined = run(pointwise.sample_latent, steps.read(deter, seen[time]), draws[time], acts[time])
             read.append(latent)
         ctx.steps, ctx.draws, ctx.has_frames = steps, draws, has_frames
         ctx.set_materialize_grads(False)

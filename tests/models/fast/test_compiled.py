@@ -46,8 +46,8 @@ def weights():
     return found
 
 
-def asked(name):
-    """One call of each compiled rollout on some of the rows."""
+def make_call(name):
+    """A function that makes a compiled call with the same input every time, for some rows."""
     state, actions = start(), draw(ROWS, TIME, ACTION, seed=2)
 
     def imagined(weights, rows=slice(None)):
@@ -62,8 +62,10 @@ def asked(name):
 
 @pytest.mark.parametrize("name", ["imagine", "propose"])
 def test_compiled_call_computes_each_row_independently(weights, name):
-    ask = asked(name)
-    for whole, part, alone in zip(ask(weights), ask(weights, slice(30, 68)), ask(weights, slice(40, 41)), strict=True):
+    call = make_call(name)
+    for whole, part, alone in zip(
+        call(weights), call(weights, slice(30, 68)), call(weights, slice(40, 41)), strict=True
+    ):
         assert torch.equal(whole[30:68], part)
         assert torch.equal(whole[40:41], alone)
 
@@ -83,11 +85,11 @@ def test_fast_step_equals_a_rollout_of_one_step(weights):
 
 
 def test_compiled_rollout_does_not_depend_on_the_number_of_threads(weights):
-    ask, before = asked("imagine"), torch.get_num_threads()
+    call, before = make_call("imagine"), torch.get_num_threads()
     results = []
     for threads in (1, 3):
         torch.set_num_threads(threads)
-        results.append(ask(weights))
+        results.append(call(weights))
     torch.set_num_threads(before)
     assert all(torch.equal(left, right) for left, right in zip(*results, strict=True))
 

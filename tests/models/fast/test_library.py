@@ -6,7 +6,7 @@ import torch
 from latentplan.models.fast import library as kernels
 
 DTYPES = [torch.bfloat16, torch.float32]
-ROWS, SIZE = 37, 45  # neither is a multiple of what a vector holds
+ROWS, SIZE = 37, 45  # neither is a multiple of a vector's length
 
 
 @pytest.fixture
@@ -24,8 +24,8 @@ def norm(size):
     return 1.0 + 0.3 * draw(size, seed=1), 0.3 * draw(size, seed=2)
 
 
-def asked(name, dtype):
-    """One call of each kernel: what it makes of the same input whenever it is asked."""
+def make_call(name, dtype):
+    """A function that calls a kernel with the same input every time, for some rows."""
     if name == "norm_silu":
         return lambda row=slice(None): (kernels.norm_silu(4.0 * draw(ROWS, SIZE, dtype=dtype)[row] + 1.0, norm(SIZE)),)
     if name == "gates":
@@ -41,10 +41,10 @@ CASES = [(name, dtype) for name in ("norm_silu", "gates") for dtype in DTYPES] +
 @pytest.mark.usefixtures("compiled")
 @pytest.mark.parametrize(("name", "dtype"), CASES)
 def test_compiled_kernel_equals_torch(name, dtype, monkeypatch):
-    ask = asked(name, dtype)
-    fused = ask()
+    call = make_call(name, dtype)
+    fused = call()
     monkeypatch.setattr(kernels, "load", lambda: None)
-    for left, right in zip(fused, ask(), strict=True):
+    for left, right in zip(fused, call(), strict=True):
         assert left.dtype == right.dtype and left.shape == right.shape
         precision = 2e-2 if left.dtype == torch.bfloat16 else 2e-5
         assert torch.allclose(left.float(), right.float(), rtol=precision, atol=precision)
@@ -52,8 +52,8 @@ def test_compiled_kernel_equals_torch(name, dtype, monkeypatch):
 
 @pytest.mark.parametrize(("name", "dtype"), CASES)
 def test_kernel_computes_each_row_independently(name, dtype):
-    ask = asked(name, dtype)
-    for whole, part in zip(ask(), ask(slice(5, 6)), strict=True):
+    call = make_call(name, dtype)
+    for whole, part in zip(call(), call(slice(5, 6)), strict=True):
         # Torch takes the end of a tensor another way than its middle, which shows in the last bit.
         assert (
             torch.equal(whole[5:6], part) if kernels.load() else torch.allclose(whole[5:6], part, rtol=1e-2, atol=1e-6)
