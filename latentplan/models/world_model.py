@@ -33,7 +33,7 @@ class WorldModel(nn.Module):
         goal_dim: Width of the heads for goals (`GoalHeads`), which are trained after everything else; 0 for none.
 
     Attributes:
-        backend: Computes steps, rollouts and beliefs; plain torch unless `latentplan.models.fast.accelerate` chose another.
+        backend: Computes steps, rollouts and beliefs; the reference, or a faster one that `accelerate` chose.
     """
 
     label_scales: Tensor

@@ -7,7 +7,7 @@ from torch import nn
 from latentplan.config import ModelConfig
 from latentplan.models import State, WorldModel
 from latentplan.models.backend import Backend
-from latentplan.models.fast import CpuBackend, GpuBackend, library, rollout
+from latentplan.models.fast import CpuBackend, GpuBackend, accelerate, library, rollout
 
 ROWS, TIME, ACTION = 70, 4, 3  # three blocks of the compiled rollout, the last one of six rows
 SIZES = ModelConfig(
@@ -160,3 +160,9 @@ def test_cpu_backend_is_as_near_to_float32_as_the_reference_in_bfloat16(call, pa
         for found, by_reference, truth in parts:
             error, reference_error = ((part - truth).square().mean().sqrt() for part in (found, by_reference))
             assert found.dtype == torch.float32 and 0.0 < error < 1.2 * reference_error
+
+
+def test_accelerate_chooses_the_backend_of_the_device():
+    model = WorldModel(SIZES, ACTION)
+    assert type(model.backend) is Backend
+    assert accelerate(model) is model and type(model.backend) is CpuBackend
