@@ -119,7 +119,7 @@ def sizes(model: WorldModel) -> dict[str, int]:
 
 
 def _trace(model: WorldModel) -> ExportedProgram:
-    decision = _Decision(one_frame.lay_out(model), model.config.turns).eval()
+    decision = _Decision(one_frame.convert_weights(model), model.config.turns).eval()
     batch = Dim("batch", min=1)
     dynamic = {name: {0: batch} for name in INPUTS}
     with torch.no_grad():

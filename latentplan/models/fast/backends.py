@@ -11,7 +11,7 @@ from torch import Tensor, nn
 from latentplan.models.backend import Backend
 from latentplan.models.dynamics import Gaussian, Rssm, State
 from latentplan.models.fast import compiled, one_frame, pointwise, unroll
-from latentplan.models.fast import rollout as laid_out
+from latentplan.models.fast import rollout as rollouts
 from latentplan.models.world_model import WorldModel
 
 
@@ -58,7 +58,7 @@ class ConvertedWeights:
         return [owner[name] for owner, name in places[1] if owner[name] is not None]
 
 
-class _LaidOutBackend(Backend):
+class _ConvertingBackend(Backend):
     """Rollouts and single frames with weights that are converted once, for dynamics of the class `Rssm`."""
 
     def __init__(self, trunk_dtype: torch.dtype) -> None:
@@ -73,11 +73,11 @@ class _LaidOutBackend(Backend):
 
     def rollout(self, model: WorldModel, state: State, actions: Tensor) -> tuple[Tensor, State]:
         """See `Backend.rollout`; gradients do not reach the weights."""
-        return laid_out.imagine(self._weights(model), state, actions)
+        return rollouts.imagine(self._weights(model), state, actions)
 
     def propose(self, model: WorldModel, state: State, noise: Tensor) -> Tensor:
         """See `Backend.propose`; gradients do not reach the weights."""
-        return laid_out.propose(self._weights(model), state, noise)
+        return rollouts.propose(self._weights(model), state, noise)
 
     def advance(self, model: WorldModel, state: State, action: Tensor) -> Tensor:
         """See `Backend.advance`."""
@@ -91,15 +91,15 @@ class _LaidOutBackend(Backend):
         """See `Backend.act`."""
         return one_frame.act(self._frame_weights.of(model, torch.float32), state)
 
-    def _weights(self, model: WorldModel) -> laid_out.Weights:
+    def _weights(self, model: WorldModel) -> rollouts.Weights:
         kind = model.device.type
         with model.trunk_precision():
             dtype = torch.get_autocast_dtype(kind) if torch.is_autocast_enabled(kind) else torch.float32
-        weights: laid_out.Weights = self._rollout_weights.of(model, dtype)
+        weights: rollouts.Weights = self._rollout_weights.of(model, dtype)
         return weights
 
 
-class CpuBackend(_LaidOutBackend):
+class CpuBackend(_ConvertingBackend):
     """Rollouts, steps and values in one compiled call each, where the processor multiplies bfloat16; else torch."""
 
     def __init__(self) -> None:
@@ -122,7 +122,7 @@ class CpuBackend(_LaidOutBackend):
         return None if torch.is_grad_enabled() else self._weights(model).packed
 
 
-class GpuBackend(_LaidOutBackend):
+class GpuBackend(_ConvertingBackend):
     """Fewer kernels per step: the gradients of the recurrence are written out, and elementwise work is compiled.
 
     The trunk is float32, because converting operands takes longer than products of this size save. Where the tensors
@@ -164,8 +164,8 @@ def _rollout_parts(model: WorldModel) -> tuple[nn.Module, ...]:
     return model.dynamics, model.reward_head, model.value_head, model.actor
 
 
-def _convert_for_rollouts(model: WorldModel, dtype: torch.dtype) -> laid_out.Weights:
-    return laid_out.lay_out(model.dynamics, model.reward_head, model.value_head, model.actor, dtype)
+def _convert_for_rollouts(model: WorldModel, dtype: torch.dtype) -> rollouts.Weights:
+    return rollouts.convert_weights(model.dynamics, model.reward_head, model.value_head, model.actor, dtype)
 
 
 def _frame_parts(model: WorldModel) -> tuple[nn.Module, ...]:
@@ -173,4 +173,4 @@ def _frame_parts(model: WorldModel) -> tuple[nn.Module, ...]:
 
 
 def _convert_for_frames(model: WorldModel, dtype: torch.dtype) -> one_frame.FrameWeights:
-    return one_frame.lay_out(model)
+    return one_frame.convert_weights(model)

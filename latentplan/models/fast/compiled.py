@@ -49,7 +49,7 @@ def pack(weights: Weights, critic: tuple[Trunk, Tensor, Tensor]) -> Packed | Non
     """Weights for compiled calls; None if the processor, the dtype or the sizes of the model do not allow them.
 
     Args:
-        weights: Converted weights from `rollout.lay_out`.
+        weights: Converted weights from `rollout.convert_weights`.
         critic: Trunk, logits and shift of the value head, in the form that `weights` has for the reward head.
     """
     library = load()
@@ -82,7 +82,7 @@ def pack(weights: Weights, critic: tuple[Trunk, Tensor, Tensor]) -> Packed | Non
         *mlp(weights.actor, weights.actor_output, weights.actor_shift),
         *mlp(*critic),
     ]
-    return _lay_out(layers, weights.values, (action, latent, deter, hidden))
+    return _to_tiles(layers, weights.values, (action, latent, deter, hidden))
 
 
 def rollout(packed: Packed, deter: Tensor, stoch: Tensor, actions: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -137,7 +137,7 @@ def _padded(matrix: Tensor, dim: int) -> Tensor:
     return functional.pad(matrix, [0, 0] * (matrix.dim() - 1 - dim) + [0, missing])
 
 
-def _lay_out(
+def _to_tiles(
     layers: Sequence[tuple[Tensor, Tensor | None, Tensor]], values: Tensor, sizes: tuple[int, int, int, int]
 ) -> Packed:
     built, kept = [], [values]

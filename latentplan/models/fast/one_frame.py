@@ -56,7 +56,7 @@ class FrameWeights(NamedTuple):
 
 
 @torch.no_grad()
-def lay_out(model: WorldModel) -> FrameWeights:
+def convert_weights(model: WorldModel) -> FrameWeights:
     """The weights of a world model.
 
     On the CPU the weights share the model's memory. For this the model's convolutions are converted to the memory

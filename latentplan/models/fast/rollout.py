@@ -49,7 +49,7 @@ class Weights(NamedTuple):
 
 
 @torch.no_grad()
-def lay_out(dynamics: Rssm, head: ScalarHead, critic: ScalarHead, actor: Actor, dtype: torch.dtype) -> Weights:
+def convert_weights(dynamics: Rssm, head: ScalarHead, critic: ScalarHead, actor: Actor, dtype: torch.dtype) -> Weights:
     """Converted weights, with products in `dtype`; the norm of the gates and the outputs of heads are float32.
 
     Args:
@@ -104,7 +104,7 @@ def imagine(weights: Weights, state: State, actions: Tensor) -> tuple[Tensor, St
     """Rewards float32 (rows, time) along sequences, and the last state, float32.
 
     Args:
-        weights: Converted weights from `lay_out`.
+        weights: Converted weights from `convert_weights`.
         state: Start of every sequence, (rows, ...).
         actions: Actions in [-1, 1], (rows, time, action).
     """
@@ -123,7 +123,7 @@ def propose(weights: Weights, state: State, noise: Tensor) -> Tensor:
     """Actions of the actor along the mean of the prior, float32 (rows, time, action).
 
     Args:
-        weights: Converted weights from `lay_out`.
+        weights: Converted weights from `convert_weights`.
         state: Start of every sequence, (rows, ...).
         noise: Standard normal draws for its samples, zeros for its mode, (rows, time, action).
     """
