@@ -16,6 +16,7 @@ COMMANDS = {
     "train": "what an update costs, part by part, and how near it comes to what the machine can do",
     "render": "milliseconds per frame and change of the picture in each render quality",
     "decide": "milliseconds per decision of planner and actor",
+    "paths": "milliseconds of every fast path of the world model beside its reference in plain torch",
     "plan": "milliseconds per search beside other planners, on the same model with the same settings",
     "compile": "milliseconds per search in small models of one's own, stepped and with compile_rollout",
     "ablate": "what each part of a trained planner earns, in paired episodes",

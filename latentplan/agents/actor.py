@@ -9,7 +9,6 @@ from torch import Tensor
 from latentplan.agents.base import ModelAgent
 from latentplan.config import Config
 from latentplan.models import State, WorldModel
-from latentplan.models.fast import reflex
 from latentplan.models.heads import sample_action
 from latentplan.models.symmetry import flat, mean_over_turns
 
@@ -43,7 +42,8 @@ class ActorAgent(ModelAgent):
         return super().act(frame)
 
     def _choose(self, state: State) -> Tensor:
-        mean, std = (mean_over_turns(part, state) for part in reflex.act(self._weights, flat(state)))
+        raw = self.model.backend.act(self.model, flat(state))
+        mean, std = (mean_over_turns(part, state) for part in raw)
         if not self.explore:
             return mean
         return sample_action(mean, std, self.noise.draw(mean, self.generator, self._forget))

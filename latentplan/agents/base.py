@@ -12,8 +12,7 @@ from torch import Tensor
 from latentplan.agents.noise import CorrelatedNoise
 from latentplan.config import Config
 from latentplan.models import State, WorldModel
-from latentplan.models.fast import reflex
-from latentplan.models.symmetry import TurnedModel, flat, folded, per_turn, turned, unturned
+from latentplan.models.symmetry import TurnedModel, first_turn, flat, folded, per_turn, turned
 from latentplan.objectives.expression import Expression
 from latentplan.objectives.objective import plan_goals, read_goal_image
 from latentplan.planning import CEMPlanner
@@ -82,7 +81,6 @@ class ModelAgent:
         self.state: State | None = None
         self._action: Tensor | None = None
         self._forget: Tensor | None = None
-        self._weights = reflex.lay_out(model)
         self._turns = model.config.turns
         self.imagined: WorldModel | TurnedModel = model if self._turns == 1 else TurnedModel(model)
         self.seed(seed)
@@ -146,7 +144,7 @@ class ModelAgent:
 
     def _picture(self, state: State, actions: Tensor) -> np.ndarray:
         """The decoded end of a plan (batch, horizon, action), uint8 (32, 32, 3), of the first environment."""
-        first = State(*(part[:1] for part in unturned(state)))
+        first = State(*(part[:1] for part in first_turn(state)))
         self.steps_ahead = actions.shape[1]
         _, last = self.model.rollout(first, actions[:1].to(first.deter.dtype))
         return self.model.decoder.picture(last.features.float())[0].cpu().numpy()
@@ -172,20 +170,18 @@ class ModelAgent:
         return self.model.see(self.model.dynamics.initial(len(frames)).deter, frames).stoch
 
     def _believe(self, frames: Tensor) -> State:
-        if self.state is None or self.model.device.type != "cpu":  # elsewhere the weights do not follow the model's
-            self._weights = reflex.lay_out(self.model)
         if self.state is not None and len(self.state.deter) != len(frames):
             raise ValueError(f"got {len(frames)} frames after {len(self.state.deter)}: call reset() between batches")
         frames, turns = turned(frames, self._turns), self._turns
         if self.state is None or self._action is None:
             return folded(self._see(self.model.dynamics.initial(len(frames)).deter, frames), turns)
-        deter = reflex.advance(self._weights, flat(self.state), per_turn(self._action, turns))
+        deter = self.model.backend.advance(self.model, flat(self.state), per_turn(self._action, turns))
         if self._forget is not None:
             deter = torch.where(per_turn(self._forget, turns)[:, None], 0.0, deter)
         return folded(self._see(deter, frames), turns)
 
     def _see(self, deter: Tensor, frames: Tensor) -> State:
-        return reflex.see(self._weights, deter, frames)
+        return self.model.backend.see(self.model, deter, frames)
 
     def _check(self, frames: np.ndarray) -> Tensor:
         if frames.dtype != np.uint8 or frames.shape[1:] != (64, 64, 3):

@@ -17,6 +17,7 @@ from latentplan.agents.modes import MODES, make_agent
 from latentplan.config import Config, PlannerConfig, UserError, from_dict, to_dict
 from latentplan.config.planner import override_planner
 from latentplan.models import WorldModel
+from latentplan.models.fast import accelerate
 
 WEIGHTS = "weights.safetensors"
 INFO = "info.json"
@@ -112,7 +113,7 @@ def load_model(path: str | Path, device: str = "cpu") -> tuple[WorldModel, Confi
     if broken := _not_finite(state):
         raise UserError(f"{weights} cannot be used: {broken} is not finite")
     try:
-        return model.to(device), config, info
+        return accelerate(model.to(device)), config, info
     except (AssertionError, RuntimeError) as error:
         raise UserError(f"device {device!r} cannot be used: {str(error).splitlines()[0]}") from None
 

@@ -27,8 +27,8 @@ from torch.utils._pytree import tree_flatten, tree_unflatten
 from latentplan.agents.base import ModelAgent
 from latentplan.agents.checkpoint import load_model
 from latentplan.config import UserError, output_file
-from latentplan.models import State, WorldModel
-from latentplan.models.fast import reflex
+from latentplan.models import Rssm, State, WorldModel
+from latentplan.models.fast import one_frame
 from latentplan.models.symmetry import turned
 
 FORMATS = ("pt2", "onnx")
@@ -41,7 +41,7 @@ EXAMPLE_ROWS = 2  # a batch of one would be built into the program
 class _Decision(nn.Module):
     """One decision: belief update and actor, with a copy of their weights."""
 
-    def __init__(self, weights: reflex.Reflex, turns: int) -> None:
+    def __init__(self, weights: one_frame.FrameWeights, turns: int) -> None:
         super().__init__()
         self._turns = turns
         tensors, self._layout = tree_flatten(weights)
@@ -56,10 +56,10 @@ class _Decision(nn.Module):
         turns, (rows, size) = self._turns, action.shape
         taken = action[:, None].expand(-1, turns, -1).reshape(rows * turns, size)
         last = State(*(part.reshape(rows * turns, part.shape[1] // turns) for part in (deter, stoch)))
-        advanced = reflex.advance(weights, last, taken).reshape(rows, deter.shape[1])
+        advanced = one_frame.advance(weights, last, taken).reshape(rows, deter.shape[1])
         begun = torch.where(is_first[:, None], 0.0, advanced).reshape(last.deter.shape)
-        state = reflex.see(weights, begun, turned(frame, turns))
-        modes, _ = reflex.act(weights, state)
+        state = one_frame.see(weights, begun, turned(frame, turns))
+        modes, _ = one_frame.act(weights, state)
         mean = modes.reshape(rows, turns, size).mean(1)
         deters, stochs = (part.reshape(rows, part.shape[1] * turns) for part in state)
         return mean, deters, stochs
@@ -93,6 +93,10 @@ def export_actor(agent_or_checkpoint: ModelAgent | str | Path, path: str | Path,
         model = agent_or_checkpoint.model
     else:
         model, _, _ = load_model(agent_or_checkpoint)
+    if not isinstance(model.dynamics, Rssm):
+        raise UserError(
+            f"only agents with dynamics of the class Rssm can be exported, got {type(model.dynamics).__name__}"
+        )
     part = target.with_name(f".{target.name}.part")
     try:
         _write(_trace(model), model, part, format)
@@ -115,7 +119,7 @@ def sizes(model: WorldModel) -> dict[str, int]:
 
 
 def _trace(model: WorldModel) -> ExportedProgram:
-    decision = _Decision(reflex.lay_out(model), model.config.turns).eval()
+    decision = _Decision(one_frame.convert_weights(model), model.config.turns).eval()
     batch = Dim("batch", min=1)
     dynamic = {name: {0: batch} for name in INPUTS}
     with torch.no_grad():

@@ -20,6 +20,7 @@ from latentplan.config import USER_DOMAIN, Config, UserError, derive_seed
 from latentplan.config.files import dump_config, read_config
 from latentplan.envs import default_task
 from latentplan.models import WorldModel
+from latentplan.models.fast import accelerate
 from latentplan.replay.buffer import Replay
 from latentplan.training.callbacks import Experience, Record, Restore, Save, Stop, weights_of
 from latentplan.training.collection.collector import Description, EnvFactory
@@ -158,6 +159,7 @@ class _Run:
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(derive_seed(config.run.seed, "weights"))
             model = WorldModel(config.model, self.description.action_dim, self.description.labels).to(self.device)
+        accelerate(model)
         on = self.device if config.replay.on_device else torch.device("cpu")
         saved_replay = self.folder / "resume" / "replay"
         capacity, num_labels = replay_capacity(config, saved_replay), len(model.labels)

@@ -115,7 +115,7 @@ def counted_model_steps(model: WorldModel) -> Iterator[dict[str, int]]:
 
         return call
 
-    names = ("step", "rollout")
+    names = ("step", "fast_step", "rollout")
     for name in names:
         setattr(model, name, counting(getattr(model, name)))
     try:
@@ -131,9 +131,11 @@ def _load(flags: Flags, composed: Config | None, device: torch.device) -> tuple[
         import torch
 
         from latentplan.models import WorldModel
+        from latentplan.models.fast import accelerate
 
         torch.manual_seed(0)
-        return WorldModel(composed.model, action_size(flags, composed)).to(device), composed, UNTRAINED_DISCOUNT
+        model = accelerate(WorldModel(composed.model, action_size(flags, composed)).to(device))
+        return model, composed, UNTRAINED_DISCOUNT
     from latentplan.agents.checkpoint import load_model
 
     model, config, info = load_model(Path(flags["--checkpoint"]), str(device))

@@ -114,7 +114,7 @@ def measure_error(trial: Trial) -> Iterator[Row]:
 
 def _record(agent: Any, env: SuiteEnv, seed: int) -> tuple[list[Any], list[np.ndarray], list[float]]:
     """Beliefs of an episode, the action at each belief, and the reward that followed the action."""
-    from latentplan.models.symmetry import unturned
+    from latentplan.models.symmetry import first_turn
 
     beliefs, actions, rewards = [], [], []
     agent.reset()
@@ -122,7 +122,7 @@ def _record(agent: Any, env: SuiteEnv, seed: int) -> tuple[list[Any], list[np.nd
     is_over = False
     while not is_over:
         action = agent.act(frame)
-        beliefs.append(unturned(agent.state))
+        beliefs.append(first_turn(agent.state))
         actions.append(action)
         frame, reward, terminated, truncated, _ = env.step(action)
         rewards.append(reward)

@@ -4,6 +4,7 @@ import torch
 
 from latentplan.config import Config, ModelConfig, PlannerConfig
 from latentplan.models import WorldModel
+from latentplan.models.fast import accelerate
 
 SIZES = ModelConfig(deter_dim=16, hidden_dim=16, encoder_channels=(8, 8), decoder_channels=2, num_bins=15)
 CONFIG = Config(
@@ -15,7 +16,7 @@ CONFIG = Config(
 def make_model():
     """An untrained world model whose predicted rewards and actor's modes differ between states."""
     torch.manual_seed(0)
-    model = WorldModel(CONFIG.model, action_dim=2)
+    model = accelerate(WorldModel(CONFIG.model, action_dim=2))
     with torch.no_grad():
         model.reward_head.mlp.output.weight.normal_(std=0.3)
         model.actor.mlp.output.weight.normal_(std=0.3)

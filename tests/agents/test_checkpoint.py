@@ -13,6 +13,7 @@ from latentplan.agents.checkpoint import load_agent, load_model, read_info, reso
 from latentplan.agents.planning import PlanningAgent
 from latentplan.config import Config, EnvConfig, ModelConfig, PlannerConfig, UserError
 from latentplan.models import WorldModel
+from latentplan.models.fast import accelerate
 
 CONFIG = Config(
     env=EnvConfig(domain="cartpole", task="swingup"),
@@ -26,7 +27,7 @@ FRAMES = np.random.default_rng(0).integers(0, 256, (4, 64, 64, 3), dtype=np.uint
 @pytest.fixture(scope="module")
 def model():
     torch.manual_seed(0)
-    model = WorldModel(CONFIG.model, action_dim=2)
+    model = accelerate(WorldModel(CONFIG.model, action_dim=2))
     with torch.no_grad():
         model.reward_head.mlp.output.weight.normal_(std=0.3)
         # A checkpoint holds float16: weights that are float16 already come back exactly.

@@ -22,7 +22,8 @@ from latentplan.config import Config, derive_seed
 from latentplan.envs import make_env, make_from, make_vector_env, render_info
 from latentplan.evaluation.episodes import episode_seed, run_episodes
 from latentplan.models import WorldModel
-from latentplan.models.symmetry import unturned
+from latentplan.models.fast import accelerate
+from latentplan.models.symmetry import first_turn
 from latentplan.replay.buffer import Rows
 from latentplan.reporting.film import filming_if_possible
 from latentplan.training.collection.rewards import RewardCheck
@@ -94,7 +95,7 @@ class Collector:
         self._decisions: int | None = getattr(self._eval_env.unwrapped, "decisions_per_episode", None)
         self.discount = discount = config.learning.discount or _discount_for(self._decisions)
         self.labels: dict[str, float] = getattr(self._eval_env.unwrapped, "labels", {})
-        self.model = WorldModel(config.model, action_dim, self.labels).to(device)
+        self.model = accelerate(WorldModel(config.model, action_dim, self.labels).to(device))
         noise, correlation = config.collection.noise_std, config.collection.noise_correlation
         planner, for_goals = (
             PlanningAgent(self.model, config, discount, noise_std=noise, noise_correlation=correlation)
@@ -220,7 +221,7 @@ class Collector:
         frames, labels, first = self._frames.copy(), self._labels.copy(), self._ended.copy()
         actions = agent.act(frames)
         state = agent.state if isinstance(agent, ModelAgent) else None
-        deter = None if state is None else unturned(state).deter.float().cpu().numpy()
+        deter = None if state is None else first_turn(state).deter.float().cpu().numpy()
         self._frames, rewards, terminated, truncated, info = self.envs.step(actions)
         self._check(rewards, first)
         self._ended = terminated | truncated

@@ -19,8 +19,8 @@ from latentplan.config import GoalsConfig, LearningConfig, derive_seed
 from latentplan.models import State, WorldModel
 from latentplan.objectives.box import box_degree
 from latentplan.replay.buffer import Replay
-from latentplan.training.learner.losses import lambda_return, roll_out
-from latentplan.training.learner.optimization import descend, follow, return_scale
+from latentplan.training.learner.losses import draw_noise, entropy, lambda_return
+from latentplan.training.learner.optimization import descend, return_scale
 from latentplan.training.learner.snapshot import Snapshot
 
 RANGE = (0.005, 0.995)  # quantiles of the observed quantities, between which box centres are moved
@@ -152,21 +152,25 @@ class GoalLearner:
             worth = box_degree(low, high, self.model.goal_quantities(features[1:]), scales)
             values = self.target.value(features[1:], code)
         discounts = torch.full_like(worth, self.discount)
-        returns = lambda_return(self.frames_per_step * worth, discounts, values, self.learning.lambda_)
+        returns = self.model.backend.call(
+            lambda_return, self.frames_per_step * worth, discounts, values, self.learning.lambda_
+        )
         reach = torch.cat([torch.ones_like(discounts[:1]), discounts[:-1]]).cumprod(0)
         gains = returns / return_scale(self.return_range, returns.detach()) + settings.entropy_scale * entropies
         with self.model.trunk_precision():
-            logits = heads.judge(features[:-1].detach(), code)
+            logits = heads.value_logits(features[:-1].detach(), code)
         loss = (reach * (heads.value_head.loss(logits, returns.detach()) - gains)).mean()
         descend(self.optimizer, loss, self.learning.max_grad_norm, self.updates)
-        follow(self.target.parameters(), heads.parameters(), self.learning.target_rate)
+        self.model.backend.move_towards([*self.target.parameters()], [*heads.parameters()], self.learning.target_rate)
         self.updates += 1
         return {"worth": float(worth.detach().mean()), "entropy": float(entropies.detach().mean())}
 
     def imagine(self, start: State, code: Tensor, generator: torch.Generator) -> tuple[Tensor, Tensor]:
-        """What the actor for the boxes of a code does from rows of states; see `roll_out`."""
+        """What the actor for the boxes of a code does from rows of states; see `Dynamics.imagine`."""
         act = partial(self.model.goal_action, code=code)
-        return roll_out(self.dream, act, start, self.settings.horizon, generator)
+        noise = draw_noise(self.dream, self.settings.horizon, len(start.deter), generator)
+        features, std = self.dream.dynamics.imagine(act, start, *noise)
+        return features, entropy(std)
 
     def state_dict(self) -> dict[str, Any]:
         """The states of goal heads, target and optimizer, and the counters."""

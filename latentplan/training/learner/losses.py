@@ -6,7 +6,6 @@ that weighs it. A new loss needs nothing else than its function here and its set
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import NamedTuple
 
 import torch
@@ -15,8 +14,7 @@ from torch import Tensor
 
 from latentplan.config import LearningConfig
 from latentplan.models import Gaussian, State, WorldModel, kl_divergence
-from latentplan.models.fast import pointwise, unroll
-from latentplan.models.heads import MAX_ACTION_STD, MIN_ACTION_STD, Actor, ScalarHead, sample_action
+from latentplan.models.heads import MAX_ACTION_STD, MIN_ACTION_STD, Actor, ScalarHead
 from latentplan.replay.buffer import Batch
 from latentplan.training.learner.augmentation import random_shift
 from latentplan.training.learner.registry import BEHAVIOUR_LOSSES, WORLD_MODEL_LOSSES, register, weighted_sum
@@ -139,7 +137,7 @@ def world_model_loss(model: WorldModel, batch: Batch, config: LearningConfig, ge
     noise = torch.randn(
         size, frames_per_sequence, model.config.latent_dim, generator=generator, device=batch.frames.device
     )
-    states, posterior = unroll.observe(model.dynamics, embeddings, batch.actions, batch.deter, noise)
+    states, posterior = model.backend.observe(model, embeddings, batch.actions, batch.deter, noise)
     features = states.features
     overshooting, open_loop = _predict_open_loop(model, batch, states, posterior, config)
     with model.trunk_precision(cache=False):
@@ -252,57 +250,14 @@ def _replayed_value(behaviour: Behaviour) -> Tensor:
 def imagine(
     model: WorldModel, start: State, horizon: int, generator: torch.Generator, decay: float = 1.0
 ) -> Imagination:
-    """Roll the actor out in the model for `horizon` steps from rows of states; gradients and decay as in `roll_out`."""
-    if unroll.pays(start.deter):
-        action_noise, noise = _draws(model, horizon, len(start.deter), generator)
-        stacked, std = unroll.dream(model.dynamics, model.actor, start, action_noise, noise, decay)
-        entropies = _entropy(std)
-    else:
-        stacked, entropies = roll_out(model, model.actor, start, horizon, generator, decay)
+    """Roll the actor out in the model for `horizon` steps from rows of states; see `Dynamics.imagine`."""
+    stacked, std = model.backend.imagine(model, start, *draw_noise(model, horizon, len(start.deter), generator), decay)
     rewards = model.reward_head.mean(model.reward_head(stacked[1:]))
     continues = torch.sigmoid(model.continue_head(stacked[1:])).squeeze(-1)
-    return Imagination(stacked, rewards, continues, entropies)
+    return Imagination(stacked, rewards, continues, entropy(std))
 
 
-def roll_out(
-    model: WorldModel,
-    policy: Callable[[Tensor], tuple[Tensor, Tensor]],
-    start: State,
-    horizon: int,
-    generator: torch.Generator,
-    decay: float = 1.0,
-) -> tuple[Tensor, Tensor]:
-    """Follow samples of a policy and of the prior, with gradients through the dynamics.
-
-    The policy reads its state without a gradient, so that each action is credited along the dynamics alone
-    (Hafner et al. 2020, section 3).
-
-    Args:
-        model: What imagines.
-        policy: Mean and std of the action, (rows, action) each, for features (rows, feature).
-        start: Rows of states.
-        horizon: Steps.
-        generator: Of the samples.
-        decay: Share of a state's gradient that a step passes back to the state before, in [0, 1]. Where bodies touch,
-            gradients grow from step to step until they say nothing (Schrittwieser et al. 2020, appendix G, halve them).
-
-    Returns:
-        Features, the start first, (horizon + 1, rows, feature); entropies of the actions, in nats, (horizon, rows).
-    """
-    state, features, stds = start, [start.features], []
-    action_noise, noise = _draws(model, horizon, len(start.deter), generator)
-    for step in range(horizon):
-        mean, std = policy(features[-1].detach())
-        action = sample_action(mean, std, action_noise[step])
-        stds.append(std)
-        deter = model.dynamics.advance(State(*(_decayed(part, decay) for part in state)), action)
-        prior = model.dynamics.prior(deter)
-        state = State(deter, torch.addcmul(prior.mean, prior.std, noise[step]))
-        features.append(state.features)
-    return torch.stack(features), _entropy(torch.stack(stds))
-
-
-def _draws(model: WorldModel, horizon: int, rows: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:
+def draw_noise(model: WorldModel, horizon: int, rows: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:
     """Standard normal, for actions and latents, (horizon, rows, ...) each."""
     sizes = [model.action_dim, model.config.latent_dim]
     draws = torch.randn(horizon, rows, sum(sizes), generator=generator, device=model.device)
@@ -310,7 +265,7 @@ def _draws(model: WorldModel, horizon: int, rows: int, generator: torch.Generato
     return action_noise, noise
 
 
-def _entropy(std: Tensor) -> Tensor:
+def entropy(std: Tensor) -> Tensor:
     """Of Gaussian actions with a std (..., action), in nats, (...)."""
     return (std.log() + HALF_LOG_2_PI_E).sum(-1)
 
@@ -327,11 +282,6 @@ def lambda_return(rewards: Tensor, discounts: Tensor, values: Tensor, lambda_: f
     Returns:
         The return from state t on, (time, ...).
     """
-    returns: Tensor = pointwise.run(_lambda_return, rewards, discounts, values, lambda_)
-    return returns
-
-
-def _lambda_return(rewards: Tensor, discounts: Tensor, values: Tensor, lambda_: float) -> Tensor:
     following, returns = values[-1], []
     steps = zip(rewards.unbind(), discounts.unbind(), values.unbind(), strict=True)
     for reward, discount, value in reversed(list(steps)):
@@ -378,7 +328,7 @@ def _predict_open_loop(
         return sequence.unfold(1, horizon, horizon).movedim(-1, 2).flatten(0, 1)
 
     starts = [part[:, :-1].detach()[:, ::horizon][:, : length // horizon].flatten(0, 1) for part in states]
-    deter, prior = unroll.follow(model.dynamics, State(*starts), windows(batch.actions))
+    deter, prior = model.backend.predict(model, State(*starts), windows(batch.actions))
     seen = Gaussian(*(windows(part[:, 1:].detach()) for part in posterior))
     divergence = mean_within(_free_kl(seen, prior, config.free_nats), windows(batch.within))
     features = State(deter, prior.mean).features
@@ -401,11 +351,6 @@ def _probe_errors(model: WorldModel, features: Tensor, labels: Tensor) -> Tensor
 
 def _free_kl(left: Gaussian, right: Gaussian, free_nats: float) -> Tensor:
     return kl_divergence(left, right).clamp_min(free_nats)
-
-
-def _decayed(values: Tensor, share: float) -> Tensor:
-    """The same values, of whose gradient a share goes on."""
-    return values if share == 1.0 else values.detach().lerp(values, share)
 
 
 def _detached(gaussian: Gaussian) -> Gaussian:

@@ -25,7 +25,7 @@ from latentplan.training.learner.losses import (
     weighted_sum,
     world_model_loss,
 )
-from latentplan.training.learner.optimization import average, descend, follow, keep_freed_memory, return_scale
+from latentplan.training.learner.optimization import average, descend, keep_freed_memory, return_scale
 from latentplan.training.learner.snapshot import Snapshot
 
 MODEL, BEHAVIOUR = 0, 1  # the two halves of an update, of its parameters and of its optimizers
@@ -141,12 +141,13 @@ class Learner(lightning.LightningModule):
         loss, parts = self._behaviour_loss(learned, batch, generator)
         parts["behaviour_grad_norm"] = self._descend(self._optimizers()[BEHAVIOUR], loss)
         self._average(BEHAVIOUR)
-        follow(self.target_value.parameters(), self.model.value_head.parameters(), self.config.target_rate)
+        target, values = self.target_value.parameters(), self.model.value_head.parameters()
+        self.model.backend.move_towards([*target], [*values], self.config.target_rate)
         return parts
 
     def _average(self, half: int) -> None:
         running, latest = _halves(self.averaged)[half], _halves(self.model)[half]
-        average(running, latest, self.averaged_updates[half], self.config.average_rate)
+        average(self.model.backend, running, latest, self.averaged_updates[half], self.config.average_rate)
 
     def _optimizers(self) -> list[torch.optim.Optimizer]:
         optimizers = self.optimizers(use_pl_optimizer=False)
@@ -172,7 +173,7 @@ class Learner(lightning.LightningModule):
             )
             values = self.target_value.mean(self.target_value(dream.features[1:]))
         discounts = self.discount * dream.continues
-        returns = lambda_return(dream.rewards, discounts, values, config.lambda_)
+        returns = self.model.backend.call(lambda_return, dream.rewards, discounts, values, config.lambda_)
         reach = torch.cat([torch.ones_like(discounts[:1]), discounts[:-1]]).cumprod(0).detach()
         scale = return_scale(self.return_range, returns.detach())
         with self.model.trunk_precision(cache=False):
@@ -194,7 +195,7 @@ class Learner(lightning.LightningModule):
         with torch.no_grad():
             values = self.target_value.mean(self.target_value(features[1:]))
             discounts = self.discount * batch.continues.T
-            returns = lambda_return(batch.rewards.T, discounts, values, self.config.lambda_)
+            returns = self.model.backend.call(lambda_return, batch.rewards.T, discounts, values, self.config.lambda_)
         seen = torch.cat([features[:-1], predicted])
         targets = torch.cat([returns, torch.cat([returns, values[-1:]])[1 : len(predicted) + 1]])
         within = batch.within.T

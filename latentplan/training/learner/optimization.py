@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import ctypes
 import os
-from collections.abc import Iterable
+from collections.abc import Sequence
 from typing import Any
 
 import torch
 from torch import Tensor
+
+from latentplan.models.backend import Backend
 
 RETURN_RANGE_RATE = 0.01
 AVERAGED_SHARE = 0.1  # the average covers at most this share of all updates
@@ -66,29 +68,11 @@ def load_optimizer_state(optimizer: torch.optim.Optimizer, saved: dict[str, Any]
 
 
 @torch.no_grad()
-def follow(slow: Iterable[Tensor], fast: Iterable[Tensor], rate: float | Tensor) -> None:
-    """Move the parameters of a slow copy towards those that learn, by a share in [0, 1] of what is between them."""
-    behind, ahead = list(slow), list(fast)
-    if behind[0].is_cuda:
-        follow_together(behind, ahead, rate)
-        return
-    for one, other in zip(behind, ahead, strict=True):
-        one.lerp_(other, rate)
-
-
-@torch.no_grad()
-def follow_together(slow: list[Tensor], fast: list[Tensor], rate: float | Tensor) -> None:
-    """`follow` in a few kernels for all parameters, up to rounding."""
-    steps = torch._foreach_sub(fast, slow)
-    torch._foreach_mul_(steps, rate)
-    torch._foreach_add_(slow, steps)
-
-
-@torch.no_grad()
-def average(running: Iterable[Tensor], latest: Iterable[Tensor], count: Tensor, rate: float) -> None:
+def average(backend: Backend, running: Sequence[Tensor], latest: Sequence[Tensor], count: Tensor, rate: float) -> None:
     """Take the latest parameters into a running average over about the last tenth of all, and no more than 1 / rate.
 
     Args:
+        backend: Computes the average.
         running: The average.
         latest: The parameters as they are now.
         count: How many there have been before, a scalar; grows by one. On the parameters' device, so that a CUDA graph
@@ -96,7 +80,7 @@ def average(running: Iterable[Tensor], latest: Iterable[Tensor], count: Tensor, 
         rate: The least weight of the latest; with 1 there is no averaging.
     """
     count += 1.0
-    follow(running, latest, (1.0 / (AVERAGED_SHARE * count)).clamp(rate, 1.0))
+    backend.move_towards(running, latest, (1.0 / (AVERAGED_SHARE * count)).clamp(rate, 1.0))
 
 
 def return_scale(range_so_far: Tensor, returns: Tensor) -> Tensor:

@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from latentplan.models import Gaussian, State, WorldModel, kl_divergence
-from latentplan.training.learner.losses import imagine, imitation_loss, lambda_return, roll_out, world_model_loss
+from latentplan.training.learner.losses import draw_noise, imagine, imitation_loss, lambda_return, world_model_loss
 from latentplan.training.learner.optimization import return_scale
 
 
@@ -136,7 +136,8 @@ def gradients_of_the_end(model, decay):
     means = torch.zeros(4, 3, 1, requires_grad=True)
     actions = iter(means)
     start = State(torch.zeros(3, 16), torch.zeros(3, 32))
-    features, _ = roll_out(model, lambda _: (next(actions), torch.ones(3, 1)), start, 4, stream(), decay)
+    noise = draw_noise(model, 4, 3, stream())
+    features, _ = model.dynamics.imagine(lambda _: (next(actions), torch.ones(3, 1)), start, *noise, decay)
     features[-1].square().sum().backward()
     return features, means.grad
 

@@ -6,6 +6,7 @@ import pytest
 import torch
 
 from latentplan.models import WorldModel
+from latentplan.models.fast import accelerate
 from latentplan.replay.buffer import Replay
 from latentplan.training.learner.module import Learner
 from latentplan.training.state import restore
@@ -22,7 +23,7 @@ class Standalone(Learner):
 def standalone(tiny, **learning):
     torch.manual_seed(0)
     config = tiny("", learning=learning)
-    model = WorldModel(config.model, action_dim=1)
+    model = accelerate(WorldModel(config.model, action_dim=1))
     return Standalone(model, config.learning, 0.9, Replay(24, 1, 16, 1, torch.device("cpu")), seed=0)
 
 

@@ -4,9 +4,6 @@ import json
 import platform
 
 import pytest
-import torch
-
-from latentplan.training.learner.optimization import follow, follow_together
 
 BLOCK = 30_000_000
 
@@ -47,14 +44,3 @@ def test_keep_freed_memory_serves_large_tensors_from_the_heap(run_python):
     assert mapped_before >= BLOCK, "an allocation of this size is mapped anew and handed back"
     assert mapped == 0, "it comes from the heap"
     assert kept >= BLOCK, "and stays there"
-
-
-@pytest.mark.parametrize("rate", [0.25, torch.tensor(0.25)])
-def test_a_slow_copy_follows_all_at_once_as_one_by_one(rate):
-    torch.manual_seed(0)
-    slow, fast = ([torch.randn(3), torch.randn(2, 2)] for _ in range(2))
-    expected = [part.clone() for part in slow]
-    follow(expected, fast, rate)
-    follow_together(slow, fast, rate)
-    for one, other in zip(slow, expected, strict=True):
-        torch.testing.assert_close(one, other)
