@@ -16,7 +16,7 @@ from latentplan.models.symmetry import TurnedModel, flat, folded, per_turn, turn
 from latentplan.objectives.expression import Expression
 from latentplan.objectives.image import read_goal
 from latentplan.objectives.objective import plan_goals
-from latentplan.planning import CEMPlanner
+from latentplan.planning import Planner
 from latentplan.planning.objectives import Constraint, Term
 
 
@@ -119,7 +119,7 @@ class ModelAgent:
         return self.model.decoder.picture(last.features.float())[0].cpu().numpy()
 
     def _plan_goals(
-        self, objective: str | Expression | Term | None, constraints: str | Sequence[Constraint], planner: CEMPlanner
+        self, objective: str | Expression | Term | None, constraints: str | Sequence[Constraint], planner: Planner
     ) -> tuple[Term | None, Sequence[Constraint]]:
         return plan_goals(
             objective,

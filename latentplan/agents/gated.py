@@ -16,8 +16,7 @@ from latentplan.config import Config, PlannerConfig
 from latentplan.models import State, WorldModel, kl_divergence
 from latentplan.models.symmetry import flat, mean_over_turns
 from latentplan.objectives.expression import Expression
-from latentplan.planning.conditioned import seen_for
-from latentplan.planning.objectives import Constraint, Term
+from latentplan.planning.objectives import Constraint, Term, seen_for
 
 SIGNALS = ("mismatch", "value", "both", "random")
 GAP_STEPS = 2  # a step of imagination costs as much as seeing the frame

@@ -32,10 +32,17 @@ from latentplan.objectives.expression import (
     walk,
 )
 from latentplan.objectives.parser import parse_constraints, parse_objective
-from latentplan.planning.conditioned import conditioned
 from latentplan.planning.model import supports
-from latentplan.planning.objectives import Constraint, Objective, Rollout, Term, predicted_return, terminal_value
-from latentplan.planning.search.cem import CEMPlanner
+from latentplan.planning.objectives import (
+    Constraint,
+    Objective,
+    Rollout,
+    Term,
+    conditioned,
+    predicted_return,
+    terminal_value,
+)
+from latentplan.planning.search.registry import Planner
 
 CAUTION = 0.1  # margins that a plan stays away from where a constraint would break
 GUIDANCE = 0.25  # what the end of a plan counts, of what the plan would earn at the learned rate of reward
@@ -48,7 +55,7 @@ def plan_goals(
     *,
     model: Any,
     env: EnvConfig,
-    planner: CEMPlanner,
+    planner: Planner,
     encode_goal: Callable[[str], Tensor],
 ) -> tuple[Term | None, Sequence[Constraint]]:
     """What a planner is given for goals written as text.

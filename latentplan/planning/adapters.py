@@ -57,13 +57,17 @@ class CEMTrajectoryOptimizer:
         self.smoothing = smoothing
         self.action_low = action_low
         self.action_high = action_high
+        half_range = torch.as_tensor(action_high, dtype=torch.float64).sub(torch.as_tensor(action_low)) / 2
         self._planner = CEMPlanner(
             action_dim=action_dim,
             horizon=horizon,
             num_samples=num_candidates,
             num_elites=num_elites,
             num_iterations=num_iterations,
+            warm_start_iterations=num_iterations,
             smoothing=smoothing,
+            init_std=half_range,
+            min_std=0.0,
             action_low=action_low,
             action_high=action_high,
         )

@@ -16,7 +16,7 @@ from latentplan.planning.adapters import CEMTrajectoryOptimizer, RolloutControll
 from latentplan.planning.model import Model, State, count_rows, state_device
 from latentplan.planning.objectives import Constraint, Term
 from latentplan.planning.plan import Plan
-from latentplan.planning.search.cem import CEMPlanner
+from latentplan.planning.search.registry import Planner
 from latentplan.planning.search.sampling import Generators
 
 
@@ -45,7 +45,7 @@ class ModelPredictiveController:
 
     def __init__(
         self,
-        planner: CEMPlanner,
+        planner: Planner,
         model: Model,
         *,
         objective: Term | None = None,

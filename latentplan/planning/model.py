@@ -30,6 +30,7 @@ from torch import Tensor
 from torch.utils._pytree import tree_leaves, tree_map
 
 State = Any  # a tensor, or a pytree (tuple, NamedTuple, dict, list) of tensors, dim 0 = rows
+Bound = float | Sequence[float] | Tensor  # one number, or one per action dimension
 
 
 class Model(Protocol):

@@ -25,6 +25,7 @@ from latentplan.planning.model import Model, State, check_shape, require, suppor
 
 Term = Callable[["Rollout"], Tensor]
 Constraint = Callable[["Rollout"], Tensor]
+View = Callable[[Model], Model]
 
 
 @dataclass(frozen=True)
@@ -71,7 +72,7 @@ class Objective:
     needs_states: bool = False
     num_particles: int = 1
     needs: tuple[str, ...] = ()
-    view: Callable[[Model], Model] | None = None
+    view: View | None = None
 
     def __call__(self, rollout: Rollout) -> Tensor:
         """The term's value for each row, (rows,)."""
@@ -200,6 +201,31 @@ def at_every_state(function: Callable[[State], Tensor]) -> Objective:
     return Objective(partial(_excess, function), needs_states=True)
 
 
+def conditioned(view: View) -> Objective:
+    """The return of a goal that the model has learned to pursue: the goal's reward, and its value at the end.
+
+    A goal-conditioned model has a reward, a value and a policy for each goal of a family; a view of it has those of one
+    goal. A search for `conditioned(view)` alone runs in the view: the goal's policy makes proposals, and plans have
+    `horizon` steps. In a sum, `conditioned(view)` is scored in rollouts of the model, as every other term is.
+
+    Args:
+        view: `view(model)` returns a model with the same states and steps, but with the reward, the `value` and, for
+            proposals, the `policy` of the goal.
+    """
+    return Objective(partial(_conditioned_return, view), needs_states=True, view=view)
+
+
+def seen_for(model: Model, objective: Term | None) -> tuple[Model, Term | None]:
+    """Returns the model to search in and the objective to search for.
+
+    For a learned goal alone the model is the goal's view, and the objective is None, the view's own return.
+    """
+    view = objective.view if isinstance(objective, Objective) else None
+    if view is None:
+        return model, objective
+    return (model.shown_as(view) if supports(model, "shown_as") else view(model)), None  # type: ignore[attr-defined]
+
+
 def predicted_return(model: Model, use_value: bool | None) -> Objective:
     """The default objective: reward, and the terminal value if asked for (None: if the model has one)."""
     if use_value is None:
@@ -292,6 +318,16 @@ def _worst(inner: Term, share: float, rollout: Rollout) -> Tensor:
     # NaN sorts as the largest number: without this it would hide among the particles that do not count.
     worst = worst.masked_fill(values.isnan().any(dim=1), float("nan"))
     return repeat(worst, "row -> (row particle)", particle=rollout.num_particles)
+
+
+def _conditioned_return(view: View, rollout: Rollout) -> Tensor:
+    seen = view(rollout.model)
+    require(seen, "value", "a learned goal")
+    before = (rollout.start, *rollout.states[:-1])
+    pairs = zip(before, rollout.actions.unbind(1), strict=True)
+    rewards = torch.stack([seen.step(state, action)[1] for state, action in pairs], dim=1).to(rollout.rewards.dtype)
+    value: Tensor = seen.value(rollout.last_state).to(rewards.dtype)  # type: ignore[attr-defined]
+    return (rewards * rollout.weights[..., :-1]).sum(dim=1) + rollout.weights[..., -1] * value
 
 
 def _excess(function: Callable[[State], Tensor], rollout: Rollout) -> Tensor:

@@ -117,13 +117,11 @@ class WarmStart:
 
     Attributes:
         mean: Shifted plan with its tail filled, zeros where cold, within the bounds, (batch, horizon, action).
-        var: Variance to search with, (batch, horizon, action).
         elites: Shifted elites, (batch, kept, horizon, action), if any were kept.
         is_warm: (batch,) bool on the CPU.
     """
 
     mean: Tensor
-    var: Tensor
     elites: Tensor | None
     is_warm: Tensor
 
@@ -133,8 +131,6 @@ def shift_plan(
     *,
     horizon: int,
     tail: str,
-    variance: str,
-    initial_var: Tensor,
     bounds: tuple[Tensor, Tensor],
     policy_tail: Callable[[Tensor, Tensor], Tensor],
 ) -> WarmStart:
@@ -144,8 +140,6 @@ def shift_plan(
         previous: The last plan, of any length.
         horizon: Actions of the next one.
         tail: `zero`, `hold` (the last action again) or `policy`.
-        variance: `reset` to the initial variance, `keep`, or `inflate` halfway between the two.
-        initial_var: Variance of a cold start, (action,).
         bounds: Lowest and highest action, each (action,).
         policy_tail: `policy_tail(sequence, is_tail) -> sequence` fills by the model's policy.
     """
@@ -167,14 +161,8 @@ def shift_plan(
         mean = policy_tail(mean, is_tail)
     mean = torch.where(is_warm, mean, 0.0).clamp(low, high)
 
-    var = initial_var.expand_as(mean)
-    if variance != "reset":
-        kept = torch.where(is_tail, var, move(previous.var))
-        kept = kept if variance == "keep" else (kept + var) / 2
-        var = torch.where(is_warm, kept, var)
-
     elites = previous.elites
     if elites is not None:
         elites = torch.take_along_dim(elites, index[:, None], dim=2).to(low.dtype)
         elites = torch.where(is_tail[:, None], mean[:, None], elites).clamp(low, high)
-    return WarmStart(mean, var, elites, previous.is_warm)
+    return WarmStart(mean, elites, previous.is_warm)

@@ -249,7 +249,7 @@ def test_what_cannot_be_decided_leaves_the_plans_as_they_are(states, point, make
 
 
 def test_a_plan_goes_on_in_another_precision(states, make_controller):
-    controller = make_controller(keep_elite_fraction=0.5, warm_start_variance="keep")
+    controller = make_controller(keep_elite_fraction=0.5)
     assert controller.act(states.double()).dtype == torch.float64
     assert controller.act(states).dtype == torch.float32
     assert controller.act(states.double()).dtype == torch.float64

@@ -121,8 +121,8 @@ def test_own_arms_lay_typed_settings_over_the_planner():
 
 
 def test_without_the_actor_nothing_of_the_search_asks_it():
-    _, arm = parse_arms("no_actor", replace(PLANNER, start="policy", tail="policy", surprise_limit=2.0))
-    assert arm.planner == {"num_policy_samples": 0, "start": "shifted", "tail": "zero", "surprise_limit": None}
+    _, arm = parse_arms("no_actor", replace(PLANNER, tail="policy", surprise_limit=2.0))
+    assert arm.planner == {"num_policy_samples": 0, "tail": "zero", "surprise_limit": None}
 
 
 @pytest.mark.parametrize(

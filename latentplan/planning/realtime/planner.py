@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from multiprocessing.context import SpawnProcess
 from queue import Empty, SimpleQueue
 from types import TracebackType
-from typing import Any, Protocol
+from typing import Any
 
 from torch import Tensor
 from torch.utils._pytree import tree_map
@@ -28,26 +28,9 @@ from latentplan.planning.realtime.worker import (
     end,
     start_process,
 )
-from latentplan.planning.search.sampling import Generators
+from latentplan.planning.search.registry import SupportsPlan
 
 WORKERS = ("process", "thread")
-
-
-class Planner(Protocol):
-    """Whatever searches like `CEMPlanner.plan`."""
-
-    def plan(
-        self,
-        model: Any,
-        state: State,
-        previous: Plan | None = None,
-        *,
-        objective: Term | None = None,
-        constraints: Sequence[Constraint] = (),
-        generator: Generators = None,
-    ) -> Plan:
-        """The best plan from each state."""
-        ...
 
 
 class PlanBuffer:
@@ -154,7 +137,7 @@ class BackgroundPlanner:
 
     def __init__(
         self,
-        planner: Planner,
+        planner: SupportsPlan,
         model: Model,
         *,
         objective: Term | None = None,

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple, Protocol
 
 import torch
 from torch import Tensor
+from torch.utils._pytree import tree_map
 
-from latentplan.planning.conditioned import seen_for
 from latentplan.planning.model import (
     Model,
     State,
@@ -20,11 +20,10 @@ from latentplan.planning.model import (
     supports,
     take_step,
 )
-from latentplan.planning.objectives import Constraint, Term
+from latentplan.planning.objectives import Constraint, Term, seen_for
 from latentplan.planning.plan import Plan
-from latentplan.planning.realtime.nominal import NominalTrajectory
 from latentplan.planning.realtime.planner import PlanBuffer
-from latentplan.planning.search.cem import CEMPlanner
+from latentplan.planning.search.registry import Planner
 
 NUM_LATENCIES = 16
 
@@ -78,7 +77,7 @@ class PlanScheduler:
         1. polls the executor, and puts a finished plan into the buffer at the tick it was asked for;
         2. takes this tick's action from the buffer, or from the model's policy (zeros without one) if it has none; an
            action from the buffer gets what the policy does differently here than where the plan expected to be (see
-           `latentplan.planning.realtime.nominal`; nothing without a policy);
+           `NominalTrajectory`; nothing without a policy);
         3. if the executor is idle, asks for the next plan: it predicts how many ticks that takes, rolls the state
            forward by the actions these ticks will take (this one, then the buffer's, then the policy's), and requests
            a plan from there, warm-started from the last one shifted to the same tick.
@@ -103,7 +102,7 @@ class PlanScheduler:
 
     def __init__(
         self,
-        planner: CEMPlanner,
+        planner: Planner,
         model: Model,
         executor: PlanExecutor,
         *,
@@ -235,3 +234,47 @@ class PlanScheduler:
         bounds: Any = (planner.action_low, planner.action_high)
         low, high = (per_dimension(bound, planner.action_dim, "bounds").to(device, dtype) for bound in bounds)
         return low, high
+
+
+class NominalTrajectory:
+    """The states that a plan predicts, imagined as far as they are needed.
+
+    A plan is made for a predicted state and executed in another one. The policy is a feedback law: its action in the
+    real state minus its action in the predicted state, added to the planned action, answers what the plan could not
+    foresee, and is 0 where the model was right. The form is `u = u_plan + pi(x) - pi(x_plan)` of optimal control, there
+    with a linear law (Tassa et al. 2012, "Synthesis and stabilization of complex behaviors through online trajectory
+    optimization", equation 8).
+
+    Args:
+        model: The model that predicts the states.
+        start: Start of the plan, rows (batch,).
+        actions: The plan, (batch, horizon, action).
+    """
+
+    def __init__(self, model: Model, start: State, actions: Tensor) -> None:
+        self.model, self.actions = model, actions
+        self._states = [start]
+
+    def state_at(self, age: int) -> State:
+        """Returns the predicted state after `age` actions of the plan, rows (batch,)."""
+        while len(self._states) <= age:
+            following, _ = take_step(self.model, self._states[-1], self.actions[:, len(self._states) - 1])
+            self._states.append(following)
+        return self._states[age]
+
+    def correct(self, age: int, state: State, policy: Callable[[State], Tensor]) -> Tensor:
+        """Returns the plan's action of this age with the policy's correction, (batch, action).
+
+        Args:
+            age: Index of the action in the plan.
+            state: Believed state of each environment, rows (batch,).
+            policy: Returns the policy's mode (rows, action).
+
+        Returns:
+            Actions, which the caller clamps into the bounds; the plan's own where the policy is not finite.
+        """
+        both = tree_map(lambda here, there: torch.cat([here, there]), state, self.state_at(age))
+        here, there = policy(both).chunk(2)
+        answer = here - there
+        planned = self.actions[:, age]
+        return planned + torch.where(torch.isfinite(answer), answer, 0.0)

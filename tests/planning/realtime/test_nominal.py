@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from latentplan.planning import CEMPlanner, FunctionModel, PlanScheduler
-from latentplan.planning.realtime.nominal import NominalTrajectory
+from latentplan.planning.realtime.scheduler import NominalTrajectory
 
 GAIN = -0.5
 PLAN = torch.tensor([[[0.4], [-0.2], [0.1]], [[0.0], [0.3], [0.9]]])

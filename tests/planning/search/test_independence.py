@@ -28,7 +28,7 @@ def pick(plan, index):
     )
 
 
-RICH = {"num_policy_samples": 6, "keep_elite_fraction": 0.3, "noise_beta": 1.0, "start": "both", "tail": "policy"}
+RICH = {"num_policy_samples": 6, "keep_elite_fraction": 0.3, "noise_beta": 1.0, "tail": "policy"}
 
 
 @pytest.mark.parametrize("options", [{}, RICH])
