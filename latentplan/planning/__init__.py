@@ -1,6 +1,6 @@
 """Planning in any model: cross-entropy search, objectives, constraints and receding-horizon control.
 
-Imports torch and einops, and of this project only the settings.
+The package imports torch and einops, and only the settings from the rest of this project.
 """
 
 from latentplan.planning.adapters import CEMTrajectoryOptimizer

@@ -168,7 +168,9 @@ def test_coloured_noise_has_unit_variance_and_more_likeness_between_steps(beta):
 
 
 def test_mppi_equals_its_formula(point, states, seeded):
-    planner = mppi_planner(action_dim=2, horizon=4, num_samples=128, num_policy_samples=0, temperature=0.5, init_std=0.4)
+    planner = mppi_planner(
+        action_dim=2, horizon=4, num_samples=128, num_policy_samples=0, temperature=0.5, init_std=0.4
+    )
     plan = planner.plan(point, states[:1], generator=seeded())
     streams = Streams(seeded(), 1, torch.device("cpu"))
     candidates = (0.4 * streams.noise(128, 4, 2, 0.0, torch.float32)[0]).clamp(-1, 1)
