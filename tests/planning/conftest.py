@@ -1,4 +1,4 @@
-"""Small analytic models that the planner's laws are tested on."""
+"""Small analytic models for the tests of planners."""
 
 import pytest
 import torch

@@ -85,7 +85,7 @@ class PlanBuffer:
         return action, "plan" if age <= self.fresh_ticks else "tail", age
 
     def peek(self, tick: int) -> tuple[Tensor, int] | None:
-        """Returns the action (..., action) that the present plans have for a later tick, and its age; None without one."""
+        """Returns the action (..., action) of the present plans at a later tick, and its age; None without a plan."""
         found = self._find(tick)
         return None if found is None else self._action(found, tick)
 

@@ -33,7 +33,7 @@ Goals = tuple[Any, Any]  # objective, constraints
 
 
 class Request(NamedTuple):
-    """A search request; `goals`, pickled or not, replace objective and constraints from this search on, None keeps them."""
+    """A search request; `goals`, pickled or not, replace objective and constraints from now on; None keeps them."""
 
     state: State
     tick: int

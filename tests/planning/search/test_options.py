@@ -136,13 +136,13 @@ def test_tail_fills_the_end_of_the_shifted_plan(point, states, make_planner, see
         assert (end == 0).all()
 
 
-def test_a_warm_start_resets_the_variance(point, states, make_planner, seeded):
+def test_warm_start_resets_the_variance(point, states, make_planner, seeded):
     last = make_planner().plan(point, states, generator=seeded())
     plan = make_planner(num_iterations=1, smoothing=1e-9).plan(point, states, last, generator=seeded())
     torch.testing.assert_close(plan.var, torch.ones_like(plan.var))
 
 
-def test_without_policy_samples_the_policy_is_not_called(point, states, make_planner, seeded):
+def test_policy_is_not_called_when_num_policy_samples_is_0(point, states, make_planner, seeded):
     def forbidden(state, generator):
         raise AssertionError("the policy was called")
 
@@ -150,14 +150,14 @@ def test_without_policy_samples_the_policy_is_not_called(point, states, make_pla
     make_planner(num_policy_samples=0, final="better").plan(model, states, generator=seeded())
 
 
-def test_warm_and_cold_environments_get_their_own_iterations(point, states, make_planner, seeded):
+def test_warm_and_cold_environments_have_their_own_iterations(point, states, make_planner, seeded):
     planner = make_planner(num_iterations=5, warm_start_iterations=2)
     last = planner.plan(point, states, generator=seeded()).forget(torch.tensor([1, 0, 0, 1, 0]).bool())
     assert planner.plan(point, states, last, generator=seeded()).info["iterations"].tolist() == [5, 2, 2, 5, 2]
 
 
 @pytest.mark.parametrize("beta", [0.0, 1.0, 3.0])
-def test_coloured_noise_has_unit_variance_and_more_likeness_between_steps(beta):
+def test_coloured_noise_has_unit_variance_and_correlated_steps(beta):
     streams = Streams(torch.Generator().manual_seed(0), 1, torch.device("cpu"))
     noise = streams.noise(20_000, 12, 1, beta, torch.float64)[0, :, :, 0]
     torch.testing.assert_close(noise.var(dim=0), torch.ones(12, dtype=torch.float64), atol=0.05, rtol=0)
@@ -187,7 +187,7 @@ def test_mppi_equals_its_formula(point, states, seeded):
     torch.testing.assert_close(plan.var, torch.full_like(plan.var, 0.16))
 
 
-def test_a_lower_temperature_trusts_the_best_more(point, states, seeded):
+def test_lower_temperature_raises_the_expected_return(point, states, seeded):
     values = [
         mppi_planner(action_dim=2, horizon=4, temperature=temperature).plan(point, states, generator=seeded())
         for temperature in (0.1, 1.0, 10.0)
@@ -248,7 +248,7 @@ def test_gradient_steps_work_under_inference_mode_and_refuse_what_cannot_be_diff
         planner.plan(blind, states, generator=seeded())
 
 
-def test_refits_of_a_plan_are_the_public_equation(seeded):
+def test_planner_iteration_equals_refit_of_its_candidates(seeded):
     """One iteration of the planner is `refit` of the candidates it drew."""
     seen = []
 
@@ -267,7 +267,7 @@ def test_refits_of_a_plan_are_the_public_equation(seeded):
     torch.testing.assert_close((plan.mean[0], plan.var[0]), (mean, var))
 
 
-def test_nothing_leaves_the_bounds_not_even_by_rounding(seeded):
+def test_actions_stay_within_bounds_when_rounded(seeded):
     options = {"final": "best", "num_iterations": 6, "temperature": 1.0, "smoothing": 1.0}
     planner = CEMPlanner(
         action_dim=1, horizon=3, num_samples=100, num_elites=10, action_low=1.2, action_high=1.7, **options
@@ -278,7 +278,7 @@ def test_nothing_leaves_the_bounds_not_even_by_rounding(seeded):
         assert plan.actions.min() >= torch.tensor(1.2) and plan.actions.max() <= torch.tensor(1.7)
 
 
-def test_a_refinement_that_finds_nothing_leaves_what_was_found(seeded):
+def test_gradient_steps_keep_the_result_when_refinement_is_nan(seeded):
     model = FunctionModel(
         lambda state, action: state,
         lambda state, action: torch.where((action[:, 0] > 0.5) | (action[:, 0] < -0.5), action[:, 0].abs(), torch.nan),
@@ -289,12 +289,12 @@ def test_a_refinement_that_finds_nothing_leaves_what_was_found(seeded):
 
 
 @pytest.mark.parametrize("name", ["horizon", "num_samples", "action_dim"])
-def test_sizes_are_whole_numbers(name):
+def test_planner_refuses_sizes_that_are_not_whole(name):
     sizes = {"action_dim": 2, "horizon": 3, "num_samples": 16, "num_elites": 4}
     with pytest.raises(ValueError, match=f"{name} must be a whole number"):
         CEMPlanner(**sizes | {name: float(sizes[name])})
 
 
-def test_a_state_without_rows_is_refused(point, make_planner):
+def test_plan_refuses_a_state_without_rows(point, make_planner):
     with pytest.raises(ValueError, match="at least one row"):
         make_planner().plan(point, torch.zeros(0, 4))
