@@ -101,12 +101,13 @@ def make_planner(name: str, options: SearchOptions | None = None, **settings: An
             of `options` and of the planner, their default values included.
 
     Raises:
-        ValueError: There is no planner of this name, or an option has a value that is not allowed.
+        UserError: There is no planner of this name; the message names the nearest one.
+        ValueError: An option has a value that is not allowed.
     """
     if name not in PLANNERS:
         nearest = difflib.get_close_matches(name, PLANNERS, n=1, cutoff=0.5)
         hint = f"; did you mean {nearest[0]!r}?" if nearest else ""
-        raise ValueError(f"unknown planner {name!r}; available: {', '.join(PLANNERS)}{hint}")
+        raise UserError(f"unknown planner {name!r}; available: {', '.join(PLANNERS)}{hint}")
     changed: dict[str, Any] = {}
     if options is not None:
         fields = dataclasses.fields(SearchOptions)

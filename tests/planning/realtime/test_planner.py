@@ -72,8 +72,10 @@ MODEL = FunctionModel(dynamics, reward, policy=policy)
 
 @pytest.fixture(scope="module")
 def process():
-    """A background planner in a process, ready and shared, because a process first imports torch for seconds."""
-    with start(Scripted()) as background:
+    """A background planner in a process, interrupted while it starts; shared, because a process imports torch first."""
+    with BackgroundPlanner(Scripted(), MODEL) as background:
+        os.kill(background.process.pid, signal.SIGINT)
+        assert background.wait_until_ready(STARTING_SECONDS)
         yield background
 
 
@@ -202,12 +204,10 @@ def test_process_ends_when_its_planner_is_dropped():
     assert not process.is_alive()
 
 
-def test_process_survives_an_interrupt_while_it_starts():
-    with BackgroundPlanner(CEM, MODEL) as background:
-        os.kill(background.process.pid, signal.SIGINT)
-        assert background.wait_until_ready(STARTING_SECONDS) and background.process.is_alive()
-        background.request(STATE, 0)
-        assert wait_for_plan(background)[0] == 0
+def test_process_survives_an_interrupt_while_it_starts(process):
+    assert process.process.is_alive()
+    process.request(STATE, 0)
+    assert wait_for_plan(process)[0] == 0
 
 
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="forks")
