@@ -10,6 +10,7 @@ import difflib
 from collections.abc import Callable, Sequence
 from typing import Any, Protocol
 
+from latentplan.config import UserError
 from latentplan.planning.model import Bound, State
 from latentplan.planning.objectives import Constraint, Term
 from latentplan.planning.plan import Plan
