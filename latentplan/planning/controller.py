@@ -117,7 +117,7 @@ class ModelPredictiveController:
         if self.plan is not None:
             self.plan = self.plan.aged()
 
-    def follow(self) -> tuple[Tensor, Tensor] | None:
+    def next_actions(self) -> tuple[Tensor, Tensor] | None:
         """Returns the next action of the present plans, (batch, action), and where it is valid, (batch,) bool.
 
         The action is not valid where the plan has no actions left or was made for another objective. The result is None

@@ -278,7 +278,7 @@ def test_with_another_goal_the_plan_goes_on_where_none_is_made_and_the_actor_nev
     agent, sources = make(model, planning_budget=0.3, signal="random"), []
     agent.set_objective(lambda rollout: -rollout.actions[:, 0, 0])
     for frames in film:
-        expected = agent.controller.follow()
+        expected = agent.controller.next_actions()
         action = agent.act(frames[0])
         sources.append(agent.last_source)
         if agent.last_source == "tail":

@@ -124,15 +124,15 @@ def test_act_where_ages_the_plans_of_other_environments(states, make_controller)
     assert torch.equal(controller.plan.actions[~where], before.actions[~where])
 
 
-def test_follow_marks_plans_of_an_old_objective_as_invalid(states, make_controller):
+def test_next_actions_marks_plans_of_an_old_objective_as_invalid(states, make_controller):
     controller = make_controller()
     controller.act(states)
     controller.set_objective(action_penalty())
     controller.act_where(states, torch.tensor([0, 1, 0, 0, 1]).bool())
-    _, is_left = controller.follow()
+    _, is_left = controller.next_actions()
     assert is_left.tolist() == [False, True, False, False, True]
     controller.act(states)
-    assert controller.follow()[1].all()
+    assert controller.next_actions()[1].all()
 
 
 def test_warm_start_skips_steps_of_another_agent(states, make_controller):
@@ -192,7 +192,7 @@ def test_act_where_leaves_others_cold_when_plans_have_another_length(states, mak
     some = torch.tensor([1, 0, 0, 1, 0]).bool()
     controller.act_where(states, some)
     assert controller.plan.is_warm.tolist() == some.tolist()
-    assert controller.follow()[1].tolist() == some.tolist()
+    assert controller.next_actions()[1].tolist() == some.tolist()
 
 
 def test_controller_refuses_replan_every_beyond_goal_horizon(make_controller):

@@ -129,7 +129,7 @@ class Search:
             self.init_std = self._constant(problem.init_std)
         self.num_proposals = options.num_proposals(supports(model, "policy"))
         # The policy was trained on the task's reward, so it may not replace a plan for another objective.
-        self.may_follow_policy = self.num_proposals > 0 and objective is None and not problem.constraints
+        self.may_use_policy = self.num_proposals > 0 and objective is None and not problem.constraints
         self.streams = Streams(generator, self.batch, self.device)
         self.scorer = Scorer.build(
             model,
@@ -165,7 +165,7 @@ class Search:
         progress, history, stopped = self._iterate(start, proposals, budget)
         # Without a finite candidate the plan is the tail of the previous plan, or zeros clamped into the bounds.
         mean = torch.where(progress.is_found[:, None, None], progress.mean, last.mean).clamp(self.low, self.high)
-        mode = proposals[:, 0] if proposals is not None and self.may_follow_policy else None
+        mode = proposals[:, 0] if proposals is not None and self.may_use_policy else None
         actions, expected, violation = choose(options.final, self.scorer, self.state, progress, mean, mode)
         budget.lap("choose")
         if options.gradient_steps and not budget.allows("gradient"):
@@ -203,7 +203,7 @@ class Search:
         policy and a previous plan the actions are zeros. Environments that would start cold stay cold.
         """
         actions, is_policy = last.mean, torch.zeros(self.batch, dtype=torch.bool, device=self.device)
-        if self.may_follow_policy:
+        if self.may_use_policy:
             budget.lap()
             if budget.allows("propose"):
                 mode = self._propose(budget)[:, 0]
