@@ -16,7 +16,7 @@ from latentplan.config import Config, PlannerConfig
 from latentplan.models import State, WorldModel
 from latentplan.models.symmetry import TurnedModel
 from latentplan.objectives.expression import Expression
-from latentplan.planning import BackgroundPlanner, CEMPlanner, Plan, PlanExecutor, PlanScheduler
+from latentplan.planning import BackgroundPlanner, Plan, PlanExecutor, Planner, PlanScheduler, make_planner
 from latentplan.planning.objectives import Constraint, Term
 
 
@@ -28,7 +28,7 @@ class LatentPlanner:
         search: The planner.
     """
 
-    search: CEMPlanner
+    search: Planner
 
     def plan(self, model: WorldModel | TurnedModel, state: State, previous: Plan | None = None, **options: Any) -> Plan:
         """See `CEMPlanner.plan`."""
@@ -76,7 +76,8 @@ class BackgroundAgent(ModelAgent):
         make_executor: Callable[[LatentPlanner, Any], PlanExecutor] | None = None,
     ) -> None:
         super().__init__(model, config, seed=seed)
-        search = CEMPlanner.from_config(planner or config.planner, action_dim=model.action_dim, discount=discount)
+        settings = planner or config.planner
+        search = make_planner(settings.method, settings, action_dim=model.action_dim, discount=discount)
         if make_executor is None:
             executor: PlanExecutor = BackgroundPlanner(LatentPlanner(search), self.imagined, worker=worker)
         else:

@@ -15,7 +15,7 @@ from latentplan.models import State, WorldModel
 from latentplan.models.symmetry import TurnedModel, first_turn, flat, folded, per_turn, turned
 from latentplan.objectives.expression import Expression
 from latentplan.objectives.objective import plan_goals, read_goal_image
-from latentplan.planning import CEMPlanner
+from latentplan.planning import Planner
 from latentplan.planning.objectives import Constraint, Term
 
 
@@ -150,7 +150,7 @@ class ModelAgent:
         return self.model.decoder.picture(last.features.float())[0].cpu().numpy()
 
     def _plan_goals(
-        self, objective: str | Expression | Term | None, constraints: str | Sequence[Constraint], planner: CEMPlanner
+        self, objective: str | Expression | Term | None, constraints: str | Sequence[Constraint], planner: Planner
     ) -> tuple[Term | None, Sequence[Constraint]]:
         return plan_goals(
             objective,

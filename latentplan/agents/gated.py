@@ -16,8 +16,7 @@ from latentplan.config import Config, PlannerConfig
 from latentplan.models import State, WorldModel, kl_divergence
 from latentplan.models.symmetry import flat, mean_over_turns
 from latentplan.objectives.expression import Expression
-from latentplan.planning.conditioned import seen_for
-from latentplan.planning.objectives import Constraint, Term
+from latentplan.planning.objectives import Constraint, Term, seen_for
 
 SIGNALS = ("mismatch", "value", "both", "random")
 GAP_STEPS = 2  # one model step costs about as much as encoding the frame
@@ -146,7 +145,7 @@ class GatedAgent(PlanningAgent):
         action = mean_over_turns(mode, state) if is_own else mode
         is_due, is_tail = self._is_first, torch.zeros_like(self._is_first)
         if self._is_foreign:
-            planned, is_tail = self.controller.follow() or (action, is_tail)
+            planned, is_tail = self.controller.next_actions() or (action, is_tail)
             is_due = is_due | ~is_tail
             action = torch.where(is_tail[:, None].to(action.device), planned.to(action.dtype), action)
         is_planned = is_due | self._is_doubtful(state, action, is_due)

@@ -12,7 +12,7 @@ from latentplan.agents.base import ModelAgent
 from latentplan.config import Config, PlannerConfig
 from latentplan.models import State, WorldModel
 from latentplan.objectives.expression import Expression
-from latentplan.planning import CEMPlanner, ModelPredictiveController
+from latentplan.planning import ModelPredictiveController, make_planner
 from latentplan.planning.objectives import Constraint, Term
 
 
@@ -49,7 +49,7 @@ class PlanningAgent(ModelAgent):
         super().__init__(model, config, noise_std=noise_std, noise_correlation=noise_correlation, seed=seed)
         settings = planner or config.planner
         self.surprise_limit, self.was_surprised = settings.surprise_limit, False
-        search = CEMPlanner.from_config(settings, action_dim=model.action_dim, discount=discount)
+        search = make_planner(settings.method, settings, action_dim=model.action_dim, discount=discount)
         self.controller = ModelPredictiveController(search, self.imagined, generator=self.generator)
 
     def reset(self, mask: np.ndarray | None = None) -> None:

@@ -5,6 +5,7 @@ from latentplan.config.distill import DistillConfig
 from latentplan.config.goals import GoalsConfig
 from latentplan.config.learning import CollectionConfig, LearningConfig
 from latentplan.config.planner import PlannerConfig
+from latentplan.config.search import SearchOptions
 from latentplan.config.settings import (
     DEVICES,
     FLOORS,
@@ -39,6 +40,7 @@ __all__ = [
     "PlannerConfig",
     "ReplayConfig",
     "RunConfig",
+    "SearchOptions",
     "UserError",
     "derive_seed",
     "from_dict",

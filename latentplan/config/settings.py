@@ -11,7 +11,7 @@ from typing import Any
 
 from latentplan.config.checks import MAX_THREADS, UserError, above_zero, at_least, one_of, within
 from latentplan.config.learning import CollectionConfig, LearningConfig
-from latentplan.config.planner import PlannerConfig
+from latentplan.config.planner import PlannerConfig, drop_removed
 
 LATENT_DIM = 32
 RENDER_QUALITIES = ("exact", "fast", "fastest")
@@ -199,6 +199,8 @@ def from_dict(values: dict[str, Any]) -> Config:
     for section, settings in values.items():
         if section not in sections:
             raise ValueError(f"unknown section {section!r}; available: {', '.join(sections)}")
+        if section == "planner":
+            settings = drop_removed(settings)
         kind: Any = sections[section]
         names = {f.name for f in dataclasses.fields(kind)}
         for name in settings:

@@ -78,7 +78,7 @@ class TurnedModel:
         return getattr(self.model, name)
 
     def shown_as(self, view: Callable[[Any], Any]) -> TurnedModel:
-        """The turned model of a view of the model; see `latentplan.planning.conditioned`."""
+        """The turned model of a view of the model; see `latentplan.planning.objectives.conditioned`."""
         return TurnedModel(view(self.model))
 
     def particles(self, state: State, num: int) -> State:

@@ -34,10 +34,17 @@ from latentplan.objectives.expression import (
     walk,
 )
 from latentplan.objectives.parser import parse_constraints, parse_objective
-from latentplan.planning.conditioned import conditioned
 from latentplan.planning.model import supports
-from latentplan.planning.objectives import Constraint, Objective, Rollout, Term, predicted_return, terminal_value
-from latentplan.planning.search.cem import CEMPlanner
+from latentplan.planning.objectives import (
+    Constraint,
+    Objective,
+    Rollout,
+    Term,
+    conditioned,
+    predicted_return,
+    terminal_value,
+)
+from latentplan.planning.search.registry import Planner
 
 CAUTION = 0.1  # distance that a plan keeps from the limit of a constraint, in margins
 GUIDANCE = 0.25  # weight of the terminal value, as a share of what the plan would earn at the value's rate of reward
@@ -51,7 +58,7 @@ def plan_goals(
     *,
     model: Any,
     env: EnvConfig,
-    planner: CEMPlanner,
+    planner: Planner,
     encode_goal: Callable[[str], Tensor],
 ) -> tuple[Term | None, Sequence[Constraint]]:
     """The planner's objective and constraints for goals written as text.

@@ -1,12 +1,11 @@
 """Planning in any model: cross-entropy search, objectives, constraints and receding-horizon control.
 
-Imports torch and einops, and of this project only the settings.
+The package imports torch and einops, and only the settings from the rest of this project.
 """
 
 from latentplan.planning.adapters import CEMTrajectoryOptimizer
 from latentplan.planning.check import check_model
 from latentplan.planning.compiled import compile_rollout
-from latentplan.planning.conditioned import conditioned
 from latentplan.planning.controller import ModelPredictiveController
 from latentplan.planning.model import FunctionModel, Model
 from latentplan.planning.objectives import (
@@ -14,6 +13,7 @@ from latentplan.planning.objectives import (
     Rollout,
     action_penalty,
     at_every_state,
+    conditioned,
     goal_term,
     learned_return,
     risk,
@@ -25,11 +25,13 @@ from latentplan.planning.plan import Plan
 from latentplan.planning.realtime.planner import BackgroundPlanner, PlanBuffer
 from latentplan.planning.realtime.scheduler import Decision, PlanExecutor, PlanScheduler
 from latentplan.planning.realtime.worker import settle
-from latentplan.planning.search.cem import CEMPlanner
+from latentplan.planning.search.cem import CEMPlanner, icem_planner, mppi_planner
 from latentplan.planning.search.elites import refit
-from latentplan.planning.search.family import icem_planner, mppi_planner
+from latentplan.planning.search.options import SearchOptions
+from latentplan.planning.search.registry import PLANNERS, Planner, SupportsPlan, make_planner
 
 __all__ = [
+    "PLANNERS",
     "BackgroundPlanner",
     "CEMPlanner",
     "CEMTrajectoryOptimizer",
@@ -42,7 +44,10 @@ __all__ = [
     "PlanBuffer",
     "PlanExecutor",
     "PlanScheduler",
+    "Planner",
     "Rollout",
+    "SearchOptions",
+    "SupportsPlan",
     "action_penalty",
     "at_every_state",
     "check_model",
@@ -51,6 +56,7 @@ __all__ = [
     "goal_term",
     "icem_planner",
     "learned_return",
+    "make_planner",
     "mppi_planner",
     "refit",
     "risk",

@@ -1,6 +1,6 @@
-"""The search for models that are one NumPy function of a state and an action sequence.
+"""The search for a model that is one NumPy function of a state and an action sequence.
 
-Same equations, same planner; only the arrays and the names of the arguments differ.
+`CEMTrajectoryOptimizer` is a `CEMPlanner` with NumPy arrays and other argument names.
 """
 
 from __future__ import annotations
@@ -29,12 +29,12 @@ class CEMTrajectoryOptimizer:
         horizon: Steps of a sequence.
         action_dim: Numbers in an action.
         num_candidates: Sequences per iteration, the present mean among them.
-        num_elites: Best sequences that refit the distribution.
-        num_iterations: Refits.
+        num_elites: Best sequences, which refit the distribution.
+        num_iterations: Number of refits.
         smoothing: Weight of the new statistics, in (0, 1].
         action_low: Lowest action.
-        action_high: Highest action; a search begins with half the range as its standard deviation.
-        seed: Of the sampling noise; the optimizer keeps its own stream.
+        action_high: Highest action; a search starts with half the action range as its standard deviation.
+        seed: Seed of the sampling noise; the optimizer has its own random stream.
     """
 
     def __init__(
@@ -57,13 +57,17 @@ class CEMTrajectoryOptimizer:
         self.smoothing = smoothing
         self.action_low = action_low
         self.action_high = action_high
+        half_range = torch.as_tensor(action_high, dtype=torch.float64).sub(torch.as_tensor(action_low)) / 2
         self._planner = CEMPlanner(
             action_dim=action_dim,
             horizon=horizon,
             num_samples=num_candidates,
             num_elites=num_elites,
             num_iterations=num_iterations,
+            warm_start_iterations=num_iterations,
             smoothing=smoothing,
+            init_std=half_range,
+            min_std=0.0,
             action_low=action_low,
             action_high=action_high,
         )
@@ -72,12 +76,12 @@ class CEMTrajectoryOptimizer:
     def plan(
         self, initial_state: np.ndarray, rollout_fn: RolloutFunction, warm_start_mean: np.ndarray | None = None
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Mean and variance of the searched sequence, float64 (horizon, action) each.
+        """Returns mean and variance of the search distribution, float64 (horizon, action) each.
 
         Args:
-            initial_state: Handed to `rollout_fn` as it is.
+            initial_state: Passed to `rollout_fn` unchanged.
             rollout_fn: `rollout_fn(initial_state, sequence (horizon, action)) -> return`, maximised.
-            warm_start_mean: Where to start, (horizon, action); None starts at zeros.
+            warm_start_mean: Mean at the start of the search, (horizon, action); None starts at zeros.
         """
         model = _RolloutModel(initial_state, rollout_fn)
         previous = None if warm_start_mean is None else _plan_around(warm_start_mean)
@@ -96,17 +100,17 @@ class CEMTrajectoryOptimizer:
         num_elites: int = 2,
         smoothing: float = 0.8,
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """One refit by hand: the new mean and variance (horizon, action), and the first action (action,)."""
+        """Returns mean and variance (horizon, action) after one refit, and the first action of the mean (action,)."""
         arrays = (torch.as_tensor(array) for array in (candidates, returns, prior_mean, prior_var))
         mean, var = refit(*arrays, num_elites=num_elites, smoothing=smoothing)
         return mean.numpy(), var.numpy(), mean[0].numpy()
 
 
 class RolloutController:
-    """Receding-horizon control with a `CEMTrajectoryOptimizer`; what `ModelPredictiveController` becomes for one.
+    """Receding-horizon control with a `CEMTrajectoryOptimizer`; `ModelPredictiveController(optimizer, ...)` makes one.
 
     Args:
-        optimizer: What searches.
+        optimizer: The optimizer that searches at every step.
         rollout_fn: `rollout_fn(state, sequence) -> return`.
     """
 
@@ -116,7 +120,7 @@ class RolloutController:
         self.warm_start: np.ndarray | None = None
 
     def act(self, current_state: np.ndarray) -> np.ndarray:
-        """The first action (action,) of a new plan; the rest, padded with zeros, starts the next search."""
+        """Returns the first action (action,) of a new plan; the rest, padded with a zero, starts the next search."""
         mean, _ = self.optimizer.plan(current_state, self.rollout_fn, self.warm_start)
         self.warm_start = mean.copy()
         self.warm_start[:-1] = mean[1:]
@@ -129,7 +133,7 @@ class RolloutController:
 
 
 class _RolloutModel:
-    """A fused rollout made of calls to a function; the whole return counts as the first reward."""
+    """A model with a fused rollout that calls a function; the return of a sequence is its first reward."""
 
     def __init__(self, state: np.ndarray, rollout_fn: RolloutFunction) -> None:
         self._state, self._rollout_fn = state, rollout_fn
@@ -145,7 +149,7 @@ class _RolloutModel:
 
 
 def _plan_around(mean: np.ndarray) -> Plan:
-    """A plan to start from, none of which has been executed."""
+    """Returns a plan with this mean, of which no action has been executed."""
     sequence = torch.as_tensor(mean, dtype=torch.float64)[None]
     zero = torch.zeros(1, dtype=torch.long)
     return Plan(sequence, sequence, torch.ones_like(sequence), torch.zeros(1), {}, None, zero == 0, zero)

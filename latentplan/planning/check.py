@@ -1,4 +1,4 @@
-"""Finds what is wrong with a model before the first plan."""
+"""Checks a model's methods before the first plan."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from latentplan.planning.model import Model, State, action_dtype, count_rows, st
 
 _ROWS, _HORIZON, _NUM = 4, 3, 2
 _OPTIONAL = ("value", "policy", "continues", "uncertainty", "rollout", "fast_step", "propose", "particles")
-_PER_ROW = {"propose": _NUM, "particles": _NUM}  # rows that these methods answer for each that they are given
+_PER_ROW = {"propose": _NUM, "particles": _NUM}  # rows that these methods return per row of their input
 
 Inputs = tuple[State, Tensor]
 """States (rows, ...) and actions (rows, horizon, action)."""
@@ -34,21 +34,21 @@ _ARGUMENTS: dict[str, Callable[[State, Tensor], tuple[Any, ...]]] = {
 
 @torch.no_grad()
 def check_model(model: Model, state: State, action_dim: int, *, tolerance: float = 1e-3) -> tuple[str, ...]:
-    """Tries every method of a model and names what is wrong.
+    """Calls every method of a model and raises an error that lists every problem found.
 
     Args:
         model: The model.
         state: A typical state, any number of rows.
-        action_dim: Numbers in an action; those tried lie in [-1, 1].
-        tolerance: Relative difference allowed where two ways to compute a thing must agree.
+        action_dim: Numbers in an action; the check uses actions in [-1, 1].
+        tolerance: Relative difference that is allowed between two results that must agree.
 
     Returns:
-        The optional methods that the model has.
+        Names of the optional methods that the model has.
 
     Raises:
         TypeError: The state is not a tensor or a pytree of tensors.
-        ValueError: Lists every problem found, one per line: exceptions, shapes, dtypes, NaN, rows that influence each
-            other or come in another order, inputs that are changed, a rollout that does not agree with steps.
+        ValueError: There are problems; the message lists them, one per line: exceptions, shapes, dtypes, NaN, rows that
+            influence each other or come in another order, changed inputs, a rollout that does not agree with steps.
     """
     index = torch.arange(_ROWS) % count_rows(state)
     rows = tree_map(lambda leaf: leaf[index.to(leaf.device)], state)
@@ -68,16 +68,16 @@ def _problems(model: Any, state: State, actions: Tensor, tolerance: float) -> It
     particles = getattr(model, "num_particles", 1)
     if isinstance(particles, bool) or not isinstance(particles, Integral) or particles < 1:
         yield f"num_particles must be a whole number, at least 1, got {particles!r}"
-    problems, following = _tried(model, "step", (state, actions))
+    problems, following = _try(model, "step", (state, actions))
     yield from problems
     if problems:
         following = None
-    # A step away the rows differ, even if all that were given are alike.
+    # After a step the rows differ, even if all rows of the given state are equal.
     inputs = (state if following is None else following[0], actions)
     for name in ("step", *_OPTIONAL):
         if name == "step" and following is None or not supports(model, name):
             continue
-        problems, answer = _tried(model, name, inputs)
+        problems, answer = _try(model, name, inputs)
         yield from problems
         if not problems:
             yield from _row_problems(model, name, inputs, answer, tolerance)
@@ -88,25 +88,23 @@ def _problems(model: Any, state: State, actions: Tensor, tolerance: float) -> It
         yield from _disagreements(model, (first, actions), tolerance)
 
 
-def _tried(model: Any, name: str, inputs: Inputs) -> tuple[list[str], Any]:
-    """What is wrong with a method's answer, and the answer; None where it cannot be gone on with."""
+def _try(model: Any, name: str, inputs: Inputs) -> tuple[list[str], Any]:
+    """Returns the problems of a method, and its result; None if the method raised an exception."""
     given = _ARGUMENTS[name](*inputs)
-    return _called(model, name, given, lambda answer: _answer_problems(name, answer, inputs))
+    return _call(model, name, given, lambda answer: _answer_problems(name, answer, inputs))
 
 
-def _called(
-    model: Any, name: str, given: tuple[Any, ...], judge: Callable[[Any], Iterator[str]]
-) -> tuple[list[str], Any]:
-    """The same for any arguments: what is raised, what `judge` finds, and inputs that are changed."""
+def _call(model: Any, name: str, given: tuple[Any, ...], find: Callable[[Any], Iterator[str]]) -> tuple[list[str], Any]:
+    """Returns the problems of a call (exceptions, changed inputs, and those that `find` yields), and its result."""
     copies = tree_map(lambda leaf: leaf.clone() if isinstance(leaf, Tensor) else leaf, given)
     try:
         answer = getattr(model, name)(*copies)
-        problems = list(judge(answer))
+        problems = list(find(answer))
     except Exception as error:
         return [f"{name}() raises {type(error).__name__}: {error}"], None
     pairs = zip(tree_leaves(given), tree_leaves(copies), strict=True)
     if any(isinstance(before, Tensor) and not _is_same(before, after) for before, after in pairs):
-        problems.append(f"{name}() changes what it is given; it has to return new tensors")
+        problems.append(f"{name}() changes its inputs; it has to return new tensors")
     return problems, answer
 
 
@@ -147,37 +145,37 @@ def _state_problems(name: str, state: State, following: State) -> Iterator[str]:
 
 
 def _row_problems(model: Any, name: str, inputs: Inputs, together: Any, tolerance: float) -> Iterator[str]:
-    """Whether the first row gets something else when it comes alone."""
+    """Yields a problem if the first row has another result when it is the only row."""
     if not _agree(together, getattr(model, name)(*_ARGUMENTS[name](*inputs)), tolerance):
-        return  # a method that samples: which row gets which draw is the model's own business
+        return  # the method samples, so two results differ anyway
     state, actions = inputs
-    problems, alone = _tried(model, name, (tree_map(lambda leaf: leaf[:1], state), actions[:1]))
+    problems, alone = _try(model, name, (tree_map(lambda leaf: leaf[:1], state), actions[:1]))
     if problems:
         yield from (f"of one row alone, {problem}" for problem in problems)
         return
     first = tree_map(lambda leaf: leaf[: _PER_ROW.get(name, 1)], together)
     if not _agree(first, alone, tolerance if name == "step" else 10 * tolerance):
         order = ", or rows are not batch-major" if name in _PER_ROW else ""
-        yield f"rows influence each other: {name}() gives a row something else when it comes alone{order}"
+        yield f"rows influence each other: {name}() returns something else for a row that comes alone{order}"
 
 
 def _sample_problems(model: Any, inputs: Inputs) -> Iterator[str]:
     state, actions = inputs
     shape = tuple(actions[:, 0].shape)
     given = (state, _generators(actions)[0])
-    problems, _ = _called(model, "policy", given, lambda sample: _vector_problems("policy()'s sample", sample, shape))
+    problems, _ = _call(model, "policy", given, lambda sample: _vector_problems("policy()'s sample", sample, shape))
     yield from problems
 
 
 def _disagreements(model: Any, inputs: Inputs, tolerance: float) -> Iterator[str]:
-    """Where a faster way does not come to what steps come to."""
+    """Yields a problem for each fused or fast method that does not agree with `step`."""
     state, actions = inputs
     if not _agree(model.step(state, actions[:, 0]), model.step(state, actions[:, 0]), tolerance):
-        return  # a step that samples has nothing to agree with
-    if supports(model, "fast_step") and not _tried(model, "fast_step", inputs)[0]:
+        return  # the step samples, so two results differ anyway
+    if supports(model, "fast_step") and not _try(model, "fast_step", inputs)[0]:
         if not _agree(model.fast_step(state, actions[:, 0]), model.step(state, actions[:, 0]), 10 * tolerance):
             yield "fast_step() does not agree with step()"
-    if supports(model, "rollout") and not _tried(model, "rollout", inputs)[0]:
+    if supports(model, "rollout") and not _try(model, "rollout", inputs)[0]:
         answer, stepped = model.rollout(state, actions), []
         for action in actions.unbind(dim=1):
             state, reward = model.step(state, action)
@@ -202,7 +200,7 @@ def _generators(actions: Tensor) -> list[torch.Generator]:
 
 
 def _is_same(before: Tensor, after: Tensor) -> bool:
-    """Whether nothing was changed; NaN stays NaN."""
+    """Returns whether two tensors are equal, NaN included."""
     return before.shape == after.shape and bool(((before == after) | ((before != before) & (after != after))).all())
 
 

@@ -1,4 +1,4 @@
-"""A model whose imagined rollouts torch compiles."""
+"""A model with a rollout that `torch.compile` compiles."""
 
 from __future__ import annotations
 
@@ -12,22 +12,22 @@ from latentplan.planning.model import Model, State, supports, take_step
 
 
 def compile_rollout(model: Model, **options: Any) -> Model:
-    """The same model with a `rollout` that `torch.compile` makes one program of, all steps of a plan at once.
+    """Returns the same model with a `rollout` that is compiled as one program over all steps of a plan.
 
-    Pays where a step is many small operations, such as true equations or a small network: between two of them Python
-    costs more than the arithmetic. The first search of each size waits for the compiler, seconds to a minute; later
-    ones give the same numbers, to rounding. What needs the states on the way (most objectives and constraints, and
-    `use_continues`) still steps through `model.step`.
+    Compiling saves time if a step consists of many small operations (equations of motion, a small network), because
+    Python's overhead per operation is then larger than the arithmetic. The first search of each size waits seconds to a
+    minute for the compiler. Results are the same up to rounding. Objectives and constraints that read the states of a
+    rollout, and `use_continues`, still call `model.step`.
 
     Args:
-        model: Any model; its own `rollout` is compiled where it has one, else a loop over its `step`.
-        options: Of `torch.compile`; on a GPU, `mode="reduce-overhead"` records CUDA graphs.
+        model: Any model; its own `rollout` is compiled if it has one, else a loop over its `step`.
+        options: Options of `torch.compile`; on a GPU, `mode="reduce-overhead"` records CUDA graphs.
 
     Returns:
-        A model with everything that `model` has. It can be pickled where `model` can, and is compiled anew there.
+        A model with all attributes of `model`. It can be pickled if `model` can, and compiles again after unpickling.
 
     Raises:
-        torch._dynamo.exc.BackendCompilerFailed: While planning, where torch finds no C++ compiler.
+        torch._dynamo.exc.BackendCompilerFailed: While planning, if torch finds no C++ compiler.
     """
     return _Compiled(model, options)
 
@@ -38,7 +38,7 @@ class _Compiled:
         own = model.rollout if supports(model, "rollout") else partial(_step_through, model)  # type: ignore[attr-defined]
         self.rollout = torch.compile(own, **options)
 
-    def __getattr__(self, name: str) -> Any:  # asked for what is not here: an absent attribute stays absent
+    def __getattr__(self, name: str) -> Any:  # called for attributes that this class lacks
         return getattr(self._model, name)
 
     def __reduce__(self) -> tuple[Any, ...]:

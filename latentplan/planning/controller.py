@@ -1,4 +1,4 @@
-"""Receding-horizon control: plan, execute the first actions, shift, plan again."""
+"""Receding-horizon control: plan, execute the first actions, shift the plan, plan again."""
 
 from __future__ import annotations
 
@@ -16,36 +16,39 @@ from latentplan.planning.adapters import CEMTrajectoryOptimizer, RolloutControll
 from latentplan.planning.model import Model, State, count_rows, state_device
 from latentplan.planning.objectives import Constraint, Term
 from latentplan.planning.plan import Plan
-from latentplan.planning.search.cem import CEMPlanner
+from latentplan.planning.search.registry import Planner
 from latentplan.planning.search.sampling import Generators
 
 
 class ModelPredictiveController:
-    """Acts by planning anew at every step, or every few, and hands each plan on to the next search.
+    """Acts by planning at every step, or every few steps, and passes each plan to the next search.
 
-    With a `CEMTrajectoryOptimizer` and a rollout function in place of planner and model, it is a `RolloutController`.
+    With a `CEMTrajectoryOptimizer` and a rollout function as arguments, the class makes a `RolloutController`.
 
     Args:
-        planner: What searches.
-        model: What it searches in.
-        objective: What is maximised; see `CEMPlanner.plan`.
-        constraints: What plans must keep.
-        generator: Random stream, or one per environment.
-        replan_every: Actions executed from each plan; at most the planner's horizon.
+        planner: The planner; see `Planner`.
+        model: The model in which it searches.
+        objective: Maximised; see `CEMPlanner.plan`.
+        constraints: Violations that plans must avoid.
+        generator: One random stream, or a list with one per environment.
+        replan_every: Number of actions executed from each plan; at most the planner's horizon.
+
+    Attributes:
+        plan: The plans in use; None before the first.
 
     Raises:
         ValueError: `replan_every` does not lie in 1 to the horizon.
     """
 
     def __new__(cls, *args: Any, **kwargs: Any) -> Any:
-        """A controller for what it is given: a planner and a model, or an optimizer and a rollout function."""
+        """Makes a controller for a planner and a model, or for an optimizer and a rollout function."""
         if "optimizer" in kwargs or (args and isinstance(args[0], CEMTrajectoryOptimizer)):
             return RolloutController(*args, **kwargs)
         return super().__new__(cls)
 
     def __init__(
         self,
-        planner: CEMPlanner,
+        planner: Planner,
         model: Model,
         *,
         objective: Term | None = None,
@@ -63,29 +66,29 @@ class ModelPredictiveController:
         self.generator = generator
         self.replan_every = replan_every
         self.plan: Plan | None = None
-        self._is_stale: Tensor | None = None  # whose plans were made for another objective, (batch,) bool
+        self._is_stale: Tensor | None = None  # environments whose plan was made for another objective, (batch,) bool
         self._latencies_ms: deque[float] = deque(maxlen=10_000)
 
     def act(self, state: State) -> Tensor:
-        """The next action from each state, (batch, action).
+        """Returns the next action of each environment, (batch, action).
 
         Args:
-            state: Where each environment is now, rows (batch,).
+            state: Present state of each environment, rows (batch,).
         """
         return self._act(state, self.generator)
 
     def act_where(self, state: State, where: Tensor) -> Tensor:
-        """The next action where it is asked for; elsewhere somebody else acts, and the plans age by that step.
+        """Returns the next action of some environments; in the others another agent acts, and their plans age.
 
         Args:
-            state: Where each environment is now, rows (batch,).
+            state: Present state of each environment, rows (batch,).
             where: Environments to decide for, (batch,) bool.
 
         Returns:
             Actions of the environments in `where`, in order: (chosen, action).
 
         Raises:
-            ValueError: There is no environment in `where`, or the objective has goals for all of them, one each.
+            ValueError: `where` selects no environment, or the objective has one goal for each of all environments.
         """
         where = where.to("cpu", torch.bool)
         rows = where.nonzero().squeeze(1)
@@ -104,20 +107,21 @@ class ModelPredictiveController:
             raise
         assert self.plan is not None
         spread = self.plan.spread(where)
-        is_alike = whole is not None and whole.mean.shape == spread.mean.shape  # else it was for another objective
+        is_alike = whole is not None and whole.mean.shape == spread.mean.shape  # differs after a change of objective
         self.plan = whole.updated(where, spread) if whole is not None and is_alike else spread
         self._is_stale = None if stale is None else stale & ~where
         return action
 
     def skip(self) -> None:
-        """Notes that somebody else acted in every environment: the plan ages by that step."""
+        """Ages the plan by one step, in which another agent acted in every environment."""
         if self.plan is not None:
             self.plan = self.plan.aged()
 
-    def follow(self) -> tuple[Tensor, Tensor] | None:
-        """What the present plans would do next, (batch, action), and where they still say it, (batch,) bool.
+    def next_actions(self) -> tuple[Tensor, Tensor] | None:
+        """Returns the next action of the present plans, (batch, action), and where it is valid, (batch,) bool.
 
-        None without a plan. Nothing is said by plans that have run out, or were made for another objective.
+        The action is not valid where the plan has no actions left or was made for another objective. The result is None
+        if there is no plan.
         """
         if self.plan is None:
             return None
@@ -136,7 +140,7 @@ class ModelPredictiveController:
             if bool(is_due.all()):
                 self.plan = self._search(state, self.plan, generator)
             elif bool(is_due.any()):
-                with _kept(_streams_of(generator, ~is_due), _streams_of(generator, is_due)):
+                with _streams_kept(_streams_of(generator, ~is_due), _streams_of(generator, is_due)):
                     self.plan = self.plan.updated(is_due, self._search(state, self.plan, generator))
         self._is_stale = None
         action = self.plan.actions[torch.arange(len(is_due)), self.plan.elapsed]
@@ -150,7 +154,7 @@ class ModelPredictiveController:
         """Forgets the plan, so that the next search starts cold.
 
         Args:
-            mask: Environments that start anew, (batch,) bool; None is all of them.
+            mask: Environments in which an episode begins, (batch,) bool; None is all of them.
         """
         if mask is None:
             self.plan = None
@@ -158,28 +162,28 @@ class ModelPredictiveController:
             self.plan = self.plan.forget(mask)
 
     def set_objective(self, objective: Term | None, constraints: Sequence[Constraint] | None = None) -> None:
-        """Changes what is maximised, from the next action on; the last plan stays where the search starts.
+        """Changes the objective, from the next action on; the next search still starts from the previous plan.
 
         Args:
-            objective: What is maximised; None is predicted reward and value.
-            constraints: What plans must keep; None leaves them as they are.
+            objective: Maximised; None is predicted reward and value.
+            constraints: Violations that plans must avoid; None leaves the constraints as they are.
         """
         self.objective = objective
         if constraints is not None:
             self.constraints = constraints
-        if self.plan is not None:  # what was planned for the old objective is not executed further
+        if self.plan is not None:  # a plan for the old objective is not executed further
             self._is_stale = torch.ones_like(self.plan.is_warm)
 
     @property
     def source(self) -> str:
-        """What the last action is in the first environment: see `Plan.source`; "plan" before the first."""
+        """Where the first environment's last action came from, see `Plan.source`; "plan" before the first action."""
         return "plan" if self.plan is None else self.plan.source
 
     @property
     def latency(self) -> dict[str, float]:
         """Milliseconds from state to action over the last 10,000 decisions: `mean_ms`, `p50_ms`, `p95_ms`, `p99_ms`.
 
-        Empty before the first action.
+        The dictionary is empty before the first action.
         """
         if not self._latencies_ms:
             return {}
@@ -204,8 +208,11 @@ class ModelPredictiveController:
 
 
 @contextlib.contextmanager
-def _kept(waiting: list[torch.Generator], due: list[torch.Generator]) -> Iterator[None]:
-    """Leaves the streams of environments whose plans go on where they were, but for those that due ones share."""
+def _streams_kept(waiting: list[torch.Generator], due: list[torch.Generator]) -> Iterator[None]:
+    """Restores the random streams of environments that keep their plan, so that only replanned ones draw numbers.
+
+    A stream that a replanned environment shares is not restored.
+    """
     states = [(stream, stream.get_state()) for stream in waiting if all(stream is not other for other in due)]
     try:
         yield
@@ -215,7 +222,7 @@ def _kept(waiting: list[torch.Generator], due: list[torch.Generator]) -> Iterato
 
 
 def _streams_of(generators: Generators, where: Tensor) -> list[torch.Generator]:
-    """The streams of some environments, where (batch,) bool; none where all share one."""
+    """Returns the streams of the environments in where (batch,) bool; an empty list if all environments share one."""
     if generators is None or isinstance(generators, torch.Generator):
         return []
     return [generators[row] for row in where.nonzero().squeeze(1).tolist()]

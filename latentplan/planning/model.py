@@ -1,22 +1,23 @@
-"""What a planner asks of a model, and how bare functions become one.
+"""The methods that a planner calls on a model, and a model made of functions.
 
-A model needs one method, `step`. What else it has is detected by name:
+A model needs one method, `step`. Optional methods and attributes are detected by name:
 
     step(state, action) -> (next_state, reward)      state: tensor or pytree, dim 0 = rows; action (rows, action)
-    value(state) -> (rows,)                          worth of a state beyond the horizon
-    policy(state, generator) -> (rows, action)       with a generator it samples, with None it gives the mode
+    value(state) -> (rows,)                          expected return from a state on
+    policy(state, generator) -> (rows, action)       a sample; with None as the generator, the mode
     continues(state) -> (rows,)                      probability that the episode goes on from this state
-    uncertainty(state, action) -> (rows,)            doubt of the model about that step
+    uncertainty(state, action) -> (rows,)            uncertainty of the model about that step, at least 0
     rollout(state, actions (rows, horizon, action)) -> (rewards (rows, horizon), last_state)     fused fast path
-    fast_step(state, action)                         the same as step, sooner; it need not pass gradients
-    propose(state, num, horizon, generators) -> actions (batch num, horizon, action)    fused: what the policy would do,
+    fast_step(state, action)                         the same as step, faster; need not pass gradients
+    propose(state, num, horizon, generators) -> actions (batch num, horizon, action)    fused: sequences of the policy,
                                                      its mode first, then samples, one generator per row of state
-    particles(state, num) -> state                   several versions of each row, batch-major: (batch num) rows
-    num_particles                                    in how many of these every candidate is judged; 1 without it
+    particles(state, num) -> state                   `num` versions of each row, batch-major: (batch num) rows
+    num_particles                                    number of versions in which every candidate is scored, default 1
 
-    shown_as(view) -> model                          itself in front of a view of what it wraps, see `conditioned`
+    shown_as(view) -> model                          for a model that wraps another: the same wrapper around the view of
+                                                     the inner model, see `latentplan.planning.conditioned`
 
-Every output must depend on its own row only, and nothing that a method is given may be changed by it.
+Every row of an output must depend on the same row of the inputs only, and a method must not change its inputs.
 """
 
 from __future__ import annotations
@@ -30,24 +31,25 @@ from torch import Tensor
 from torch.utils._pytree import tree_leaves, tree_map
 
 State = Any  # a tensor, or a pytree (tuple, NamedTuple, dict, list) of tensors, dim 0 = rows
+Bound = float | Sequence[float] | Tensor  # one number, or one per action dimension
 
 
 class Model(Protocol):
-    """The one method that every model has; the optional ones are listed at the top of this module."""
+    """The one method that every model has; optional methods are listed at the top of this module."""
 
     def step(self, state: State, action: Tensor) -> tuple[State, Tensor]:
-        """The next state, and the reward (rows,) of taking action (rows, action) in state."""
+        """Returns the next state, and the reward (rows,) of taking action (rows, action) in state."""
         ...
 
 
 class FunctionModel:
-    """A model made of bare functions.
+    """A model made of functions.
 
     Args:
         dynamics: `dynamics(state, action) -> next_state`.
         reward: `reward(state, action) -> (rows,)`, of the state before the step.
-        value: `value(state) -> (rows,)`, the worth of the state a plan ends in.
-        policy: `policy(state, generator) -> (rows, action)`; the mode when the generator is None.
+        value: `value(state) -> (rows,)`, the expected return from the last state of a plan on.
+        policy: `policy(state, generator) -> (rows, action)`; the mode if the generator is None.
         continues: `continues(state) -> (rows,)`, the probability that the episode goes on.
         uncertainty: `uncertainty(state, action) -> (rows,)`.
         rollout: `rollout(state, actions) -> (rewards (rows, horizon), last_state)`.
@@ -73,16 +75,16 @@ class FunctionModel:
             "rollout": rollout,
         }
         for name, function in optional.items():
-            if function is not None:  # an absent attribute is how a planner sees that the model cannot do it
+            if function is not None:  # a planner detects an optional method by the attribute
                 setattr(self, name, function)
 
     def step(self, state: State, action: Tensor) -> tuple[State, Tensor]:
-        """The next state, and the reward (rows,) of the step."""
+        """Returns the next state, and the reward (rows,) of the step."""
         return self.dynamics(state, action), self.reward(state, action)
 
 
 def supports(model: object, method: str) -> bool:
-    """Whether the model has this optional method."""
+    """Returns whether the model has this optional method."""
     return callable(getattr(model, method, None))
 
 
@@ -97,17 +99,17 @@ def require(model: object, method: str, reason: str) -> None:
 
 
 def take_step(model: Any, state: State, action: Tensor) -> tuple[State, Tensor]:
-    """The model's step: its `fast_step` where it has one and no gradient is asked for."""
+    """Returns the model's step; `fast_step` takes it if the model has one and gradients are off."""
     is_fast = supports(model, "fast_step") and not torch.is_grad_enabled()
     following: tuple[State, Tensor] = (model.fast_step if is_fast else model.step)(state, action)
     return following
 
 
 def count_rows(state: State) -> int:
-    """Size of dim 0, the same in every tensor of the state.
+    """Returns the size of dim 0, which is the same in every tensor of the state.
 
     Raises:
-        TypeError: Something in the state is not a tensor.
+        TypeError: A leaf of the state is not a tensor.
         ValueError: The state holds no tensor, tensors whose rows differ, or no row.
     """
     leaves = tree_leaves(state)
@@ -123,32 +125,32 @@ def count_rows(state: State) -> int:
 
 
 def repeat_rows(state: State, num: int) -> State:
-    """Each row `num` times, batch-major: row r becomes rows r * num to r * num + num - 1."""
+    """Returns each row `num` times, batch-major: row r becomes rows r * num to r * num + num - 1."""
     return tree_map(lambda leaf: repeat(leaf, "row ... -> (row num) ...", num=num), state)
 
 
 def split_rows(state: State, batch: int) -> State:
-    """Rows (batch sample) seen as (batch, sample, ...), in every tensor of the state."""
+    """Returns the state with its rows (batch sample) split into (batch, sample, ...)."""
     return tree_map(lambda leaf: rearrange(leaf, "(batch sample) ... -> batch sample ...", batch=batch), state)
 
 
 def action_dtype(state: State) -> torch.dtype:
-    """The precision of actions and returns: float64 for a state in float64, otherwise float32."""
+    """Returns the precision of actions and returns: float64 for a state in float64, otherwise float32."""
     is_double = any(leaf.dtype == torch.float64 for leaf in tree_leaves(state))
     return torch.float64 if is_double else torch.float32
 
 
 def state_device(state: State) -> torch.device:
-    """Where the state's tensors live."""
+    """Returns the device of the state's tensors."""
     device: torch.device = tree_leaves(state)[0].device
     return device
 
 
 def per_dimension(value: float | Sequence[float] | Tensor, action_dim: int, name: str) -> Tensor:
-    """The value for each action dimension, (action,), float64.
+    """Returns the value for each action dimension, (action,), float64.
 
     Raises:
-        ValueError: Neither one number nor one per dimension, or not finite.
+        ValueError: The value is neither one number nor one per dimension, or is not finite.
     """
     numbers = torch.as_tensor(value, dtype=torch.float64)
     if numbers.ndim > 1 or numbers.numel() not in (1, action_dim):
@@ -159,10 +161,10 @@ def per_dimension(value: float | Sequence[float] | Tensor, action_dim: int, name
 
 
 def check_shape(name: str, tensor: Tensor, shape: Sequence[int]) -> None:
-    """Refuses what foreign code returned in another shape.
+    """Refuses a tensor, returned by a user's model or objective, that has another shape.
 
     Raises:
-        ValueError: The shapes differ; names both.
+        ValueError: The shapes differ; the message has both.
     """
     if tensor.shape != torch.Size(shape):
         raise ValueError(f"{name} must have shape {tuple(shape)}, got {tuple(tensor.shape)}")

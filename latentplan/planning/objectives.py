@@ -1,11 +1,11 @@
-"""What a search maximises, and what it must keep.
+"""Objectives that a search maximises, and constraints that it satisfies.
 
 Terms are added and multiplied, with each other and with numbers:
 
     learned_return() + terminal_value() + 0.1 * action_penalty() + 5 * goal_term(goal)
 
-Every term is maximised, so penalties are negative. A bare function `function(rollout) -> (rows,)` is a term as well.
-Terms can be sent to another process as long as the functions and tensors they are given can.
+Every term is maximised, so penalties are negative. A function `function(rollout) -> (rows,)` is a term as well. A term
+can be sent to another process if its functions and tensors can.
 """
 
 from __future__ import annotations
@@ -25,6 +25,7 @@ from latentplan.planning.model import Model, State, check_shape, require, suppor
 
 Term = Callable[["Rollout"], Tensor]
 Constraint = Callable[["Rollout"], Tensor]
+View = Callable[[Model], Model]
 
 
 @dataclass(frozen=True)
@@ -32,16 +33,16 @@ class Rollout:
     """Imagined trajectories, one per row; rows are (batch sample particle), the batch slowest.
 
     Attributes:
-        model: What imagined them.
-        batch: Environments that share the rows.
-        num_particles: Rollouts of each candidate.
-        actions: What was done, (rows, horizon, action).
+        model: The model that imagined the trajectories.
+        batch: Number of environments that share the rows.
+        num_particles: Number of rollouts of each candidate.
+        actions: Actions, (rows, horizon, action).
         rewards: Predicted reward of each step, (rows, horizon), float32 or float64.
-        weights: Discount of each step and, last, of the state after them: (horizon + 1,), or (rows, horizon + 1)
-            when the probability of going on is part of it.
+        weights: Discount of each step and, last, of the final state: (horizon + 1,), or (rows, horizon + 1) if the
+            probability that the episode goes on is included.
         start: State before the first step.
         last_state: State after the last step.
-        states: State after each step, when a term needs them; otherwise empty.
+        states: State after each step if a term needs the states, otherwise empty.
     """
 
     model: Any
@@ -60,25 +61,25 @@ class Objective:
     """A term, or several composed: `objective(rollout) -> (rows,)`, to be maximised.
 
     Attributes:
-        function: What computes it.
-        needs_states: Whether it looks at the states on the way, which a fused rollout does not give.
-        num_particles: Rollouts of each candidate that it asks for.
+        function: Computes the term from a rollout.
+        needs_states: Whether the term reads the states between start and end, which a fused rollout does not return.
+        num_particles: Number of rollouts of each candidate that the term needs.
         needs: Methods that the model must have.
-        view: What shows the model to a search for this alone, see `conditioned`; lost where terms are composed.
+        view: View of the model for a search for this objective alone, see `conditioned`; a sum of terms has none.
     """
 
     function: Term
     needs_states: bool = False
     num_particles: int = 1
     needs: tuple[str, ...] = ()
-    view: Callable[[Model], Model] | None = None
+    view: View | None = None
 
     def __call__(self, rollout: Rollout) -> Tensor:
-        """The term's value for each row, (rows,)."""
+        """Returns the term of each row, (rows,)."""
         return self.function(rollout)
 
     def check(self, model: Model) -> None:
-        """Refuses a model that cannot give what this objective needs.
+        """Refuses a model without a method that this objective needs.
 
         Raises:
             ValueError: The model lacks a method.
@@ -112,17 +113,17 @@ class Objective:
 
 
 def as_objective(term: Term) -> Objective:
-    """The term as an objective; a bare function is taken to need the states on the way."""
+    """Returns the term as an objective; a plain function is assumed to read the states of the rollout."""
     return term if isinstance(term, Objective) else Objective(term, needs_states=True)
 
 
 def learned_return() -> Objective:
-    """The predicted reward of every step, discounted and summed."""
+    """Returns the objective: predicted reward of every step, discounted and summed."""
     return Objective(_rewards)
 
 
 def terminal_value() -> Objective:
-    """The model's value of where a rollout ends, discounted."""
+    """Returns the objective: the model's value of the last state, discounted."""
     return Objective(_last_value, needs=("value",))
 
 
@@ -133,16 +134,16 @@ def goal_term(
     over: str = "last",
     select: Callable[[State], Tensor] | None = None,
 ) -> Objective:
-    """Closeness of the imagined states to a goal: minus the distance, so 0 at the goal.
+    """Returns the objective: minus the distance of imagined states to a goal, so 0 at the goal.
 
     Args:
         goal: Features of the goal, (feature,) for all environments or (batch, feature) for one each.
         metric: `mse` (mean squared error over features) or `cosine` (1 - cosine similarity).
-        over: Distance of the `last` state, their `sum` over the steps, or `min`, that of the closest.
-        select: `select(state) -> (rows, feature)`, what is compared; None for states that are tensors.
+        over: Distance of the `last` state, `sum` over all states, or `min`, the distance of the closest state.
+        select: `select(state) -> (rows, feature)` returns the features to compare; None for states that are tensors.
 
     Raises:
-        ValueError: `metric` or `over` is not one of these, or the goal has another rank.
+        ValueError: `metric` or `over` has another value, or the goal has another rank.
     """
     if metric not in ("mse", "cosine") or over not in ("last", "sum", "min"):
         raise ValueError(f"metric must be mse or cosine and over last, sum or min, got {metric!r} and {over!r}")
@@ -153,36 +154,35 @@ def goal_term(
 
 
 def action_penalty() -> Objective:
-    """Minus the squared size of the actions, summed over steps and dimensions."""
+    """Returns the objective: minus the squared actions, summed over steps and dimensions."""
     return Objective(_action_size)
 
 
 def smoothness_penalty() -> Objective:
-    """Minus the squared change from each action to the next, summed over steps and dimensions."""
+    """Returns the objective: minus the squared change of the action per step, summed over steps and dimensions."""
     return Objective(_action_changes)
 
 
 def uncertainty_penalty() -> Objective:
-    """Minus the model's doubt about every step, discounted and summed."""
-    return Objective(_doubt, needs_states=True, needs=("uncertainty",))
+    """Returns the objective: minus the model's uncertainty of every step, discounted and summed."""
+    return Objective(_uncertainty, needs_states=True, needs=("uncertainty",))
 
 
 def risk(objective: Term, *, measure: str = "cvar", num_particles: int = 8, worst_share: float = 0.25) -> Objective:
-    """An objective over several rollouts of each candidate, judged by more than their mean.
+    """Returns an objective with a risk measure over several rollouts of each candidate.
 
-    A constraint needs none: it counts its largest violation over the rollouts.
-
-    The rollouts differ where the model makes them differ: by `particles(state, num)`, which gives several versions of
-    each state (members of an ensemble, samples of a belief), or by a step that samples.
+    The rollouts of a candidate differ if the model makes them differ: by `particles(state, num)`, which returns several
+    versions of each state (members of an ensemble, samples of a belief), or by a step that samples. A constraint needs
+    no risk measure, because its violation is the largest over the rollouts.
 
     Args:
-        objective: What each rollout is judged by.
-        measure: `mean`, `worst`, or `cvar`: the mean of the worst share.
-        num_particles: Rollouts per candidate.
-        worst_share: Share of the rollouts that `cvar` looks at, in (0, 1].
+        objective: Objective of one rollout.
+        measure: `mean`, `worst`, or `cvar` (conditional value at risk): the mean of the worst share.
+        num_particles: Number of rollouts per candidate.
+        worst_share: Share of the rollouts that `cvar` averages, in (0, 1].
 
     Raises:
-        ValueError: An argument is not one of these.
+        ValueError: An argument is not allowed.
     """
     if measure not in ("mean", "worst", "cvar"):
         raise ValueError(f"measure must be mean, worst or cvar, got {measure!r}")
@@ -193,15 +193,40 @@ def risk(objective: Term, *, measure: str = "cvar", num_particles: int = 8, wors
 
 
 def at_every_state(function: Callable[[State], Tensor]) -> Objective:
-    """The constraint that `function(state) -> (rows,)` is at most 0 in every imagined state.
+    """Returns the constraint that `function(state) -> (rows,)` is at most 0 in every imagined state.
 
-    Its violation is what exceeds 0, summed over the steps.
+    The violation is the part of the function above 0, summed over the steps.
     """
     return Objective(partial(_excess, function), needs_states=True)
 
 
+def conditioned(view: View) -> Objective:
+    """Returns the objective of a learned goal: the goal's reward, and its value of the last state.
+
+    A goal-conditioned model has a reward, a value and a policy for each goal of a family; a view of it has those of one
+    goal. A search for `conditioned(view)` alone runs in the view: the goal's policy makes proposals, and plans have
+    `horizon` steps. In a sum, `conditioned(view)` is scored in rollouts of the model, as every other term is.
+
+    Args:
+        view: `view(model)` returns a model with the same states and steps, but with the reward, the `value` and, for
+            proposals, the `policy` of the goal.
+    """
+    return Objective(partial(_conditioned_return, view), needs_states=True, view=view)
+
+
+def seen_for(model: Model, objective: Term | None) -> tuple[Model, Term | None]:
+    """Returns the model to search in and the objective to search for.
+
+    For a learned goal alone the model is the goal's view, and the objective is None, the view's own return.
+    """
+    view = objective.view if isinstance(objective, Objective) else None
+    if view is None:
+        return model, objective
+    return (model.shown_as(view) if supports(model, "shown_as") else view(model)), None  # type: ignore[attr-defined]
+
+
 def predicted_return(model: Model, use_value: bool | None) -> Objective:
-    """The default objective: reward, and the terminal value if asked for (None: if the model has one)."""
+    """Returns the default objective: reward, plus terminal value if `use_value` (None: if the model has a value)."""
     if use_value is None:
         use_value = supports(model, "value")
     if use_value:
@@ -277,21 +302,31 @@ def _action_changes(rollout: Rollout) -> Tensor:
     return -rollout.actions.diff(dim=1).square().sum(dim=(1, 2))
 
 
-def _doubt(rollout: Rollout) -> Tensor:
+def _uncertainty(rollout: Rollout) -> Tensor:
     befores = (rollout.start, *rollout.states[:-1])
     pairs = zip(befores, rollout.actions.unbind(dim=1), strict=True)
-    doubts = torch.stack([rollout.model.uncertainty(state, action) for state, action in pairs], dim=1)
-    check_shape("uncertainty()", doubts, rollout.rewards.shape)
-    return -(rollout.weights[..., :-1] * doubts).sum(dim=1)
+    uncertainties = torch.stack([rollout.model.uncertainty(state, action) for state, action in pairs], dim=1)
+    check_shape("uncertainty()", uncertainties, rollout.rewards.shape)
+    return -(rollout.weights[..., :-1] * uncertainties).sum(dim=1)
 
 
 def _worst(inner: Term, share: float, rollout: Rollout) -> Tensor:
-    num_worst = max(1, round(share * rollout.num_particles))  # a model may have more particles than were asked for
+    num_worst = max(1, round(share * rollout.num_particles))  # a model may have more particles than the term needs
     values = rearrange(inner(rollout), "(row particle) -> row particle", particle=rollout.num_particles)
     worst = torch.topk(values, num_worst, dim=1, largest=False).values.mean(dim=1)
-    # NaN sorts as the largest number: without this it would hide among the particles that do not count.
+    # NaN sorts as the largest number, so a NaN particle would be left out of the worst ones.
     worst = worst.masked_fill(values.isnan().any(dim=1), float("nan"))
     return repeat(worst, "row -> (row particle)", particle=rollout.num_particles)
+
+
+def _conditioned_return(view: View, rollout: Rollout) -> Tensor:
+    seen = view(rollout.model)
+    require(seen, "value", "a learned goal")
+    before = (rollout.start, *rollout.states[:-1])
+    pairs = zip(before, rollout.actions.unbind(1), strict=True)
+    rewards = torch.stack([seen.step(state, action)[1] for state, action in pairs], dim=1).to(rollout.rewards.dtype)
+    value: Tensor = seen.value(rollout.last_state).to(rewards.dtype)  # type: ignore[attr-defined]
+    return (rewards * rollout.weights[..., :-1]).sum(dim=1) + rollout.weights[..., -1] * value
 
 
 def _excess(function: Callable[[State], Tensor], rollout: Rollout) -> Tensor:

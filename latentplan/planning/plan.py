@@ -1,4 +1,4 @@
-"""The result of a search, as a value: planners keep nothing between calls, callers pass the last plan on."""
+"""The result of a search, as a value. Planners keep no plan: the caller passes the previous plan to the next search."""
 
 from __future__ import annotations
 
@@ -14,18 +14,19 @@ from torch import Tensor
 
 @dataclass(frozen=True)
 class Plan:
-    """What a search found, for every environment in the call.
+    """The result of a search, for every environment in the call.
 
     Attributes:
         actions: The chosen sequence within the bounds, (batch, horizon, action).
         mean: Mean of the search distribution, (batch, horizon, action).
         var: Variance of the search distribution, (batch, horizon, action).
-        expected_return: Predicted return of what the choice rests on, (batch,): of the last elites on average, or of
-            the executed sequence where it was chosen (`final` best or better). NaN where nothing finite was found.
-        info: Diagnostics, (batch,) or (batch, iteration), and what stopped the search; see `CEMPlanner.plan`.
-        elites: Kept elites, (batch, kept, horizon, action), when the planner keeps some.
-        is_warm: Whether the next search may start here, (batch,) bool on the CPU.
-        elapsed: Actions executed since this plan was made, (batch,) on the CPU; the next search shifts by as many.
+        expected_return: Predicted return, (batch,): the mean return of the last elites, or with `final` best or better
+            the return of the chosen sequence. NaN where no candidate had a finite return.
+        info: Diagnostics, (batch,) or (batch, iteration), and the reason the search ended; see `CEMPlanner.plan`.
+        elites: Kept elites, (batch, kept, horizon, action), if the planner keeps some.
+        is_warm: Whether the next search may start from this plan, (batch,) bool on the CPU.
+        elapsed: Number of actions executed since this plan was made, (batch,) on the CPU; the next search shifts the
+            plan by this number.
     """
 
     actions: Tensor
@@ -43,9 +44,13 @@ class Plan:
         return self.actions[:, 0]
 
     def action_distribution(self, min_std: float) -> tuple[Tensor, Tensor]:
-        """Mean and std of the search distribution over the first action, (batch, action) each; std at least `min_std`.
+        """Returns mean and std of the search distribution over the first action, (batch, action) each.
 
-        NaN where no candidate had a finite return: nothing was searched there.
+        Args:
+            min_std: Floor of the returned std.
+
+        Returns:
+            Mean and std; NaN where no candidate had a finite return.
         """
         failed = self.info["is_fallback"][:, None]
         std = self.var[:, 0].sqrt().clamp_min(min_std)
@@ -53,38 +58,38 @@ class Plan:
 
     @property
     def source(self) -> str:
-        """Whose the first environment's actions are: "plan"; or, without a search, "tail" (of the last) or "actor"."""
+        """Where the first environment's actions come from: "plan", "tail" (of the previous plan) or "actor"."""
         if not bool(self.info["is_fallback"][0]):
             return "plan"
         return "actor" if bool(self.info["is_policy"][0]) else "tail"
 
     def failures(self) -> Tensor:
-        """Where neither a search nor a policy stands behind the actions, (batch,) bool on the CPU.
+        """Returns where the actions come neither from a search nor from a policy, (batch,) bool on the CPU.
 
-        Whoever has a policy had better follow that than what is left there of the last plan, or zeros.
+        These actions are the tail of the previous plan, or zeros; a caller with a policy should execute the policy.
         """
         return (self.info["is_fallback"] & ~self.info["is_policy"]).cpu()
 
     def warn_of_failures(self) -> None:
-        """Warns where nothing finite was found, and a policy acts instead."""
+        """Warns if a search found no finite return in some environment, so that the caller's policy acts there."""
         if bool((self.failures() & (self.info["num_nonfinite"] > 0).cpu()).any()):
             warnings.warn("a search found nothing finite; the policy acts", RuntimeWarning, stacklevel=2)
 
     def forget(self, mask: Tensor) -> Plan:
-        """The same plan, except that environments in mask (batch,) bool start their next search cold."""
+        """Returns this plan, except that the environments in mask (batch,) bool start their next search cold."""
         return replace(self, is_warm=self.is_warm & ~mask.to("cpu", torch.bool))
 
     def executed(self, elapsed: Tensor) -> Plan:
-        """The same plan, `elapsed` (batch,) of whose actions have been executed."""
+        """Returns this plan with `elapsed` (batch,) as the number of executed actions."""
         return replace(self, elapsed=elapsed)
 
     def aged(self) -> Plan:
-        """The same plan one step later, in which somebody else acted; where it has run out the next search is cold."""
+        """Returns this plan one step later, after another agent acted; environments without actions left are cold."""
         elapsed = self.elapsed + 1
         return replace(self, elapsed=elapsed).forget(elapsed >= self.mean.shape[1])
 
     def take(self, rows: Tensor) -> Plan:
-        """The plans of some environments, rows (chosen,) int; one may be taken more than once."""
+        """Returns the plans of the environments at rows (chosen,) int, which may repeat."""
 
         def pick(value: Any) -> Any:
             return value[rows.to(value.device)] if isinstance(value, Tensor) else value
@@ -94,15 +99,15 @@ class Plan:
         return Plan(info=info, **{name: pick(getattr(self, name)) for name in fields})
 
     def spread(self, mask: Tensor) -> Plan:
-        """These plans as those of the environments in mask (batch,) bool, in order; the others' are cold copies."""
+        """Returns these plans, in order, at the environments in mask (batch,) bool, and cold copies elsewhere."""
         return self.take((mask.cumsum(0) - 1).clamp_min(0)).forget(~mask)
 
     def updated(self, mask: Tensor, new: Plan) -> Plan:
-        """This plan, with the environments in mask (batch,) bool taken from a newer one."""
+        """Returns this plan, with the environments in mask (batch,) bool taken from a newer plan."""
 
         def choose(old: Any, fresh: Any) -> Any:
             if not isinstance(old, Tensor) or not isinstance(fresh, Tensor) or old.shape != fresh.shape:
-                return fresh  # diagnostics of another length describe the newer search only
+                return fresh  # diagnostics of another length exist for the newer search only
             chosen = rearrange(mask.to(old.device), f"batch -> batch {' '.join(['1'] * (old.ndim - 1))}")
             return torch.where(chosen, fresh, old)
 
@@ -113,17 +118,15 @@ class Plan:
 
 @dataclass(frozen=True)
 class WarmStart:
-    """The last plan, moved to the present.
+    """The previous plan, shifted to the present.
 
     Attributes:
         mean: Shifted plan with its tail filled, zeros where cold, within the bounds, (batch, horizon, action).
-        var: Variance to search with, (batch, horizon, action).
         elites: Shifted elites, (batch, kept, horizon, action), if any were kept.
-        is_warm: (batch,) bool on the CPU.
+        is_warm: Environments in which the previous plan is valid, (batch,) bool on the CPU.
     """
 
     mean: Tensor
-    var: Tensor
     elites: Tensor | None
     is_warm: Tensor
 
@@ -133,21 +136,17 @@ def shift_plan(
     *,
     horizon: int,
     tail: str,
-    variance: str,
-    initial_var: Tensor,
     bounds: tuple[Tensor, Tensor],
     policy_tail: Callable[[Tensor, Tensor], Tensor],
 ) -> WarmStart:
-    """Moves a plan forward by the actions executed since, and fills what that leaves open at its end.
+    """Shifts a plan by the actions executed since it was made, and fills its tail.
 
     Args:
-        previous: The last plan, of any length.
-        horizon: Actions of the next one.
+        previous: The previous plan, of any length.
+        horizon: Number of actions of the next plan.
         tail: `zero`, `hold` (the last action again) or `policy`.
-        variance: `reset` to the initial variance, `keep`, or `inflate` halfway between the two.
-        initial_var: Variance of a cold start, (action,).
         bounds: Lowest and highest action, each (action,).
-        policy_tail: `policy_tail(sequence, is_tail) -> sequence` fills by the model's policy.
+        policy_tail: `policy_tail(sequence, is_tail) -> sequence` fills the tail with the model's policy.
     """
     length = previous.mean.shape[1]
     device, low, high = previous.mean.device, *bounds
@@ -156,7 +155,7 @@ def shift_plan(
     index = position.clamp_max(length - 1).to(device)[..., None]
 
     def move(sequence: Tensor) -> Tensor:
-        """In this search's precision; past its end this repeats the last action: `hold`."""
+        """Returns the shifted sequence in this search's precision, its last action repeated past its end (`hold`)."""
         return torch.take_along_dim(sequence, index, dim=1).to(low.dtype)
 
     is_warm = previous.is_warm.to(device)[:, None, None]
@@ -167,14 +166,8 @@ def shift_plan(
         mean = policy_tail(mean, is_tail)
     mean = torch.where(is_warm, mean, 0.0).clamp(low, high)
 
-    var = initial_var.expand_as(mean)
-    if variance != "reset":
-        kept = torch.where(is_tail, var, move(previous.var))
-        kept = kept if variance == "keep" else (kept + var) / 2
-        var = torch.where(is_warm, kept, var)
-
     elites = previous.elites
     if elites is not None:
         elites = torch.take_along_dim(elites, index[:, None], dim=2).to(low.dtype)
         elites = torch.where(is_tail[:, None], mean[:, None], elites).clamp(low, high)
-    return WarmStart(mean, var, elites, previous.is_warm)
+    return WarmStart(mean, elites, previous.is_warm)

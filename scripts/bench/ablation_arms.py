@@ -76,7 +76,7 @@ def without_actor(base: PlannerConfig) -> dict[str, Any]:
     """Settings of a search that does not use the actor."""
     tail = {"tail": "zero"} if base.tail == "policy" else {}
     trust = {} if base.surprise_limit is None else {"surprise_limit": None}
-    return {"num_policy_samples": 0, "start": "shifted", **tail, **trust}
+    return {"num_policy_samples": 0, **tail, **trust}
 
 
 def play_arm(checkpoint: str, arm: Arm, seeds: Sequence[int], device: str, threads: int) -> Outcome:

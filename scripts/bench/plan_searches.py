@@ -37,6 +37,8 @@ def our_search(problem: Problem, dtype: str, batch: int = 1) -> Search:
         num_samples=problem.samples,
         num_elites=problem.num_elites,
         num_iterations=problem.iterations,
+        init_std=1.0,
+        min_std=0.0,
         terminal_value=False,
     )
     return lambda: planner.plan(model, start)

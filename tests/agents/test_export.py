@@ -60,7 +60,7 @@ def test_exported_program_gives_the_actions_of_the_agent(checkpoint, module):
 def test_documented_runner_gives_the_actions_of_the_agent_without_this_package(
     checkpoint, program, run_python, tmp_path, root
 ):
-    text = (root / "docs" / "distillation.md").read_text()
+    text = (root / "docs" / "guides" / "distillation.md").read_text()
     runner = next(part for part in text.split("```python\n")[1:] if "torch.export.load" in part).split("```")[0]
     film = np.random.default_rng(0).integers(0, 256, (6, 64, 64, 3), dtype=np.uint8)
     np.save(program.parent / "film.npy", film)

@@ -279,7 +279,7 @@ def test_gated_agent_executes_the_rest_of_the_plan_when_the_objective_is_not_the
     agent, sources = make(model, planning_budget=0.3, signal="random"), []
     agent.set_objective(lambda rollout: -rollout.actions[:, 0, 0])
     for frames in film:
-        expected = agent.controller.follow()
+        expected = agent.controller.next_actions()
         action = agent.act(frames[0])
         sources.append(agent.last_source)
         if agent.last_source == "tail":

@@ -1,4 +1,4 @@
-"""The listing that many readers start from runs as it is written, on this planner."""
+"""`CEMTrajectoryOptimizer` and its controller, with the demonstration of their interface."""
 
 import numpy as np
 import pytest
@@ -58,7 +58,7 @@ def rollout(state, sequence):
     return total
 
 
-def test_the_demonstration_runs_verbatim_and_prints_its_numbers(capsys):
+def test_optimizer_demonstration_prints_its_numbers(capsys):
     names = {"np": np, "CEMTrajectoryOptimizer": CEMTrajectoryOptimizer}
     exec(DEMONSTRATION, names)
     assert capsys.readouterr().out.splitlines() == [
@@ -69,7 +69,7 @@ def test_the_demonstration_runs_verbatim_and_prints_its_numbers(capsys):
     ]
 
 
-def test_receding_horizon_control_with_a_rollout_function_reaches_its_goal():
+def test_rollout_controller_reaches_its_goal():
     optimizer = CEMTrajectoryOptimizer(horizon=8, action_dim=1)
     controller = ModelPredictiveController(optimizer=optimizer, rollout_fn=rollout)
     state = np.array([1.0, 0.0])
@@ -81,7 +81,7 @@ def test_receding_horizon_control_with_a_rollout_function_reaches_its_goal():
     assert np.abs(state).max() < 0.1
 
 
-def test_the_plan_is_numpy_and_its_warm_start_zero_padded():
+def test_rollout_controller_pads_the_shifted_plan_with_zero():
     controller = ModelPredictiveController(CEMTrajectoryOptimizer(4, 1), rollout)
     action = controller.act(np.array([1.0, 0.0]))
     mean, var = CEMTrajectoryOptimizer(4, 1).plan(np.array([1.0, 0.0]), rollout)
@@ -92,20 +92,20 @@ def test_the_plan_is_numpy_and_its_warm_start_zero_padded():
     assert controller.warm_start is None
 
 
-def test_a_search_is_as_wide_as_its_bounds():
+def test_optimizer_searches_the_whole_action_range():
     optimizer = CEMTrajectoryOptimizer(3, 1, action_low=-100.0, action_high=100.0)
     mean, _ = optimizer.plan(np.zeros(1), lambda state, sequence: -float(((sequence - 50.0) ** 2).sum()))
     assert np.abs(mean - 50.0).max() < 10.0
 
 
-def test_a_search_starts_from_the_warm_start_as_it_is_given():
+def test_optimizer_starts_at_warm_start_mean_unshifted():
     optimizer = CEMTrajectoryOptimizer(3, 2, num_candidates=4, num_elites=4, num_iterations=1, smoothing=1e-12)
     given = np.array([[0.1, 0.2], [0.3, 0.4], [0.5, 0.6]])
     mean, _ = optimizer.plan(np.zeros(1), lambda state, sequence: 0.0, given)
     np.testing.assert_allclose(mean, given, atol=1e-9)
 
 
-def test_candidates_keep_the_bounds_and_the_state_arrives_untouched():
+def test_optimizer_passes_the_state_unchanged_and_sequences_within_bounds():
     seen, state = [], object()
 
     def record(given, sequence):
@@ -117,18 +117,18 @@ def test_candidates_keep_the_bounds_and_the_state_arrives_untouched():
     assert np.min(seen) >= -0.5 and np.max(seen) <= 0.25 and len(seen) == 5 * 100
 
 
-def test_equal_optimizers_give_equal_plans():
+def test_optimizers_with_equal_seeds_give_equal_plans():
     plans = [CEMTrajectoryOptimizer(3, 1, seed=seed).plan(np.array([1.0, 0.0]), rollout)[0] for seed in (4, 4, 5)]
     np.testing.assert_array_equal(plans[0], plans[1])
     assert not np.array_equal(plans[0], plans[2])
 
 
-def test_bad_settings_are_named():
+def test_optimizer_names_a_bad_setting():
     with pytest.raises(ValueError, match="num_elites"):
         CEMTrajectoryOptimizer(3, 1, num_candidates=5)
 
 
-def test_a_function_may_write_to_the_sequence_it_is_given():
+def test_rollout_fn_may_write_to_its_sequence():
     def written(state, sequence):
         sequence += state
         return -float(((sequence - 1.5) ** 2).sum())
@@ -140,13 +140,13 @@ def test_a_function_may_write_to_the_sequence_it_is_given():
     np.testing.assert_array_equal(*plans)
 
 
-def test_a_function_without_a_finite_return_is_told_of():
+def test_optimizer_warns_when_no_return_is_finite():
     with pytest.warns(RuntimeWarning, match="no sequence had a finite return"):
         mean, _ = CEMTrajectoryOptimizer(3, 1).plan(np.ones(1), lambda state, sequence: float("nan"))
     assert (mean == 0.0).all()
 
 
-def test_returns_of_the_numerical_example_may_be_whole_numbers():
+def test_step_numerical_example_accepts_integer_returns():
     candidates, zeros = np.arange(6, dtype=np.float32).reshape(3, 2, 1), np.zeros((2, 1))
     plans = [
         CEMTrajectoryOptimizer(2, 1).step_numerical_example(candidates, returns, zeros, zeros + 1.0)

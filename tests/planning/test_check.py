@@ -1,4 +1,4 @@
-"""`check_model` names what is wrong before the first plan does."""
+"""`check_model` names the problems of a model."""
 
 import numpy as np
 import pytest
@@ -9,7 +9,7 @@ from latentplan.planning import FunctionModel, check_model
 STATE = torch.randn(3, 4, generator=torch.Generator().manual_seed(0))
 
 
-def test_a_good_model_passes_and_its_abilities_are_listed(point):
+def test_check_model_returns_the_optional_methods_of_a_good_model(point):
     assert check_model(point, STATE, 2) == ("value", "policy")
 
 
@@ -38,8 +38,8 @@ def test_a_good_model_passes_and_its_abilities_are_listed(point):
         ({"value": lambda state: state.softmax(0).sum(1)}, r"influence each other: value"),
         ({"policy": lambda state, generator: (state - state.mean(0))[:, :2]}, r"influence each other: policy"),
         ({"particles": lambda state, num: state.repeat(num, 1)}, r"particles\(\)[^$]*not batch-major"),
-        ({"dynamics": lambda state, action: state.add_(0.1)}, r"step\(\) changes what it is given"),
-        ({"value": lambda state: state.mul_(2.0)[:, 0]}, r"value\(\) changes what it is given"),
+        ({"dynamics": lambda state, action: state.add_(0.1)}, r"step\(\) changes its inputs"),
+        ({"value": lambda state: state.mul_(2.0)[:, 0]}, r"value\(\) changes its inputs"),
         ({"dynamics": lambda state, action: state.reshape(7)}, r"step\(\) raises RuntimeError"),
         ({"value": lambda state: state.nothing}, r"value\(\) raises AttributeError"),
         ({"rollout": lambda state, actions: state}, r"rollout\(\) must return \(rewards, state\)"),
@@ -59,33 +59,33 @@ def test_a_good_model_passes_and_its_abilities_are_listed(point):
         ),
     ],
 )
-def test_what_is_wrong_is_named(point, change, complaint):
+def test_check_model_names_the_problem(point, change, complaint):
     for name, function in change.items():
         setattr(point, name, function)
     with pytest.raises(ValueError, match=complaint):
         check_model(point, STATE, 2)
 
 
-def test_any_whole_number_of_particles_is_one(point):
+def test_check_model_accepts_numpy_integers_as_num_particles(point):
     point.num_particles = np.int64(2)
     check_model(point, STATE, 2)
 
 
 @pytest.mark.parametrize("state", [torch.zeros(5, 4), torch.zeros(1, 4)])
-def test_rows_that_are_alike_do_not_hide_that_they_influence_each_other(point, state):
+def test_check_model_finds_dependent_rows_when_given_rows_are_equal(point, state):
     point.value = lambda state: -(state - state.mean(0)).square().sum(1)
     with pytest.raises(ValueError, match=r"influence each other: value"):
         check_model(point, state, 2)
 
 
-def test_all_problems_are_named_at_once(point):
+def test_check_model_names_all_problems_at_once(point):
     point.value = lambda state: state
     point.policy = lambda state, generator: state
     with pytest.raises(ValueError, match=r"value\(\)[^$]*policy\(\)"):
         check_model(point, STATE, 2)
 
 
-def test_a_model_without_step_and_a_state_that_is_none_are_named():
+def test_check_model_names_a_missing_step_and_a_state_that_is_no_tensor():
     with pytest.raises(ValueError, match="no step"):
         check_model(object(), STATE, 2)
     model = FunctionModel(lambda state, action: state, lambda state, action: action[:, 0])
@@ -96,7 +96,7 @@ def test_a_model_without_step_and_a_state_that_is_none_are_named():
         check_model(model, STATE, 2)
 
 
-def test_what_steps_that_sample_come_to_is_not_compared():
+def test_check_model_does_not_compare_steps_that_sample():
     def dynamics(state, action):
         return state + 0.1 * torch.randn_like(state)
 
@@ -108,7 +108,7 @@ def test_what_steps_that_sample_come_to_is_not_compared():
     assert check_model(model, STATE, 2) == ("rollout", "fast_step")
 
 
-def test_a_layer_that_mixes_the_batch_is_found():
+def test_check_model_finds_a_layer_that_mixes_the_batch():
     layer = torch.nn.BatchNorm1d(4)
     model = FunctionModel(lambda state, action: layer(state + action[:, :1]), lambda state, action: action[:, 0])
     layer.eval()

@@ -1,4 +1,4 @@
-"""A compiled rollout changes nothing but the time."""
+"""A compiled rollout gives the same plans."""
 
 import pickle
 
@@ -22,7 +22,7 @@ def counted():
     return backend, programs
 
 
-def test_plans_are_those_of_the_model_itself(point, states, seeded, counted):
+def test_compile_rollout_gives_the_same_plans(point, states, seeded, counted):
     backend, programs = counted
     model = compile_rollout(point, backend=backend)
     check_model(model, states, action_dim=2)
@@ -32,14 +32,14 @@ def test_plans_are_those_of_the_model_itself(point, states, seeded, counted):
     torch.testing.assert_close(compiled.expected_return, own.expected_return)
 
 
-def test_all_steps_are_one_program(point, counted):
+def test_compile_rollout_makes_one_program_of_all_steps(point, counted):
     backend, programs = counted
     model = compile_rollout(FunctionModel(point.dynamics, point.reward), backend=backend)
     PLANNER.plan(model, torch.ones(1, 4))
     assert len(programs) == 1
 
 
-def test_a_models_own_rollout_is_what_is_compiled(point, seeded, counted):
+def test_compile_rollout_compiles_the_models_own_rollout(point, seeded, counted):
     def rollout(state, actions):
         rewards = -(state[:, :1] + actions.sum(dim=2).cumsum(dim=1)).square()
         return rewards, state
@@ -54,7 +54,7 @@ def test_a_models_own_rollout_is_what_is_compiled(point, seeded, counted):
     torch.testing.assert_close(compiled.actions, own.actions)
 
 
-def test_it_has_what_the_model_has_and_lacks_what_it_lacks(point, counted):
+def test_compile_rollout_keeps_the_set_of_optional_methods(point, counted):
     backend, _ = counted
     model = compile_rollout(FunctionModel(point.dynamics, point.reward), backend=backend)
     with pytest.raises(ValueError, match=r"needs a model with value\(\)"):
@@ -71,7 +71,7 @@ class Drift:
         return state[:, 0]
 
 
-def test_it_can_be_sent_to_another_process():
+def test_compile_rollout_survives_pickling():
     again = pickle.loads(pickle.dumps(compile_rollout(Drift(), backend="eager")))
     rewards, last = again.rollout(torch.ones(5, 2), torch.ones(5, 3, 2))
     assert rewards[0].tolist() == [-2.0, -8.0, -18.0] and again.value(last).tolist() == [4.0] * 5

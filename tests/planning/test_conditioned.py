@@ -1,4 +1,4 @@
-"""A goal that a model has learned is searched as if the model had been trained for it alone."""
+"""A search for a learned goal equals a search in a model that was trained for this goal."""
 
 import pytest
 import torch
@@ -29,16 +29,16 @@ def to_goal(model):
     return GOAL
 
 
-def test_the_plan_is_the_one_of_a_model_that_was_trained_for_the_goal(point, states, make_planner, seeded):
+def test_conditioned_gives_the_plan_of_a_model_trained_for_the_goal(point, states, make_planner, seeded):
     planner = make_planner(num_policy_samples=8, goal_horizon=9)
     plan = planner.plan(point, states, objective=conditioned(to_goal), generator=seeded())
     own = planner.plan(GOAL, states, generator=seeded())
-    assert plan.actions.shape == (5, 6, 2)  # as long as for the model's own return: the value tells what comes after
+    assert plan.actions.shape == (5, 6, 2)  # `horizon` steps, not `goal_horizon`, because the goal has a value
     assert torch.equal(plan.actions, own.actions) and torch.equal(plan.expected_return, own.expected_return)
     assert not torch.allclose(plan.actions, planner.plan(point, states, generator=seeded()).actions)
 
 
-def test_a_search_may_leave_the_value_of_the_goal_out(point, states, make_planner, seeded):
+def test_conditioned_search_omits_the_goals_value_when_terminal_value_is_false(point, states, make_planner, seeded):
     plans = [
         make_planner(terminal_value=kept).plan(point, states, objective=conditioned(to_goal), generator=seeded())
         for kept in (True, False)
@@ -46,7 +46,7 @@ def test_a_search_may_leave_the_value_of_the_goal_out(point, states, make_planne
     assert not torch.allclose(plans[0].expected_return, plans[1].expected_return)
 
 
-def test_as_a_part_of_a_sum_it_is_worth_the_same(point, states, make_planner, seeded):
+def test_conditioned_has_the_same_return_in_a_sum(point, states, make_planner, seeded):
     planner = make_planner(num_iterations=1)
     alone = planner.plan(point, states, objective=conditioned(to_goal), generator=seeded())
     summed = planner.plan(point, states, objective=conditioned(to_goal) + 0.0 * action_penalty(), generator=seeded())
@@ -66,7 +66,7 @@ class Idle:
 
 
 @pytest.mark.parametrize("is_goal", [False, True])
-def test_beside_a_loop_the_policy_of_the_goal_acts_where_there_is_no_plan(is_goal, point, states, make_planner):
+def test_scheduler_takes_the_goals_policy_when_there_is_no_plan(is_goal, point, states, make_planner):
     scheduler = PlanScheduler(make_planner(), point, Idle())
     scheduler.set_objective(conditioned(to_goal) if is_goal else None)
     decision = scheduler.decide(states)

@@ -1,4 +1,4 @@
-"""Receding-horizon control: what is kept between steps, and what forgets it."""
+"""Receding-horizon control: the plan that is kept between steps, and the calls that forget it."""
 
 import itertools
 
@@ -18,7 +18,7 @@ def make_controller(point, make_planner, seeded):
     return make
 
 
-def test_acting_is_planning_with_the_last_plan(point, states, make_controller, make_planner, seeded):
+def test_act_plans_with_the_last_plan(point, states, make_controller, make_planner, seeded):
     controller, planner, generator = make_controller(), make_planner(), seeded()
     first = planner.plan(point, states, generator=generator)
     torch.testing.assert_close(controller.act(states), first.action)
@@ -26,7 +26,7 @@ def test_acting_is_planning_with_the_last_plan(point, states, make_controller, m
     torch.testing.assert_close(controller.act(states + 0.1), second.action)
 
 
-def test_reset_forgets_everything(states, make_controller):
+def test_reset_forgets_the_plan(states, make_controller):
     controller = make_controller(num_iterations=4, warm_start_iterations=1, keep_elite_fraction=0.5)
     controller.act(states)
     controller.act(states)
@@ -37,7 +37,7 @@ def test_reset_forgets_everything(states, make_controller):
     assert controller.plan.info["iterations"].tolist() == [4] * 5
 
 
-def test_reset_by_mask_forgets_those_environments_only(states, make_controller):
+def test_reset_with_mask_forgets_only_masked_environments(states, make_controller):
     controller = make_controller(num_iterations=4, warm_start_iterations=1)
     controller.reset(torch.tensor([True, False]))  # nothing to forget yet
     controller.act(states)
@@ -48,7 +48,7 @@ def test_reset_by_mask_forgets_those_environments_only(states, make_controller):
     assert controller.plan.info["iterations"].tolist() == [1] * 5
 
 
-def test_a_plan_is_executed_for_as_long_as_asked(point, states, make_controller):
+def test_controller_executes_replan_every_actions_of_a_plan(point, states, make_controller):
     controller = make_controller(replan_every=3)
     actions = [controller.act(states) for _ in range(3)]
     plan = controller.plan
@@ -57,7 +57,7 @@ def test_a_plan_is_executed_for_as_long_as_asked(point, states, make_controller)
     assert controller.plan.mean is not plan.mean
 
 
-def test_the_warm_start_skips_all_that_was_executed(states, make_controller):
+def test_warm_start_skips_all_executed_actions(states, make_controller):
     controller = make_controller(replan_every=3)
     for _ in range(3):
         controller.act(states)
@@ -69,7 +69,7 @@ def test_the_warm_start_skips_all_that_was_executed(states, make_controller):
     assert (frozen.plan.mean[:, 3:] == 0).all()
 
 
-def test_a_reset_environment_is_replanned_at_once_and_the_others_go_on(states, make_controller):
+def test_controller_replans_only_the_environment_that_was_reset(states, make_controller):
     controller = make_controller(replan_every=4)
     controller.act(states)
     before = controller.plan
@@ -81,7 +81,7 @@ def test_a_reset_environment_is_replanned_at_once_and_the_others_go_on(states, m
     assert controller.plan.elapsed.tolist() == [2, 2, 1, 2, 2]
 
 
-def test_another_objective_takes_effect_at_once_and_keeps_the_plan_as_its_start(states, make_controller):
+def test_set_objective_replans_at_once_from_the_last_plan(states, make_controller):
     controller = make_controller(replan_every=4, num_samples=256, num_iterations=6, num_elites=16)
     first = controller.act(states)
     controller.set_objective(action_penalty())
@@ -91,14 +91,14 @@ def test_another_objective_takes_effect_at_once_and_keeps_the_plan_as_its_start(
     assert (controller.act(torch.zeros(5, 4)) > 0.3).all()
 
 
-def test_another_number_of_environments_starts_cold(states, make_controller):
+def test_controller_starts_cold_when_the_number_of_environments_changes(states, make_controller):
     controller = make_controller(num_iterations=4, warm_start_iterations=1)
     controller.act(states)
     assert controller.act(states[:2]).shape == (2, 2)
     assert controller.plan.info["iterations"].tolist() == [4, 4]
 
 
-def test_latency_is_measured(states, make_controller):
+def test_controller_measures_latency_quantiles(states, make_controller):
     controller = make_controller()
     assert controller.latency == {}
     for _ in range(5):
@@ -107,12 +107,12 @@ def test_latency_is_measured(states, make_controller):
     assert 0 < latency["p50_ms"] <= latency["p95_ms"] <= latency["p99_ms"]
 
 
-def test_more_steps_per_plan_than_it_has_are_refused(make_controller):
+def test_controller_refuses_replan_every_beyond_the_horizon(make_controller):
     with pytest.raises(ValueError, match=r"replan_every \(7\)"):
         make_controller(replan_every=7)
 
 
-def test_deciding_for_some_environments_leaves_the_others_plans_to_age(states, make_controller):
+def test_act_where_ages_the_plans_of_other_environments(states, make_controller):
     controller, reference = make_controller(), make_controller()
     reference.act(states)
     controller.act(states)
@@ -124,18 +124,18 @@ def test_deciding_for_some_environments_leaves_the_others_plans_to_age(states, m
     assert torch.equal(controller.plan.actions[~where], before.actions[~where])
 
 
-def test_plans_for_an_old_objective_are_not_followed_where_nobody_planned_since(states, make_controller):
+def test_next_actions_marks_plans_of_an_old_objective_as_invalid(states, make_controller):
     controller = make_controller()
     controller.act(states)
     controller.set_objective(action_penalty())
     controller.act_where(states, torch.tensor([0, 1, 0, 0, 1]).bool())
-    _, is_left = controller.follow()
+    _, is_left = controller.next_actions()
     assert is_left.tolist() == [False, True, False, False, True]
     controller.act(states)
-    assert controller.follow()[1].all()
+    assert controller.next_actions()[1].all()
 
 
-def test_the_warm_start_skips_what_others_did(states, make_controller):
+def test_warm_start_skips_steps_of_another_agent(states, make_controller):
     controller = make_controller()
     controller.act(states)
     last = controller.plan
@@ -147,7 +147,7 @@ def test_the_warm_start_skips_what_others_did(states, make_controller):
     torch.testing.assert_close(frozen.plan.mean[:, :3], last.actions[:, 3:])
 
 
-def test_a_plan_that_has_run_out_is_no_warm_start(states, make_controller):
+def test_search_starts_cold_when_the_plan_has_run_out(states, make_controller):
     controller = make_controller(num_iterations=4, warm_start_iterations=1)
     controller.skip()  # nothing to age yet
     controller.act(states)
@@ -160,7 +160,7 @@ def test_a_plan_that_has_run_out_is_no_warm_start(states, make_controller):
     assert controller.plan.info["iterations"].tolist() == [1, 4, 4, 4, 4]
 
 
-def test_deciding_for_some_first_leaves_the_others_cold(states, make_controller, seeded):
+def test_act_where_leaves_environments_without_a_plan_cold(states, make_controller, seeded):
     controller = make_controller(num_iterations=4, warm_start_iterations=1)
     controller.generator = [seeded(seed) for seed in range(5)]
     controller.act_where(states, torch.tensor([0, 0, 1, 0, 0]).bool())
@@ -169,8 +169,8 @@ def test_deciding_for_some_first_leaves_the_others_cold(states, make_controller,
         controller.act_where(states, torch.zeros(5))
 
 
-def test_an_objective_is_planned_for_as_far_ahead_as_it_asks_for(states, make_controller):
-    """What is left of the last plan is where the next search starts, cut or filled with zeros."""
+def test_controller_changes_plan_length_with_the_objective(states, make_controller):
+    """The rest of the last plan, cut or filled with zeros, starts the next search."""
     controller = make_controller(goal_horizon=9, init_std=0.0, num_iterations=1)
     controller.act(states)
     own = controller.plan.actions
@@ -185,22 +185,22 @@ def test_an_objective_is_planned_for_as_far_ahead_as_it_asks_for(states, make_co
     torch.testing.assert_close(controller.plan.mean, further[:, 1:7])
 
 
-def test_a_plan_of_another_length_is_no_plan_of_the_other_environments(states, make_controller):
+def test_act_where_leaves_others_cold_when_plans_have_another_length(states, make_controller):
     controller = make_controller(goal_horizon=9)
     controller.act(states)
     controller.set_objective(action_penalty())
     some = torch.tensor([1, 0, 0, 1, 0]).bool()
     controller.act_where(states, some)
     assert controller.plan.is_warm.tolist() == some.tolist()
-    assert controller.follow()[1].tolist() == some.tolist()
+    assert controller.next_actions()[1].tolist() == some.tolist()
 
 
-def test_no_more_is_executed_than_the_shorter_plan_holds(make_controller):
+def test_controller_refuses_replan_every_beyond_goal_horizon(make_controller):
     with pytest.raises(ValueError, match="horizon \\(3\\)"):
         make_controller(replan_every=4, goal_horizon=3)
 
 
-def test_a_reset_elsewhere_leaves_the_random_stream_of_an_environment_alone(states, point, make_planner, seeded):
+def test_actions_of_an_environment_are_the_same_when_another_is_reset(states, point, make_planner, seeded):
     def actions(resets):
         generators = [seeded(row) for row in range(5)]
         controller = ModelPredictiveController(make_planner(), point, generator=generators, replan_every=3)
@@ -214,7 +214,7 @@ def test_a_reset_elsewhere_leaves_the_random_stream_of_an_environment_alone(stat
     torch.testing.assert_close(actions(resets=True), actions(resets=False))
 
 
-def test_environments_that_share_a_stream_draw_on(point, states, make_planner, seeded):
+def test_shared_stream_advances_at_every_replan(point, states, make_planner, seeded):
     generator = seeded()
     controller = ModelPredictiveController(make_planner(), point, generator=[generator] * 5, replan_every=2)
     controller.act(states)
@@ -226,7 +226,7 @@ def test_environments_that_share_a_stream_draw_on(point, states, make_planner, s
     assert not any(torch.equal(before, after) for before, after in itertools.pairwise(drawn))
 
 
-def test_a_search_that_fails_draws_nothing_for_those_who_wait(point, states, make_planner, seeded):
+def test_failed_search_draws_nothing_from_streams_of_waiting_environments(point, states, make_planner, seeded):
     generators = [seeded(row) for row in range(5)]
     controller = ModelPredictiveController(make_planner(), point, generator=generators, replan_every=3)
     controller.act(states)
@@ -238,7 +238,7 @@ def test_a_search_that_fails_draws_nothing_for_those_who_wait(point, states, mak
     assert all(torch.equal(kept, now.get_state()) for kept, now in zip(before[1:], generators[1:], strict=True))
 
 
-def test_what_cannot_be_decided_leaves_the_plans_as_they_are(states, point, make_planner):
+def test_act_where_keeps_the_plans_when_the_search_fails(states, point, make_planner):
     goals = torch.randn(5, 4)
     controller = ModelPredictiveController(make_planner(), point, objective=goal_term(goals))
     controller.act(states)
@@ -248,8 +248,8 @@ def test_what_cannot_be_decided_leaves_the_plans_as_they_are(states, point, make
     assert controller.plan is plan
 
 
-def test_a_plan_goes_on_in_another_precision(states, make_controller):
-    controller = make_controller(keep_elite_fraction=0.5, warm_start_variance="keep")
+def test_controller_continues_a_plan_in_another_precision(states, make_controller):
+    controller = make_controller(keep_elite_fraction=0.5)
     assert controller.act(states.double()).dtype == torch.float64
     assert controller.act(states).dtype == torch.float32
     assert controller.act(states.double()).dtype == torch.float64

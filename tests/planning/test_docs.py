@@ -1,4 +1,4 @@
-"""The page's examples run, and its table lists every option."""
+"""The examples of docs/planning.md run, and its table lists every option."""
 
 import dataclasses
 import re
@@ -12,16 +12,16 @@ PAGE = (Path(__file__).parents[2] / "docs" / "guides" / "planning.md").read_text
 EXAMPLES = re.findall(r"```python\n(.*?)```", PAGE, flags=re.DOTALL)
 
 
-def test_the_page_has_its_examples():
+def test_planning_page_has_eight_examples():
     assert len(EXAMPLES) == 8
 
 
 @pytest.mark.parametrize("index", range(len(EXAMPLES)))
-def test_example_runs(index):
+def test_planning_page_example_runs(index):
     exec(compile(EXAMPLES[index], f"docs/guides/planning.md, example {index}", "exec"), {"__name__": "example"})
 
 
-def test_the_table_lists_every_option_with_its_default():
+def test_planning_page_lists_every_option_with_its_default():
     rows = [
         line.split("|") for line in PAGE.split("## Options")[1].split("## ")[0].splitlines() if line.startswith("| `")
     ]

@@ -1,4 +1,4 @@
-"""A model may take its steps sooner for a planner."""
+"""A search uses the `fast_step` of a model."""
 
 import pytest
 import torch
@@ -6,7 +6,7 @@ import torch
 from latentplan.planning import CEMPlanner, check_model
 
 
-def test_steps_are_taken_by_the_models_fast_step_where_no_gradient_is_asked_for(seeded):
+def test_search_uses_fast_step_except_for_gradients(seeded):
     class Model:
         def __init__(self):
             self.calls = {"step": 0, "fast_step": 0}
@@ -26,7 +26,7 @@ def test_steps_are_taken_by_the_models_fast_step_where_no_gradient_is_asked_for(
     assert not torch.equal(plans[0].actions, plans[1].actions)
 
 
-def test_a_fast_step_that_is_another_step_is_named_before_the_first_plan():
+def test_check_model_names_a_fast_step_that_disagrees_with_step():
     class Model:
         def step(self, state, action):
             return state + action, -state.square().sum(dim=1)

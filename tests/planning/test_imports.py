@@ -1,4 +1,4 @@
-"""The planner stands on torch alone."""
+"""The planning package imports torch and einops, and no simulator or trainer."""
 
 import subprocess
 import sys
@@ -22,5 +22,5 @@ assert not strays, strays
 """
 
 
-def test_planning_imports_without_simulators_or_trainers():
+def test_planning_imports_only_torch_einops_and_config():
     subprocess.run([sys.executable, "-c", SCRIPT], cwd=PROJECT, check=True)

@@ -1,4 +1,4 @@
-"""Objectives compose as their arithmetic says, and constraints come before returns."""
+"""Arithmetic of objectives, risk measures, and constraints."""
 
 import numpy as np
 import pytest
@@ -55,26 +55,26 @@ def test_terms_add_and_multiply(point, states, actions):
 
 
 @pytest.mark.parametrize("half", [0.5, np.float32(0.5), torch.tensor(0.5)])
-def test_any_kind_of_number_is_one(point, states, actions, half):
+def test_terms_multiply_with_any_kind_of_number(point, states, actions, half):
     expected = 0.5 * returns(point, learned_return(), states, actions)
     torch.testing.assert_close(returns(point, learned_return() * half, states, actions), expected)
 
 
-def test_the_default_objective_is_reward_plus_value(point, states, actions):
+def test_default_objective_is_reward_plus_value(point, states, actions):
     composed = learned_return() + terminal_value()
     torch.testing.assert_close(
         returns(point, None, states, actions, discount=0.9), returns(point, composed, states, actions, discount=0.9)
     )
 
 
-def test_penalties_are_what_they_say(walk, actions):
+def test_action_and_smoothness_penalty_equal_their_formulas(walk, actions):
     state = torch.zeros(5, 2)
     torch.testing.assert_close(returns(walk, action_penalty(), state, actions), -actions.square().sum(dim=(2, 3)))
     changes = (actions[:, :, 1:] - actions[:, :, :-1]).square().sum(dim=(2, 3))
     torch.testing.assert_close(returns(walk, smoothness_penalty(), state, actions), -changes)
 
 
-def test_a_goal_is_compared_with_the_last_every_or_the_closest_state(walk, actions):
+def test_goal_term_measures_the_last_the_sum_or_the_closest_state(walk, actions):
     state, goal = torch.zeros(5, 2), torch.tensor([0.5, -1.0])
     distances = (actions.cumsum(dim=2) - goal).square().mean(dim=-1)
     for over, expected in [("last", distances[..., -1]), ("sum", distances.sum(-1)), ("min", distances.amin(-1))]:
@@ -85,7 +85,7 @@ def test_a_goal_is_compared_with_the_last_every_or_the_closest_state(walk, actio
     torch.testing.assert_close(returns(walk, first, state, actions), -(actions.sum(dim=2)[..., 0] - 0.5).square())
 
 
-def test_every_environment_may_have_its_own_goal(walk, make_planner, seeded):
+def test_goal_term_takes_one_goal_per_environment(walk, make_planner, seeded):
     goals = torch.tensor([[1.5, 0.5], [-1.0, 2.0], [0.0, -2.0]])
     planner = make_planner(num_samples=256, num_iterations=8)
     plan = planner.plan(walk, torch.zeros(3, 2), objective=goal_term(goals), generator=seeded())
@@ -94,7 +94,7 @@ def test_every_environment_may_have_its_own_goal(walk, make_planner, seeded):
         planner.plan(walk, torch.zeros(2, 2), objective=goal_term(goals))
 
 
-def test_uncertainty_is_asked_where_each_action_is_taken(walk, actions):
+def test_uncertainty_penalty_uses_the_state_before_each_action(walk, actions):
     walk.uncertainty = lambda state, action: state.abs().sum(dim=1) + action.abs().sum(dim=1)
     positions = torch.cat([torch.zeros(5, 7, 1, 2), actions.cumsum(dim=2)[:, :, :-1]], dim=2)
     doubt = (positions.abs().sum(-1) + actions.abs().sum(-1)) * 0.9 ** torch.arange(4.0)
@@ -102,7 +102,7 @@ def test_uncertainty_is_asked_where_each_action_is_taken(walk, actions):
     torch.testing.assert_close(measured, -doubt.sum(dim=-1))
 
 
-def test_an_objective_names_what_the_model_lacks(walk, states, make_planner):
+def test_plan_names_the_method_that_an_objective_needs(walk, states, make_planner):
     for objective, method in [(uncertainty_penalty(), "uncertainty"), (learned_return() + terminal_value(), "value")]:
         with pytest.raises(ValueError, match=method):
             make_planner().plan(walk, states[:, :2], objective=objective)
@@ -119,7 +119,7 @@ class Gamble:
         return slopes.repeat(len(state))[:, None]
 
 
-def test_risk_measures_look_at_their_share_of_the_outcomes():
+def test_risk_averages_the_share_of_its_measure():
     actions = torch.tensor([-1.0, 0.5, 1.0]).reshape(1, 3, 1, 1).expand(2, 3, 1, 1)
     state = torch.zeros(2, 1)
     for measure, share, good, bad in [
@@ -132,7 +132,7 @@ def test_risk_measures_look_at_their_share_of_the_outcomes():
         torch.testing.assert_close(measured, torch.tensor([[bad, good / 2, good]]).expand(2, 3))
 
 
-def test_the_mean_of_a_model_with_particles_of_its_own_is_of_all_of_them():
+def test_risk_mean_covers_all_particles_of_the_model():
     model = Gamble()
     model.num_particles = 8
     actions = torch.tensor([-1.0, 1.0]).reshape(1, 2, 1, 1)
@@ -140,7 +140,7 @@ def test_the_mean_of_a_model_with_particles_of_its_own_is_of_all_of_them():
     torch.testing.assert_close(returns(model, objective, torch.zeros(1, 1), actions), torch.tensor([[-0.75, 0.75]]))
 
 
-def test_risk_changes_the_plan_and_composes(make_planner, seeded):
+def test_risk_changes_the_plan_and_adds_to_other_terms(make_planner, seeded):
     mean, worst = (
         make_planner(horizon=1, action_dim=1).plan(
             Gamble(), torch.zeros(3, 1), objective=risk(learned_return(), measure=measure), generator=seeded()
@@ -157,7 +157,7 @@ def test_risk_changes_the_plan_and_composes(make_planner, seeded):
         risk(learned_return(), num_particles=4) + risk(learned_return(), num_particles=8)
 
 
-def test_a_particle_that_breaks_breaks_its_candidate(make_planner, seeded):
+def test_candidate_is_no_elite_when_one_particle_is_nan(make_planner, seeded):
     class Breaks(Gamble):
         def step(self, state, action):
             return state, torch.where((action[:, 0] > 0) & (state[:, 0] < 0), float("nan"), action[:, 0])
@@ -169,7 +169,7 @@ def test_a_particle_that_breaks_breaks_its_candidate(make_planner, seeded):
     assert (plan.action <= 0).all()
 
 
-def test_proposals_of_a_policy_are_judged_over_all_particles(seeded, make_planner):
+def test_proposals_are_scored_over_all_particles(seeded, make_planner):
     class WithPolicy(Gamble):
         def policy(self, state, generator):
             return torch.ones(len(state), 1)
@@ -182,12 +182,12 @@ def test_proposals_of_a_policy_are_judged_over_all_particles(seeded, make_planne
 
 
 def wall(rollout):
-    """Positions right of 0.5 are forbidden; the violation is how far they go."""
+    """Positions above 0.5 are infeasible; the violation is the distance beyond 0.5."""
     return torch.stack([state[:, 0] for state in rollout.states]).amax(dim=0) - 0.5
 
 
 @pytest.mark.parametrize("make", ["cem", "mppi"])
-def test_constraints_hold_and_what_is_left_is_maximised(walk, make_planner, seeded, make):
+def test_constraints_are_satisfied_and_the_return_maximised(walk, make_planner, seeded, make):
     settings = {"num_samples": 400, "num_elites": 20, "num_iterations": 6, "horizon": 3}
     planner = make_planner(**settings)
     if make == "mppi":
@@ -200,7 +200,7 @@ def test_constraints_hold_and_what_is_left_is_maximised(walk, make_planner, seed
     assert (reached[:, -1] > 0.3).all()
 
 
-def test_a_penalty_trades_the_constraint_for_return(walk, make_planner, seeded):
+def test_constraint_penalty_trades_violation_for_return(walk, make_planner, seeded):
     settings = {"num_samples": 400, "num_elites": 20, "num_iterations": 6, "horizon": 3}
     cheap, dear = (
         make_planner(constraint_penalty=penalty, **settings).plan(
@@ -216,7 +216,7 @@ def wall_violation(plan):
     return (plan.actions[..., 0].cumsum(dim=1).amax(dim=1) - 0.5).clamp_min(0)
 
 
-def test_without_any_feasible_candidate_the_least_infeasible_is_chosen(walk, make_planner, seeded):
+def test_least_infeasible_candidate_is_chosen_when_none_is_feasible(walk, make_planner, seeded):
     plan = make_planner(num_samples=400, num_iterations=6, horizon=3).plan(
         walk, torch.tensor([[4.0, 0.0]]), constraints=[wall], generator=seeded()
     )
@@ -224,8 +224,8 @@ def test_without_any_feasible_candidate_the_least_infeasible_is_chosen(walk, mak
     assert plan.info["violation"].item() == pytest.approx(4.0 + plan.actions[0, 0, 0].item() - 0.5, abs=1e-4)
 
 
-def test_a_mean_that_breaks_a_constraint_is_not_executed(make_planner, seeded):
-    """Feasible actions lie on both sides of a forbidden middle: their mean is forbidden."""
+def test_best_candidate_is_executed_when_the_mean_violates_a_constraint(make_planner, seeded):
+    """Feasible actions lie on both sides of an infeasible middle, so their mean is infeasible."""
     model = FunctionModel(lambda state, action: state, lambda state, action: -action[:, 1].square())
     planner = make_planner(horizon=1, num_samples=400, num_elites=200, num_iterations=1)
     middle = planner.plan(
@@ -235,7 +235,7 @@ def test_a_mean_that_breaks_a_constraint_is_not_executed(make_planner, seeded):
     assert (middle.actions[:, 0, 0].abs() >= 0.4).all() and (middle.info["violation"] == 0).all()
 
 
-def test_a_violation_that_is_nan_is_not_feasible(walk, make_planner, seeded):
+def test_candidate_is_infeasible_when_its_violation_is_nan(walk, make_planner, seeded):
     plan = make_planner(horizon=1, final="best").plan(
         walk,
         torch.zeros(2, 2),
@@ -245,7 +245,7 @@ def test_a_violation_that_is_nan_is_not_feasible(walk, make_planner, seeded):
     assert (plan.action[:, 0] <= 0).all()
 
 
-def test_a_constraint_on_every_state_adds_up_its_excess(walk, actions):
+def test_at_every_state_sums_the_excess_over_the_steps(walk, actions):
     constraint = at_every_state(lambda state: state[:, 0] - 0.5)
     excess = (actions.cumsum(dim=2)[..., 0] - 0.5).clamp_min(0).sum(dim=2)
     scores = score(walk, None, torch.zeros(5, 2), actions, constraints=[constraint])
@@ -254,7 +254,7 @@ def test_a_constraint_on_every_state_adds_up_its_excess(walk, actions):
     torch.testing.assert_close(penalised.returns, scores.returns - 2 * excess)
 
 
-def test_bad_choices_are_named():
+def test_goal_term_and_risk_name_a_bad_argument():
     with pytest.raises(ValueError, match="metric"):
         goal_term(torch.zeros(2), metric="l1")
     with pytest.raises(ValueError, match="measure"):
@@ -269,7 +269,7 @@ def test_terms_are_subtracted_from_and_divided_by_numbers(walk, actions):
     torch.testing.assert_close(returns(walk, action_penalty() / 2, torch.zeros(5, 2), actions), size / 2)
 
 
-def test_a_constraint_may_ask_for_particles(make_planner, seeded):
+def test_constraint_sets_the_number_of_particles(make_planner, seeded):
     seen = []
 
     def watch(rollout):

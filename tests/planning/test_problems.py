@@ -1,4 +1,4 @@
-"""Problems with a known answer: linear-quadratic control, and a pendulum that must be swung up."""
+"""Problems with a known solution: linear-quadratic control, and a pendulum that must be swung up."""
 
 import math
 
@@ -27,7 +27,7 @@ def riccati(dynamics, control, state_cost, action_cost, horizon):
 
 
 @pytest.mark.parametrize("num_states", [2, 4, 8, 12])
-def test_linear_quadratic_return_is_within_two_percent_of_riccatis(num_states):
+def test_icem_reaches_the_riccati_return_within_two_percent(num_states):
     generator = torch.Generator().manual_seed(num_states)
     dynamics, control, state_cost, action_cost = linear_problem(num_states, generator)
     horizon = 8
@@ -59,8 +59,8 @@ def test_linear_quadratic_return_is_within_two_percent_of_riccatis(num_states):
     assert (achieved >= 1.02 * optimum).all() and (achieved <= optimum + 1e-9).all()
 
 
-def test_a_pendulum_is_swung_up_with_its_true_dynamics():
-    """Torque 2 against gravity 10: it must swing back and forth before it can stand."""
+def test_icem_swings_up_a_pendulum_with_its_true_dynamics():
+    """The torque is too small to lift the pendulum directly, so it must swing back and forth."""
 
     def dynamics(state, action):
         angle, speed = state[:, 0], state[:, 1]
@@ -89,7 +89,7 @@ def test_a_pendulum_is_swung_up_with_its_true_dynamics():
     assert torch.cos(state[:, 0]).min() > 0.95 and state[:, 1].abs().max() < 1.0
 
 
-def test_bfloat16_and_float32_trunks_share_their_elites_under_a_value_of_1000():
+def test_elites_are_the_same_for_bfloat16_and_float32_trunks_at_a_value_of_1000():
     """Only the trunk's products are in bfloat16; a return of 1000 summed there would step by 4."""
     generator = torch.Generator().manual_seed(0)
     hidden, output = torch.randn(16, 64, generator=generator) / 4, torch.randn(64, 16, generator=generator) / 8

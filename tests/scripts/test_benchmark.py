@@ -96,8 +96,8 @@ def test_parse_arms_applies_settings_of_own_arms():
 
 
 def test_parse_arms_no_actor_removes_every_use_of_the_actor():
-    _, arm = parse_arms("no_actor", replace(PLANNER, start="policy", tail="policy", surprise_limit=2.0))
-    assert arm.planner == {"num_policy_samples": 0, "start": "shifted", "tail": "zero", "surprise_limit": None}
+    _, arm = parse_arms("no_actor", replace(PLANNER, tail="policy", surprise_limit=2.0))
+    assert arm.planner == {"num_policy_samples": 0, "tail": "zero", "surprise_limit": None}
 
 
 @pytest.mark.parametrize(

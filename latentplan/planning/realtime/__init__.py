@@ -1,1 +1,1 @@
-"""Plans that are searched beside the control loop."""
+"""Planning in real time: searches that run beside the control loop."""

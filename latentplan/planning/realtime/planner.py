@@ -1,4 +1,4 @@
-"""Planning in real time: plans by the tick they are for, and a search that runs beside the control loop."""
+"""A buffer of plans by tick, and a planner that searches in a process or thread beside the control loop."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from multiprocessing.context import SpawnProcess
 from queue import Empty, SimpleQueue
 from types import TracebackType
-from typing import Any, Protocol
+from typing import Any
 
 from torch import Tensor
 from torch.utils._pytree import tree_map
@@ -28,46 +28,29 @@ from latentplan.planning.realtime.worker import (
     end,
     start_process,
 )
-from latentplan.planning.search.sampling import Generators
+from latentplan.planning.search.registry import SupportsPlan
 
 WORKERS = ("process", "thread")
 
 
-class Planner(Protocol):
-    """Whatever searches like `CEMPlanner.plan`."""
-
-    def plan(
-        self,
-        model: Any,
-        state: State,
-        previous: Plan | None = None,
-        *,
-        objective: Term | None = None,
-        constraints: Sequence[Constraint] = (),
-        generator: Generators = None,
-    ) -> Plan:
-        """The best plan from each state."""
-        ...
-
-
 class PlanBuffer:
-    """Plans by the tick at which their first action is due; pure bookkeeping, no clock and no thread.
+    """Plans by the tick at which their first action is due. The buffer has no clock and no thread.
 
-    A tick is the index of a decision. The age of a plan at a tick is the tick minus the one its first action is due at,
-    and it is also the index of the action that the tick takes. By its age, an action comes from
+    A tick is the index of a decision. The age of a plan at a tick is the tick minus the tick of the plan's first
+    action, and it is also the index of the action that is taken. The age decides the source of an action:
 
-        0 to fresh_ticks            the "plan": nothing newer was to be expected yet;
-        beyond, up to max_age       the "tail" of a plan whose successor is late;
-        beyond max_age or horizon   nowhere: the plan is stale and dropped.
+        0 to fresh_ticks            "plan": no newer plan was expected yet;
+        beyond, up to max_age       "tail": the next plan is late;
+        beyond max_age or horizon   none: the plan is stale and dropped.
 
-    A plan that is not due yet waits while the one before it goes on.
+    A plan that is not due yet waits, and the plan before it is used until then.
 
     Attributes:
-        max_age: Oldest age at which a plan is used; None uses it to its end.
-        fresh_ticks: Ticks after which the next plan normally arrives; may be changed at any time.
+        max_age: Largest age at which a plan is used; None uses a plan to its end.
+        fresh_ticks: Number of ticks after which the next plan normally arrives; may be changed at any time.
 
     Raises:
-        ValueError: A setting is negative.
+        ValueError: An argument is negative.
     """
 
     def __init__(self, max_age: int | None = None, fresh_ticks: int = 1) -> None:
@@ -78,20 +61,20 @@ class PlanBuffer:
         self._plans: list[tuple[int, Tensor]] = []  # by first tick, the newest last
 
     def submit(self, plan_actions: Tensor, first_tick: int) -> None:
-        """Hold a plan; one that is older than the newest held is dropped.
+        """Adds a plan; a plan for an earlier tick than the newest one is dropped.
 
         Args:
-            plan_actions: (..., horizon, action).
-            first_tick: Tick of its first action.
+            plan_actions: Actions of the plan, (..., horizon, action).
+            first_tick: Tick of the first action.
         """
         if self._plans and first_tick < self._plans[-1][0]:
             return
         self._plans = [plan for plan in self._plans if plan[0] != first_tick] + [(first_tick, plan_actions)]
 
     def choose(self, tick: int) -> tuple[Tensor | None, str | None, int | None]:
-        """The action (..., action) of a tick, its source ("plan" or "tail") and its age in ticks; else three None.
+        """Returns the action (..., action) of a tick, its source ("plan" or "tail") and its age; or three None.
 
-        Ticks do not go back: plans that are stale at this one, or older than the one in use, are dropped.
+        Ticks must not decrease, because plans that are stale at this tick, or older than the plan in use, are dropped.
         """
         found = self._find(tick)
         if found is None:
@@ -102,12 +85,12 @@ class PlanBuffer:
         return action, "plan" if age <= self.fresh_ticks else "tail", age
 
     def peek(self, tick: int) -> tuple[Tensor, int] | None:
-        """The action (..., action) that a later tick would take, and its age, judged from the plans held now."""
+        """Returns the action (..., action) of the present plans at a later tick, and its age; None without a plan."""
         found = self._find(tick)
         return None if found is None else self._action(found, tick)
 
     def remaining(self, tick: int) -> Tensor | None:
-        """The actions (..., ticks, action) of the plan in use, from this tick to the plan's end."""
+        """Returns the actions (..., ticks, action) of the plan in use from this tick on; None without a plan."""
         found = self._find(tick)
         if found is None:
             return None
@@ -115,11 +98,11 @@ class PlanBuffer:
         return actions[..., tick - first_tick :, :]
 
     def clear(self) -> None:
-        """Drop every plan."""
+        """Drops every plan."""
         self._plans = []
 
     def _find(self, tick: int) -> int | None:
-        """Index of the newest plan that is due; None when there is none, or it is stale (older ones are staler)."""
+        """Returns the index of the newest plan that is due; None if there is none or it is stale."""
         due = [index for index, (first_tick, _) in enumerate(self._plans) if first_tick <= tick]
         if not due:
             return None
@@ -133,28 +116,28 @@ class PlanBuffer:
 
 
 class BackgroundPlanner:
-    """Searches in one process (or thread) of its own, so that the control loop never waits for a plan.
+    """Searches in a process (or thread) of its own, so that the control loop never waits for a plan.
 
-    No call but `close` and `wait_until_ready` takes longer than copying a state. The process is spawned, so a script
-    that makes one needs `if __name__ == "__main__":`, and planner, model, objective and constraints must be picklable;
-    a model on a GPU is better served by a thread. A thread shares the interpreter with the loop, and one that hangs
-    cannot be ended: it is left to end with the program.
+    Except for `close` and `wait_until_ready`, no call takes longer than copying a state. The process is spawned, so the
+    script needs `if __name__ == "__main__":`, and planner, model, objective and constraints must be picklable. Use a
+    thread for a model on a GPU. A thread shares the interpreter with the loop, and a thread that hangs ends only with
+    the program.
 
     Args:
-        planner: What searches, usually a `CEMPlanner`.
-        model: What it searches in; a process works with a copy of it, made now.
+        planner: The planner, of which only `plan` is called.
+        model: The model in which it searches; a process works with a copy, made now.
         objective: See `CEMPlanner.plan`.
         constraints: See `CEMPlanner.plan`.
         worker: `process` or `thread`.
 
     Raises:
-        ValueError: There is no such worker.
-        TypeError: Something cannot be sent to another process.
+        ValueError: `worker` has another value.
+        TypeError: Planner, model, objective or constraints cannot be pickled.
     """
 
     def __init__(
         self,
-        planner: Planner,
+        planner: SupportsPlan,
         model: Model,
         *,
         objective: Term | None = None,
@@ -164,7 +147,7 @@ class BackgroundPlanner:
         if worker not in WORKERS:
             raise ValueError(f"worker must be one of {', '.join(WORKERS)}, got {worker!r}")
         problem = (planner, model, objective, tuple(constraints))
-        self._goals: Goals | bytes | None = None  # that the next request carries
+        self._goals: Goals | bytes | None = None  # sent with the next request
         self._is_idle, self._is_closed = True, False
         self._ready = threading.Event()
         self._requests: SimpleQueue[Request | None] = SimpleQueue()
@@ -179,39 +162,42 @@ class BackgroundPlanner:
         target = drive_process if worker == "process" else drive_search
         self._thread = threading.Thread(target=target, args=arguments, name="latentplan-plan", daemon=True)
         self._thread.start()
-        # The thread holds no reference to this object: one that is dropped, or alive at exit, is closed all the same.
+        # The thread holds no reference to this object, so the finalizer runs when the object is dropped or at exit.
         self._close = weakref.finalize(self, end, os.getpid(), self._requests, self._thread, self.process)
 
     @property
     def is_idle(self) -> bool:
-        """Whether a request would be taken now: nothing is in work, and no result is left to poll."""
+        """Whether a request would be accepted now: no search is running, and no result is left to poll."""
         return self._is_idle and not self._is_closed
 
     def wait_until_ready(self, seconds: float) -> bool:
-        """Wait until the worker can search at once, at most so long; whether it can (or has failed to start)."""
+        """Waits up to `seconds` until the worker is ready; returns whether it is (or has failed to start)."""
         return self._ready.wait(seconds)
 
     def set_objective(self, objective: Term | None = None, constraints: Sequence[Constraint] = ()) -> None:
-        """Changes what is searched for, from the next request on.
+        """Changes objective and constraints, from the next request on.
 
         Args:
             objective: See `CEMPlanner.plan`.
             constraints: See `CEMPlanner.plan`.
 
         Raises:
-            TypeError: Something cannot be sent to another process; the old goals stay.
+            TypeError: The objective or a constraint cannot be pickled; the old ones stay.
         """
         goals = (objective, tuple(constraints))
         self._goals = goals if self.process is None else dump(goals)
 
     def request(self, state: State, tick: int, previous: Plan | None = None, seed: int | None = None) -> bool:
-        """Start the search of a plan whose first action is due at `tick`; False (and nothing happens) if one is busy.
+        """Starts the search of a plan whose first action is due at `tick`.
 
         Args:
-            state: Where the plan starts: the state predicted for `tick`, rows (batch,).
-            tick: Handed back with the plan.
-            previous: Warm start, already shifted (its `elapsed` says by how much).
-            seed: Of the search's random stream; None takes torch's default.
+            state: The state predicted for `tick`, rows (batch,).
+            tick: Returned with the plan.
+            previous: Previous plan for a warm start, with `elapsed` set for `tick`.
+            seed: Seed of the search's random stream; None takes torch's default.
+
+        Returns:
+            Whether the request was accepted; a planner that is not idle ignores it.
         """
         if not self.is_idle:
             return False
@@ -222,11 +208,11 @@ class BackgroundPlanner:
         return True
 
     def poll(self) -> tuple[int, Plan] | None:
-        """The finished plan and the tick it was requested for, once; None while there is none.
+        """Returns the finished plan with the tick of its request, once; None if no plan is finished.
 
         Raises:
-            Exception: What the search raised, with its own type and message; where it happened is the cause.
-            RuntimeError: The process has ended by itself. No more plans come.
+            Exception: The exception that the search raised, with its own type and message; its traceback is the cause.
+            RuntimeError: The process has ended unexpectedly, and no more plans will come.
         """
         try:
             kind, value = self._answers.get_nowait()
@@ -249,16 +235,16 @@ class BackgroundPlanner:
         return found
 
     def close(self) -> None:
-        """End the worker, whatever it is doing; may be called again."""
+        """Ends the worker, even during a search; may be called again."""
         self._is_closed = True
         self._close()
 
     def __enter__(self) -> BackgroundPlanner:
-        """Nothing but the planner itself."""
+        """Returns the planner."""
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, where: TracebackType | None
     ) -> None:
-        """Close."""
+        """Closes the planner."""
         self.close()

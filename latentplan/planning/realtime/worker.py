@@ -1,4 +1,4 @@
-"""What runs beside the control loop: the process or thread that searches, and the thread that talks to it."""
+"""The process or thread that searches beside the control loop, and the thread that exchanges messages with it."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ Goals = tuple[Any, Any]  # objective, constraints
 
 
 class Request(NamedTuple):
-    """What is to be searched, and goals that hold from this search on: as they are, as bytes, or None for the old."""
+    """A search request; `goals`, pickled or not, replace objective and constraints from now on; None keeps them."""
 
     state: State
     tick: int
@@ -43,15 +43,14 @@ class Request(NamedTuple):
 
 
 def settle() -> bool:
-    """Keep away from this process what would stop it for long; to be called before a control loop.
+    """Prevents long pauses of this process by garbage collection and paging; call it before a control loop.
 
-    Everything that exists now is taken out of garbage collection, after one last: a full one walks through all that
-    torch and others have imported, a tenth of a second in which no thread runs Python, and comes when enough else has
-    been made. What is made later is collected as ever. Pages of the memory there is now stay where they are once they
-    have been used, if the system allows that.
+    A full garbage collection visits every object of torch and other libraries, which stops all threads for about 0.1 s.
+    This function collects garbage once, and then excludes all present objects from later collections. It also locks
+    the present memory pages once they have been used, if the system allows that.
 
     Returns:
-        Whether the system allows it: on Linux, with the capability or the limit for locked memory.
+        Whether the system allows to lock memory: on Linux, by capability or by the limit for locked memory.
     """
     gc.collect()
     gc.freeze()
@@ -60,21 +59,21 @@ def settle() -> bool:
 
 
 def start_process() -> tuple[SpawnProcess, Connection]:
-    """A spawned process that waits for its problem, and our end of the pipe to it."""
+    """Returns a spawned process that waits for its problem, and this process's end of the pipe."""
     context = multiprocessing.get_context("spawn")
     ours, theirs = context.Pipe()
     process = context.Process(target=_serve, args=(theirs,), name="latentplan-plan", daemon=True)
-    with _interrupts_held():  # a process that starts inherits that, and lets them go once it ignores them
+    with _interrupts_held():  # the child inherits the blocked signal, and unblocks it once it ignores interrupts
         process.start()
     theirs.close()
     return process, ours
 
 
 def dump(problem: Problem) -> bytes:
-    """A problem or goals as bytes, by value: torch's own way over pipes shares memory, which outlives a crash.
+    """Returns a problem or goals as bytes, with copies of tensors: memory that torch shares would outlive a crash.
 
     Raises:
-        TypeError: It cannot be sent to another process.
+        TypeError: The problem cannot be pickled.
     """
     try:
         return pickle.dumps(problem)
@@ -92,7 +91,7 @@ def drive_process(
     answers: SimpleQueue[Answer],
     ready: threading.Event,
 ) -> None:
-    """Waits on the pipe in a thread of the loop's process, so that the loop never waits for a full or empty one."""
+    """Exchanges messages with the process, in a thread, so that the loop never waits for the pipe."""
     try:
         connection.send_bytes(problem)
         started = pickle.loads(connection.recv_bytes())
@@ -111,28 +110,28 @@ def drive_process(
 def drive_search(
     problem: Problem, requests: SimpleQueue[Request | None], answers: SimpleQueue[Answer], ready: threading.Event
 ) -> None:
-    """Searches in a thread of the loop's process."""
+    """Answers search requests in a thread of the loop's process."""
     ready.set()
     search = _Search(problem)
     while (request := requests.get()) is not None:
         try:
             answers.put(search(request))
-        except BaseException as error:  # such as SystemExit, which would end the thread without a word
+        except BaseException as error:  # such as SystemExit, which would end the thread without a message
             answers.put(("error", _portable(RuntimeError(f"{type(error).__name__}: {error}"))))
 
 
 def end(
     owner: int, requests: SimpleQueue[Request | None], thread: threading.Thread, process: SpawnProcess | None
 ) -> None:
-    """End a worker, whatever it is doing; only a thread that hangs is left behind, as a daemon.
+    """Ends a worker, even during a search. A thread that hangs is left behind as a daemon.
 
-    A fork of the loop's process has no worker to end.
+    In a fork of the loop's process the function does nothing, because the worker belongs to the parent.
     """
     if os.getpid() != owner:
         return
     requests.put(None)
     if process is not None:
-        process.terminate()  # it holds nothing that would have to be put away
+        process.terminate()  # the process holds no resource that needs a clean end
         process.join(CLOSING_SECONDS)
         if process.is_alive():
             process.kill()
@@ -168,15 +167,21 @@ def _interrupts_held() -> Iterator[None]:
 
 
 def _serve(connection: Connection) -> None:
-    """Searches in a process of its own, until the other end of the pipe is gone."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches the whole group; the loop decides what follows
+    """Answers search requests in a process of its own, until the other end of the pipe is closed."""
+    signal.signal(
+        signal.SIGINT, signal.SIG_IGN
+    )  # Ctrl-C reaches the whole process group, and the loop's process handles it
     if hasattr(signal, "pthread_sigmask"):
         signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
     torch.set_num_threads(1)
     try:
         try:
             problem = pickle.loads(connection.recv_bytes())
-        except (AttributeError, ImportError, pickle.UnpicklingError) as error:  # defined where this process cannot see
+        except (
+            AttributeError,
+            ImportError,
+            pickle.UnpicklingError,
+        ) as error:  # defined in a module that this process cannot import
             connection.send_bytes(pickle.dumps(("error", _portable(error))))
             return
         search = _Search(problem)
@@ -189,14 +194,14 @@ def _serve(connection: Connection) -> None:
 
 
 class _Search:
-    """Answers one request after another, each with the latest goals."""
+    """Answers requests one after another, each with the latest goals."""
 
     def __init__(self, problem: Problem) -> None:
         self._planner, self._model, *goals = problem
         self._goals: Any = tuple(goals)
 
     def __call__(self, request: Request) -> Answer:
-        """The plan, or what went wrong; goals that cannot be read go wrong until there are others."""
+        """Returns the plan or the error; goals that cannot be unpickled give an error until new goals arrive."""
         if request.goals is not None:
             self._goals = request.goals
         generator = None if request.seed is None else torch.Generator().manual_seed(request.seed)
@@ -218,7 +223,7 @@ class _Search:
 
 
 def _portable(error: Exception) -> tuple[Exception, str]:
-    """An error that survives the pipe, and where it happened."""
+    """Returns an exception that can be pickled, and its traceback as text."""
     where = traceback.format_exc()
     try:
         pickle.loads(pickle.dumps(error))

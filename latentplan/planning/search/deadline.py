@@ -1,4 +1,4 @@
-"""How much of a search still fits: what its parts took before, and what is left of the budget."""
+"""Deadlines: the durations of the parts of earlier searches, and the time left for the present one."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ import torch
 NUM_DURATIONS = 32
 QUANTILE = 0.9
 PATIENCE = 10
-ROUNDING = 1.0 + 1e-9  # sums of durations that fill a budget exactly still fit
+ROUNDING = 1.0 + 1e-9  # durations whose sum equals the budget still fit, whatever their rounding
 
 
 @dataclass
 class _Durations:
-    """Seconds that one part of a search took, the first time left out; and refusals since the last."""
+    """Seconds that one part of a search took, without the first time, and the number of refusals since."""
 
     recent: deque[float] = field(default_factory=lambda: deque(maxlen=NUM_DURATIONS))
     fastest: float = math.inf
@@ -26,20 +26,20 @@ class _Durations:
 
 
 class Pace:
-    """What the parts of a search took at each problem size.
+    """The durations of the parts of a search, by problem size.
 
-    A part is expected to take the 0.9 quantile of its last 32 durations. The first duration never counts, because it
-    includes lazy initialisation; nothing is expected of a part without a duration. A part that was refused 10 times in
-    a row is tried once more if its fastest duration ever would fit, so that one hiccup does not end it for good.
+    The expected duration of a part is the 0.9 quantile of its last 32 durations, and 0 without any. The first duration
+    never counts, because it includes lazy initialisation. After 10 refusals in a row the fastest duration is expected,
+    so that a single slow one does not refuse a part for ever.
 
-    A copy starts without durations: it may live on another machine, and has to warm up there.
+    A copy starts without durations, because the copy may run on another machine.
     """
 
     def __init__(self) -> None:
         self._durations: dict[Hashable, _Durations] = {}
 
     def expected(self, key: Hashable) -> float:
-        """Seconds that a part is expected to take, 0 where nothing is known."""
+        """Returns the expected duration of a part in seconds, 0 if none is known."""
         durations = self._durations.get(key)
         if durations is None or not durations.recent:
             return 0.0
@@ -48,7 +48,7 @@ class Pace:
         return sorted(durations.recent)[math.ceil(QUANTILE * (len(durations.recent) - 1))]
 
     def record(self, key: Hashable, seconds: float) -> None:
-        """Note what a part took."""
+        """Records the duration of a part."""
         durations = self._durations.setdefault(key, _Durations())
         durations.num_refusals = 0
         if durations.is_warmed_up:
@@ -57,7 +57,7 @@ class Pace:
         durations.is_warmed_up = True
 
     def refuse(self, key: Hashable) -> None:
-        """Note that a part was not started for want of time."""
+        """Records that a part was not started for want of time."""
         self._durations.setdefault(key, _Durations()).num_refusals += 1
 
     def __reduce__(self) -> tuple[type[Pace], tuple[()]]:
@@ -68,12 +68,12 @@ class Budget:
     """The time of one search.
 
     Args:
-        pace: What the parts took before; learns what they take now.
-        size: Problem size that durations hold for.
-        clock: Gives the time in seconds.
-        started: When the search began.
-        seconds: What it may take; None is as long as it likes.
-        device: Where it computes.
+        pace: Durations of earlier searches; this search adds its own.
+        size: Problem size of this search; durations of other sizes are not used.
+        clock: Returns the time in seconds.
+        started: Time at which the search began.
+        seconds: Duration that is allowed; None sets no limit.
+        device: Device on which the search computes.
     """
 
     def __init__(
@@ -92,7 +92,7 @@ class Budget:
         self._lap_started = started
 
     def allows(self, *parts: str) -> bool:
-        """Whether these parts, one after the other, are expected to end in time."""
+        """Returns whether these parts, one after the other, are expected to end in time."""
         if self._seconds is None:
             return True
         elapsed = self._now() - self._started
@@ -104,9 +104,9 @@ class Budget:
         return False
 
     def lap(self, part: str | None = None) -> None:
-        """Note the time since the last lap as the duration of a part; None only starts the next lap."""
+        """Records the time since the last lap as the duration of a part; None only starts the next lap."""
         if self._is_asynchronous and self._seconds is None:
-            return  # waiting for the device only to know the time would cost time
+            return  # without a limit the durations are not needed, and reading them would wait for the device
         now = self._now()
         if part is not None:
             self._pace.record((part, self._size), now - self._lap_started)

@@ -1,4 +1,4 @@
-"""The equations of the cross-entropy method: who the elites are, and what distribution they suggest."""
+"""The equations of the cross-entropy method: selecting elites, and refitting the distribution to them."""
 
 from __future__ import annotations
 
@@ -12,12 +12,13 @@ from torch import Tensor
 
 
 class Scores(NamedTuple):
-    """How good candidates are.
+    """Returns and constraint violations of candidates.
 
     Attributes:
-        returns: Maximised, (batch, sample).
-        violations: How far each breaks the constraints, 0 where it keeps them, (batch, sample); None without any.
-        is_ranked: Whether violations decide before returns do.
+        returns: Returns, (batch, sample); larger is better.
+        violations: Constraint violations, 0 where all constraints are satisfied, (batch, sample); None without
+            constraints.
+        is_ranked: Whether candidates are ranked by violation first and by return second.
     """
 
     returns: Tensor
@@ -25,11 +26,11 @@ class Scores(NamedTuple):
     is_ranked: bool = True
 
     def first(self, num: int) -> Scores:
-        """The scores of the first candidates."""
+        """Returns the scores of the first `num` candidates."""
         return self._part(slice(num))
 
     def rest(self, num: int) -> Scores:
-        """The scores of all but the first candidates."""
+        """Returns the scores of all but the first `num` candidates."""
         return self._part(slice(num, None))
 
     def _part(self, samples: slice) -> Scores:
@@ -38,7 +39,7 @@ class Scores(NamedTuple):
 
     @staticmethod
     def join(parts: Sequence[Scores]) -> Scores:
-        """The scores of several groups of candidates, one after the other."""
+        """Returns the scores of several groups of candidates, concatenated."""
         violations = [part.violations for part in parts if part.violations is not None]
         joined = torch.cat(violations, dim=1) if violations else None
         return Scores(torch.cat([part.returns for part in parts], dim=1), joined, parts[0].is_ranked)
@@ -49,8 +50,8 @@ class Elites(NamedTuple):
 
     Attributes:
         actions: Sequences, (batch, elite, horizon, action).
-        scores: How good they are, (batch, elite).
-        weights: Their share in the new mean, summing to 1, or to 0 where no candidate was finite, (batch, elite).
+        scores: Their scores, (batch, elite).
+        weights: Weights in the new mean, (batch, elite); their sum is 1, or 0 where no candidate has a finite return.
     """
 
     actions: Tensor
@@ -68,28 +69,28 @@ def refit(
     smoothing: float,
     temperature: float | None = None,
 ) -> tuple[Tensor, Tensor]:
-    """One step of the cross-entropy method: the Gaussian moves towards its best candidates.
+    """Returns mean and variance after one step of the cross-entropy method.
 
-    Elite mean and population variance (1/K) are blended with the old ones: `smoothing * elite + (1 - smoothing) * old`,
-    for the mean and for the variance. A candidate whose return is NaN or infinite is never an elite; where fewer than
-    `num_elites` are finite those few are used, and where none is the distribution stays.
+    Mean and population variance (1/K) of the elites are blended with the old ones: `smoothing * elite + (1 - smoothing)
+    * old`. A candidate whose return is NaN or infinite is never an elite. If fewer than `num_elites` candidates have a
+    finite return, only these are elites; if none has, mean and variance stay.
 
     Args:
         candidates: Action sequences, (sample, horizon, action) or (batch, sample, horizon, action).
         returns: Their returns, maximised, (sample,) or (batch, sample).
-        mean: Mean that the candidates were drawn around, (horizon, action) or (batch, horizon, action).
-        var: Variance that they were drawn with, shaped like `mean`.
-        num_elites: How many candidates count.
+        mean: Mean of the distribution of the candidates, (horizon, action) or (batch, horizon, action).
+        var: Variance of this distribution, shaped like `mean`.
+        num_elites: Number of elites.
         smoothing: Weight of the new statistics, in (0, 1].
-        temperature: None weighs elites alike; a number by exp(return / temperature), as MPPI does.
+        temperature: Elites are weighted by exp(return / temperature) as in MPPI; None weights all alike.
 
     Returns:
-        New mean and variance, shaped like the old.
+        New mean and variance, shaped like `mean`.
 
     Raises:
-        ValueError: Shapes do not belong together, there are fewer candidates than elites, or a number is out of range.
+        ValueError: Shapes do not fit each other, there are fewer candidates than elites, or a number is out of range.
     """
-    candidates, returns, mean, var = _alike(candidates, returns, mean, var)
+    candidates, returns, mean, var = _same_precision(candidates, returns, mean, var)
     if candidates.ndim == 3:
         batched = (candidates[None], returns[None], mean[None], var[None])
         new_mean, new_var = refit(*batched, num_elites=num_elites, smoothing=smoothing, temperature=temperature)
@@ -109,12 +110,12 @@ def refit(
 
 
 def select_elites(candidates: Tensor, scores: Scores, *, num_elites: int, temperature: float | None) -> Elites:
-    """The best candidates: by return, or, where violations rank, the feasible first and then the least infeasible.
+    """Returns the best candidates: by return, or if violations rank, by violation first and by return second.
 
     Args:
         candidates: (batch, sample, horizon, action).
-        scores: How good each is, (batch, sample).
-        num_elites: How many to take.
+        scores: Their scores, (batch, sample).
+        num_elites: Number of elites.
         temperature: See `refit`.
     """
     returns, violations, is_ranked = scores
@@ -132,12 +133,12 @@ def select_elites(candidates: Tensor, scores: Scores, *, num_elites: int, temper
     violation = None if violations is None else violations.gather(1, index)
     weights = is_valid.to(candidates.dtype)
     if temperature is not None:
-        merit = best if violation is None or not is_ranked else _merit(best, violation)
-        merit = torch.where(is_valid[:, :1], merit, 0.0)  # a softmax over nothing would be NaN
-        weights = weights * torch.softmax(merit / temperature, dim=1)
+        exponents = best if violation is None or not is_ranked else _weight_exponents(best, violation)
+        exponents = torch.where(is_valid[:, :1], exponents, 0.0)  # a softmax over nothing would be NaN
+        weights = weights * torch.softmax(exponents / temperature, dim=1)
     weights = weights / weights.sum(dim=1, keepdim=True).clamp_min(torch.finfo(weights.dtype).tiny)
     chosen = torch.take_along_dim(candidates, index[:, :, None, None], dim=1)
-    # Weight 0 does not silence an action that is itself NaN.
+    # An action that is NaN would make the weighted mean NaN, even with weight 0.
     chosen = torch.where(is_valid[:, :, None, None], chosen, 0.0)
     return Elites(chosen, Scores(best, violation, is_ranked), weights)
 
@@ -145,7 +146,7 @@ def select_elites(candidates: Tensor, scores: Scores, *, num_elites: int, temper
 def move_towards(
     elites: Elites, mean: Tensor, var: Tensor, *, smoothing: float, adapt_std: bool = True
 ) -> tuple[Tensor, Tensor]:
-    """Mean and variance, (batch, horizon, action), moved towards those of the elites; unmoved where there are none."""
+    """Returns mean and variance, (batch, horizon, action), blended with the elites'; unchanged without elites."""
     weights = rearrange(elites.weights, "batch elite -> batch elite 1 1")
     found = elites.weights.sum(dim=1)[:, None, None] > 0
     elite_mean = (weights * elites.actions).sum(dim=1)
@@ -157,26 +158,26 @@ def move_towards(
 
 
 def mean_return(elites: Elites) -> Tensor:
-    """Weighted mean return of the elites, NaN where there are none, (batch,)."""
+    """Returns the weighted mean return of the elites, NaN without elites, (batch,)."""
     total = (elites.weights * elites.scores.returns.masked_fill(elites.weights == 0, 0.0)).sum(dim=1)
     return total.masked_fill(elites.weights.sum(dim=1) == 0, float("nan"))
 
 
-def _alike(*tensors: Tensor) -> list[Tensor]:
-    """The tensors in one floating-point precision that holds them all."""
+def _same_precision(*tensors: Tensor) -> list[Tensor]:
+    """Returns the tensors in one floating-point precision that holds them all."""
     dtype = reduce(torch.promote_types, (tensor.dtype for tensor in tensors))
     dtype = dtype if dtype.is_floating_point else torch.float32
     return [tensor.to(dtype) for tensor in tensors]
 
 
 def _feasible_first(returns: Tensor, violations: Tensor) -> Tensor:
-    """Order of candidates by violation, and among equals (all feasible ones are) by return, (batch, sample)."""
+    """Returns the order of candidates by violation, and among equal violations by return, (batch, sample)."""
     by_return = torch.argsort(returns, dim=1, descending=True, stable=True)
     by_violation = torch.argsort(violations.gather(1, by_return), dim=1, stable=True)
     return by_return.gather(1, by_violation)
 
 
-def _merit(returns: Tensor, violations: Tensor) -> Tensor:
-    """What weighs elites that are in feasible-first order: return among the feasible, without those the violation."""
+def _weight_exponents(returns: Tensor, violations: Tensor) -> Tensor:
+    """Returns the exponents of the weights of ranked elites: the returns of feasible ones, else minus violations."""
     has_feasible = violations[:, :1] == 0
     return torch.where(has_feasible, returns.masked_fill(violations > 0, float("-inf")), -violations)

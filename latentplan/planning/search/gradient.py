@@ -19,26 +19,26 @@ def ascend(
     step_size: float,
     bounds: tuple[Tensor, Tensor],
 ) -> tuple[Tensor, Tensor, Tensor | None]:
-    """Sequences moved uphill along the gradient of their return; a step that does not help is undone and halved.
+    """Returns sequences improved by gradient ascent on their return; a step without gain is undone and halved.
 
     Args:
-        scorer: What a sequence is worth.
-        state: Where plans start, rows (batch,).
+        scorer: Gives sequences their returns.
+        state: Start of the plans, rows (batch,).
         actions: Sequences, (batch, horizon, action).
-        num_steps: Gradients taken.
+        num_steps: Number of gradient steps.
         step_size: Largest change of an action in the first step, in action units.
         bounds: Lowest and highest action, each (action,).
 
     Returns:
-        Sequences (batch, horizon, action) that are worth no less and break constraints no more, their returns and,
-        when there are constraints, their violations, (batch,).
+        Sequences (batch, horizon, action) with a return no lower and a violation no higher than before, their returns
+        (batch,) and, with constraints, their violations (batch,).
 
     Raises:
-        ValueError: The return does not depend on the actions in a way that can be differentiated.
+        ValueError: The return is not differentiable in the actions.
     """
     low, high = bounds
     with torch.enable_grad():
-        # A state made under inference_mode cannot take part in a gradient; its clone can.
+        # A tensor made in inference mode cannot take part in a gradient; its clone can.
         rows = scorer.start_rows(tree_map(lambda leaf: leaf.clone(), state), 1)
         current = actions.clone()
         size = torch.full_like(current[:, :1, :1], step_size)
@@ -58,14 +58,14 @@ def ascend(
 
 
 def _measure(scorer: Scorer, rows: State, actions: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Return (batch,), violation (batch,) and the gradient scaled to a largest entry of 1, (batch, horizon, action)."""
+    """Returns return (batch,), violation (batch,) and gradient (batch, horizon, action) with a largest entry of 1."""
     leaf = actions.detach().requires_grad_()
     scores = scorer.score(rows, leaf[:, None])
     returns = scores.returns[:, 0]
     if not returns.requires_grad:
         raise ValueError("gradient_steps above 0 needs a model that is differentiable in the action")
     (gradient,) = torch.autograd.grad(returns.sum(), leaf)
-    gradient = torch.nan_to_num(gradient, posinf=0.0, neginf=0.0)  # a broken row stays where it is, alone
+    gradient = torch.nan_to_num(gradient, posinf=0.0, neginf=0.0)  # a row that is not finite stays where it is
     slope = gradient / gradient.abs().amax(dim=(1, 2), keepdim=True).clamp_min(torch.finfo(gradient.dtype).tiny)
     none = torch.zeros_like(returns)
     violation = none if scores.violations is None else scores.violations[:, 0]

@@ -1,102 +1,174 @@
-"""One search, from the candidates to the plan: the loop that every planner of the family runs."""
+"""One search, from the first candidates to the plan: the loop that every planner of the family runs."""
 
 from __future__ import annotations
 
-import time
-from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
+from torch.utils._pytree import tree_map
 
-from latentplan.planning.conditioned import seen_for
-from latentplan.planning.model import Model, State, action_dtype, count_rows, per_dimension, state_device
-from latentplan.planning.objectives import Constraint, Term
+from latentplan.planning.model import Model, State, action_dtype, count_rows, state_device, supports
+from latentplan.planning.objectives import Constraint, Term, seen_for
 from latentplan.planning.plan import Plan, WarmStart, shift_plan
-from latentplan.planning.search.choice import choose
-from latentplan.planning.search.deadline import Budget
-from latentplan.planning.search.elites import Scores, mean_return, move_towards, select_elites
+from latentplan.planning.search.deadline import Budget, Pace
+from latentplan.planning.search.elites import Elites, Scores, mean_return, move_towards, select_elites
 from latentplan.planning.search.gradient import ascend
-from latentplan.planning.search.progress import Progress
+from latentplan.planning.search.options import SearchOptions
 from latentplan.planning.search.sampling import Generators, Streams
 from latentplan.planning.search.scorer import Scorer
 
-if TYPE_CHECKING:
-    from latentplan.planning.search.cem import CEMPlanner
+Candidates = tuple[Tensor, Scores]
+"""Sequences (batch, sample, horizon, action) and their scores."""
 
-Candidates = tuple[Tensor, Scores]  # sequences (batch, sample, horizon, action) and how good they are
+Choice = tuple[Tensor, Tensor, Tensor | None]
+"""Sequences (batch, horizon, action), their expected returns (batch,) and, with constraints, violations (batch,)."""
+
+
+@dataclass(frozen=True)
+class Problem:
+    """What is searched for in one call.
+
+    Attributes:
+        model: The model in which action sequences are imagined.
+        state: Start of the plans, rows (batch,).
+        objective: Maximised; None is the predicted return.
+        constraints: Violations that candidates must avoid.
+        low: Lowest action, (action,).
+        high: Highest action, (action,).
+        init_std: Standard deviation at the start of the search, (action,); None takes a quarter of the action range.
+        discount: Discount per model step, in (0, 1].
+    """
+
+    model: Model
+    state: State
+    objective: Term | None
+    constraints: Sequence[Constraint]
+    low: Tensor
+    high: Tensor
+    init_std: Tensor | None
+    discount: float
+
+
+class Progress(NamedTuple):
+    """The search between two refits; dim 0 of every tensor is the environment, so finished ones can be frozen.
+
+    Attributes:
+        mean: Mean of the search distribution, (batch, horizon, action).
+        var: Variance of the search distribution, (batch, horizon, action).
+        elites: Elites of the last refit; None before the first.
+        expected_return: Mean return of the last elites, NaN before the first refit, (batch,).
+        num_nonfinite: Number of candidates so far whose return was not finite, (batch,).
+        iterations: Number of refits so far, (batch,).
+        is_found: Whether any candidate had a finite return, (batch,).
+    """
+
+    mean: Tensor
+    var: Tensor
+    elites: Elites | None
+    expected_return: Tensor
+    num_nonfinite: Tensor
+    iterations: Tensor
+    is_found: Tensor
+
+    def updated(self, mask: Tensor, new: Progress) -> Progress:
+        """Returns this progress, with the environments in mask (batch,) taken from `new`."""
+
+        def choose(fresh: Any, past: Any) -> Any:
+            if not isinstance(fresh, Tensor):
+                return fresh
+            return torch.where(mask.reshape(-1, *[1] * (fresh.ndim - 1)), fresh, past)
+
+        chosen: Progress = tree_map(choose, new, self)
+        return chosen
+
+    def describe(self, history: Sequence[tuple[Tensor, Tensor]], stopped: str) -> dict[str, Any]:
+        """Returns the diagnostics of a plan.
+
+        Args:
+            history: The elites' mean return and the mean sampling std after each refit, both (batch,).
+            stopped: The reason the search ended.
+        """
+        none = self.expected_return.new_zeros(len(self.expected_return), 0)
+        return {
+            "elite_return": torch.stack([elite_return for elite_return, _ in history], dim=1) if history else none,
+            "std": torch.stack([std for _, std in history], dim=1) if history else none,
+            "iterations": self.iterations,
+            "num_nonfinite": self.num_nonfinite,
+            "is_fallback": ~self.is_found,
+            "stopped": stopped,
+        }
 
 
 class Search:
-    """The search problem of one call, and the settings it is solved with.
+    """One search: a problem, and the options with which it is solved.
 
     Args:
-        options: The planner whose settings hold.
-        model: What imagines.
-        state: Where plans start, rows (batch,).
-        objective: What is maximised; None for the predicted return.
-        constraints: What candidates must keep.
+        options: Options of the search.
+        problem: Model, start, objective and bounds.
         generator: See `CEMPlanner.plan`.
-        started: When the call began, by the planner's clock.
-        deadline_ms: What the call may take; None is as long as it likes.
 
     Raises:
-        ValueError: The model lacks what a setting asks for.
+        ValueError: The model lacks a method that an option needs.
     """
 
-    def __init__(
-        self,
-        options: CEMPlanner,
-        model: Model,
-        state: State,
-        objective: Term | None,
-        constraints: Sequence[Constraint],
-        generator: Generators,
-        started: float,
-        deadline_ms: float | None,
-    ) -> None:
-        model, objective = seen_for(model, objective)
-        self.options, self.state = options, state
-        self.batch, self.device, self.dtype = count_rows(state), state_device(state), action_dtype(state)
-        self.low = self._constant(options.action_low, "action_low")
-        self.high = self._constant(options.action_high, "action_high")
+    def __init__(self, options: SearchOptions, problem: Problem, generator: Generators) -> None:
+        model, objective = seen_for(problem.model, problem.objective)
+        self.options, self.model, self.state = options, model, problem.state
+        self.batch, self.device = count_rows(self.state), state_device(self.state)
+        self.dtype = action_dtype(self.state)
+        self.low, self.high = self._constant(problem.low), self._constant(problem.high)
         self.horizon = options.horizon if objective is None else options.goal_horizon or options.horizon
-        half_range = (self.high - self.low) / 2
-        self.init_std = half_range if options.init_std is None else self._constant(options.init_std, "init_std")
-        # Only what the policy was trained for is its business.
-        self.may_follow_policy = options.num_policy_samples > 0 and objective is None and not constraints
+        self.min_std = torch.full_like(self.low, options.min_std)
+        if problem.init_std is None:
+            self.init_std = (self.high - self.low) / 4
+            self.min_std = torch.minimum(self.min_std, self.init_std)
+        else:
+            self.init_std = self._constant(problem.init_std)
+        self.num_proposals = options.num_proposals(supports(model, "policy"))
+        # The policy was trained on the task's reward, so it may not replace a plan for another objective.
+        self.may_use_policy = self.num_proposals > 0 and objective is None and not problem.constraints
         self.streams = Streams(generator, self.batch, self.device)
-        discounts = options.discount ** torch.arange(self.horizon + 1, dtype=self.dtype, device=self.device)
         self.scorer = Scorer.build(
             model,
             objective,
-            constraints,
-            discounts,
+            problem.constraints,
+            problem.discount ** torch.arange(self.horizon + 1, dtype=self.dtype, device=self.device),
             terminal_value=options.terminal_value,
             use_continues=options.use_continues,
             penalty=options.constraint_penalty,
         )
-        kind = type(model), type(getattr(model, "model", None))  # what it wraps may be slower than what another does
-        size = (kind, self.batch, self.horizon, self.scorer.num_particles, self.dtype, self.device)
-        seconds = None if deadline_ms is None else deadline_ms / 1000
-        self.budget = Budget(options.pace, size, options.clock or time.perf_counter, started, seconds, self.device)
 
-    def run(self, previous: Plan | None) -> Plan:
-        """The plan, warm-started from the last one in the environments where it may be."""
+    def budget(self, pace: Pace, clock: Callable[[], float], started: float, seconds: float | None) -> Budget:
+        """Returns the time that this search may take; see `Budget`."""
+        # A wrapper such as `compile_rollout` is as fast as the model that it wraps, so both types are part of the size.
+        kind = type(self.model), type(getattr(self.model, "model", None))
+        size = (kind, self.batch, self.horizon, self.scorer.num_particles, self.dtype, self.device)
+        return Budget(pace, size, clock, started, seconds, self.device)
+
+    def run(self, previous: Plan | None, budget: Budget) -> Plan:
+        """Returns the plan; the environments in which the previous plan is still valid start from it.
+
+        Args:
+            previous: The previous plan; None starts everywhere without one.
+            budget: The time that the search may take.
+        """
         options = self.options
         last = self._cold_start() if previous is None else self._shift(previous)
         start = last if options.warm_start else self._cold_start()
-        if not self.budget.allows("propose", "iteration", "choose"):
-            return self._fall_back(last)
-        self.budget.lap()
-        proposals = self._propose() if options.num_policy_samples else None
-        progress, history, stopped = self._iterate(start, proposals)
-        # Where nothing finite was found: the last plan's tail, or zeros clamped into the bounds.
+        if not budget.allows("propose", "iteration", "choose"):
+            return self._fall_back(last, budget)
+        budget.lap()
+        proposals = self._propose(budget) if self.num_proposals else None
+        progress, history, stopped = self._iterate(start, proposals, budget)
+        # Without a finite candidate the plan is the tail of the previous plan, or zeros clamped into the bounds.
         mean = torch.where(progress.is_found[:, None, None], progress.mean, last.mean).clamp(self.low, self.high)
-        mode = proposals[:, 0] if proposals is not None and self.may_follow_policy else None
+        mode = proposals[:, 0] if proposals is not None and self.may_use_policy else None
         actions, expected, violation = choose(options.final, self.scorer, self.state, progress, mean, mode)
-        self.budget.lap("choose")
-        if options.gradient_steps and not self.budget.allows("gradient"):
+        budget.lap("choose")
+        if options.gradient_steps and not budget.allows("gradient"):
             stopped = "deadline"
         elif options.gradient_steps:
             actions, refined, violation = ascend(
@@ -108,7 +180,7 @@ class Search:
                 bounds=(self.low, self.high),
             )
             expected = torch.where(torch.isfinite(refined), refined, expected)
-            self.budget.lap("gradient")
+            budget.lap("gradient")
         info = {**progress.describe(history, stopped), "is_policy": torch.zeros_like(progress.is_found)}
         if violation is not None:
             info["violation"] = violation
@@ -118,49 +190,55 @@ class Search:
         ones = torch.ones(self.batch, dtype=torch.long)
         return Plan(actions, mean, progress.var, expected, info, kept, ones.bool(), ones)
 
-    def _propose(self) -> Tensor:
+    def _propose(self, budget: Budget) -> Tensor:
         generators, bounds = self.streams.policy_generators(), (self.low, self.high)
-        proposals = self.scorer.propose(self.state, self.options.num_policy_samples, generators, bounds)
-        self.budget.lap("propose")
+        proposals = self.scorer.propose(self.state, self.num_proposals, generators, bounds)
+        budget.lap("propose")
         return proposals
 
-    def _hold_policy(self) -> Tensor:
-        """The policy's mode here and now, (batch, 1, action)."""
-        return self.scorer.act(self.state, (self.low, self.high))[:, None]
+    def _fall_back(self, last: WarmStart, budget: Budget) -> Plan:
+        """Returns a plan without a search, for want of time: the policy's sequence, else the shifted previous plan.
 
-    def _fall_back(self, last: WarmStart) -> Plan:
-        """Where there is no time to search: what the policy does; without one the shifted last plan, or zeros.
-
-        It is the policy's mode in imagination if that fits, else its action now, held. What is cold stays cold.
+        The policy's sequence is its mode in imagination if the budget allows that, else its action now, held. Without a
+        policy and a previous plan the actions are zeros. Environments that would start cold stay cold.
         """
         actions, is_policy = last.mean, torch.zeros(self.batch, dtype=torch.bool, device=self.device)
-        if self.may_follow_policy:
-            self.budget.lap()
-            mode = self._propose()[:, 0] if self.budget.allows("propose") else self._hold_policy().expand_as(actions)
+        if self.may_use_policy:
+            budget.lap()
+            if budget.allows("propose"):
+                mode = self._propose(budget)[:, 0]
+            else:
+                mode = self.scorer.act(self.state, (self.low, self.high))[:, None].expand_as(actions)
             is_policy = torch.isfinite(mode).flatten(1).all(1)
             actions = torch.where(is_policy[:, None, None], mode, actions)
-        progress, _, _ = self._begin(last, None, 1)
+        progress = self._begin(last)
         info = {**progress.describe([], "deadline"), "is_policy": is_policy}
         if self.scorer.constraints:
             info["violation"] = torch.full_like(progress.expected_return, float("nan"))
         ones = torch.ones(self.batch, dtype=torch.long)
-        return Plan(actions, last.mean, last.var, progress.expected_return, info, last.elites, last.is_warm, ones)
+        return Plan(actions, last.mean, progress.var, progress.expected_return, info, last.elites, last.is_warm, ones)
 
-    def _iterate(self, start: WarmStart, proposals: Tensor | None) -> tuple[Progress, list[tuple[Tensor, Tensor]], str]:
-        """The refits; after each, the elites' mean return and the mean sampling std, both (batch,); what ended them."""
-        options, num_fresh = self.options, self.options.num_samples - self.options.num_policy_samples
-        progress, centre, spread = self._begin(start, proposals, num_fresh)
-        warm_iterations = options.warm_start_iterations or options.num_iterations
-        budget = torch.where(start.is_warm, warm_iterations, options.num_iterations)
-        num_common = int(budget.min())
-        is_active = torch.ones(self.batch, dtype=torch.bool, device=self.device)
+    def _iterate(
+        self, start: WarmStart, proposals: Tensor | None, budget: Budget
+    ) -> tuple[Progress, list[tuple[Tensor, Tensor]], str]:
+        """Refits the distribution until the iterations or the time are used up.
+
+        Returns:
+            The last progress, the elites' mean return and the mean sampling std (batch,) after each refit, and the
+            reason the loop ended: "iterations" or "deadline".
+        """
+        options, num_fresh = self.options, self.options.num_samples - self.num_proposals
+        progress = self._begin(start)
+        spread = self._sampling_std(progress.var)[:, None]
+        limit = torch.where(start.is_warm, options.num_warm_iterations, options.num_iterations)
+        num_common = int(limit.min())
         known: list[Candidates] = []
         history, stopped = [], "iterations"
-        for iteration in range(int(budget.max())):
-            if iteration and not self.budget.allows("iteration", "choose"):
+        for iteration in range(int(limit.max())):
+            if iteration and not budget.allows("iteration", "choose"):
                 stopped = "deadline"
                 break
-            fresh = self._sample(centre, spread, num_fresh)
+            fresh = self._sample(progress.mean[:, None], spread, num_fresh)
             fresh[:, 0] = progress.mean.clamp(self.low, self.high) if iteration else start.mean
             if iteration == 0:
                 self._place_elites(fresh, start)
@@ -168,61 +246,40 @@ class Search:
             if iteration <= 1:  # the proposals are scored once
                 rows = self.scorer.start_rows(self.state, fresh.shape[1])
             scores = self.scorer.score(rows, fresh)
-            if iteration == 0:  # what a policy says may be NaN, and a model may not mind: it must not become an elite
+            if iteration == 0:  # a policy may propose NaN, and a model may give NaN a finite return: not an elite
                 is_finite = torch.isfinite(fresh).flatten(2).all(dim=2)
                 scores = scores._replace(returns=scores.returns.masked_fill(~is_finite, float("nan")))
             updated = self._refit(progress, [(fresh, scores), *known, *self._kept(progress, known)], scores.returns)
-            if iteration == 0:  # the policy's proposals and the shifted last plan stay among the candidates
+            if iteration == 0:  # the policy's proposals and the shifted previous plan stay among the candidates
                 known = [(fresh[:, num_fresh:], scores.rest(num_fresh)), (fresh[:, :1], scores.first(1))]
-            elif iteration >= num_common or options.stop_std > 0:
-                updated = progress.updated(is_active & (budget > iteration).to(self.device), updated)
+            elif iteration >= num_common:
+                updated = progress.updated((limit > iteration).to(self.device), updated)
             progress = updated
             spread = self._sampling_std(progress.var)[:, None]
-            centre = progress.mean[:, None]
             history.append((progress.expected_return, spread.mean(dim=(1, 2, 3))))
-            self.budget.lap("iteration")
-            if options.stop_std > 0:
-                is_active = is_active & (progress.var.amax(dim=(1, 2)).sqrt() >= options.stop_std)
-                if not bool(is_active.any()):
-                    stopped = "agreement"
-                    break
+            budget.lap("iteration")
         return progress, history, stopped
 
-    def _begin(self, start: WarmStart, proposals: Tensor | None, num_fresh: int) -> tuple[Progress, Tensor, Tensor]:
-        """The first distribution, and the centre and std of its samples, (batch, 1 or sample, horizon, action)."""
-        mean, var = start.mean, start.var
-        centre, spread = mean[:, None], self._sampling_std(var)[:, None]
-        if proposals is not None and self.options.start != "shifted":
-            mode = proposals[:, 0]
-            mode = torch.where(torch.isfinite(mode), mode, mean)  # a policy that fails leaves the last plan
-            mode_std = self.init_std.clamp_min(self.options.min_std).expand_as(mode)
-            if self.options.start == "policy":
-                mean, var = mode, self.init_std.square().expand_as(mode)
-                centre, spread = mode[:, None], mode_std[:, None]
-            else:
-                is_policy = (torch.arange(num_fresh, device=self.device) % 2 == 1)[:, None, None]
-                centre = torch.where(is_policy, mode[:, None], centre)
-                spread = torch.where(is_policy, mode_std[:, None], spread)
-                mean = (mean + mode) / 2
+    def _begin(self, start: WarmStart) -> Progress:
         nothing = torch.zeros(self.batch, dtype=torch.long, device=self.device)
         unknown = torch.full((self.batch,), float("nan"), dtype=self.dtype, device=self.device)
-        return Progress(mean, var, None, unknown, nothing, nothing, nothing.bool()), centre, spread
+        var = self.init_std.square().expand_as(start.mean)
+        return Progress(start.mean, var, None, unknown, nothing, nothing, nothing.bool())
 
     def _sample(self, centre: Tensor, spread: Tensor, num: int) -> Tensor:
-        options = self.options
-        noise = self.streams.noise(num, self.horizon, options.action_dim, options.noise_beta, self.dtype)
+        noise = self.streams.noise(num, self.horizon, len(self.low), self.options.noise_beta, self.dtype)
         samples = torch.addcmul(centre, spread, noise)
         return torch.minimum(torch.maximum(samples, self.low, out=samples), self.high, out=samples)
 
     def _place_elites(self, fresh: Tensor, start: WarmStart) -> None:
-        """Puts the shifted elites of the last plan among the candidates of the warm environments."""
+        """Puts the shifted elites of the previous plan among the candidates of the warm environments."""
         if start.elites is not None:
             end = min(1 + start.elites.shape[1], fresh.shape[1])
             is_warm = start.is_warm.to(self.device)[:, None, None, None]
             fresh[:, 1:end] = torch.where(is_warm, start.elites[:, : end - 1], fresh[:, 1:end])
 
     def _kept(self, progress: Progress, known: Sequence[Candidates]) -> list[Candidates]:
-        """The best of the last elites, which stay candidates; one that is `known` anyway does not count twice."""
+        """Returns the best of the last elites, which stay candidates; `known` ones are not counted twice."""
         needs_best = self.options.final == "best" or bool(self.scorer.constraints)
         num = max(self.options.num_kept, int(needs_best))
         if progress.elites is None or num == 0:
@@ -255,27 +312,83 @@ class Search:
         )
 
     def _cold_start(self) -> WarmStart:
-        shape = (self.batch, self.horizon, self.options.action_dim)
+        shape = (self.batch, self.horizon, len(self.low))
         mean = torch.zeros_like(self.low).clamp(self.low, self.high).expand(shape)
-        return WarmStart(mean, self.init_std.square().expand(shape), None, torch.zeros(self.batch, dtype=torch.bool))
+        return WarmStart(mean, None, torch.zeros(self.batch, dtype=torch.bool))
 
     def _shift(self, previous: Plan) -> WarmStart:
         (batch, _, dim), bounds = previous.mean.shape, (self.low, self.high)
-        if (batch, dim) != (self.batch, self.options.action_dim):
-            ours = f"{self.batch} environments and actions of {self.options.action_dim}"
+        if (batch, dim) != (self.batch, len(self.low)):
+            ours = f"{self.batch} environments and actions of {len(self.low)}"
             raise ValueError(f"the last plan is for {batch} environments and actions of {dim}, this search for {ours}")
         return shift_plan(
             previous,
             horizon=self.horizon,
             tail=self.options.tail,
-            variance=self.options.warm_start_variance,
-            initial_var=self.init_std.square(),
             bounds=bounds,
             policy_tail=lambda actions, is_tail: self.scorer.continue_by_policy(self.state, actions, is_tail, bounds),
         )
 
     def _sampling_std(self, var: Tensor) -> Tensor:
-        return var.sqrt().clamp_min(self.options.min_std)
+        return torch.maximum(var.sqrt(), self.min_std)
 
-    def _constant(self, value: float | Sequence[float] | Tensor, name: str) -> Tensor:
-        return per_dimension(value, self.options.action_dim, name).to(dtype=self.dtype, device=self.device)
+    def _constant(self, value: Tensor) -> Tensor:
+        return value.to(dtype=self.dtype, device=self.device)
+
+
+def choose(
+    final: str, scorer: Scorer, state: State, progress: Progress, mean: Tensor, policy_mode: Tensor | None
+) -> Choice:
+    """Returns the sequence of a finished search that is executed, its expected return and its violation.
+
+    Args:
+        final: `mean`; `best`, the best candidate; or `better`, the mean or the policy's mode.
+        scorer: Gives sequences their returns.
+        state: Start of the plans, rows (batch,).
+        progress: End of the search.
+        mean: Mean of the final distribution, within the bounds, (batch, horizon, action).
+        policy_mode: The policy's mode sequence, (batch, horizon, action); None where the policy may not replace the
+            plan, and `better` is `mean`.
+    """
+    assert progress.elites is not None
+    if progress.elites.scores.violations is not None:
+        return _choose_feasible(final, scorer, state, progress, mean)
+    if final == "better" and policy_mode is not None:
+        return _choose_better(scorer, state, progress, mean, policy_mode)
+    if final != "best":
+        return mean, progress.expected_return, None
+    best_return = progress.elites.scores.returns[:, 0]
+    is_best = torch.isfinite(best_return)
+    actions = torch.where(is_best[:, None, None], progress.elites.actions[:, 0], mean)
+    return actions, torch.where(is_best, best_return, progress.expected_return), None
+
+
+def _choose_better(scorer: Scorer, state: State, progress: Progress, mean: Tensor, policy_mode: Tensor) -> Choice:
+    """Returns the mean or the policy's mode, by predicted return; the mean where neither return is finite.
+
+    The mean of several good sequences is not one of them, and may have a lower return than the policy's mode.
+    """
+    is_finite = torch.isfinite(policy_mode).flatten(1).all(1)  # a model may give an action that is NaN a finite return
+    both = torch.stack([mean, torch.where(is_finite[:, None, None], policy_mode, mean)], dim=1)
+    better = select_elites(both, scorer.score(scorer.start_rows(state, 2), both), num_elites=1, temperature=None)
+    is_known = better.weights[:, 0] > 0
+    actions = torch.where(is_known[:, None, None], better.actions[:, 0], mean)
+    return actions, torch.where(is_known, better.scores.returns[:, 0], progress.expected_return), None
+
+
+def _choose_feasible(final: str, scorer: Scorer, state: State, progress: Progress, mean: Tensor) -> Choice:
+    """Returns the mean, or under constraints the best candidate where the mean violates them more."""
+    assert progress.elites is not None
+    best, scores = progress.elites.actions[:, 0], progress.elites.scores
+    own = scorer.score(scorer.start_rows(state, 1), mean[:, None])
+    assert own.violations is not None and scores.violations is not None
+    best_return, violation, best_violation = scores.returns[:, 0], own.violations[:, 0], scores.violations[:, 0]
+    is_best = torch.isfinite(best_return)
+    if final != "best":  # the mean of feasible sequences may itself be infeasible
+        is_safer = best_violation < violation.nan_to_num(float("inf"))
+        is_best = is_best & is_safer if scores.is_ranked else torch.zeros_like(is_best)
+    return (
+        torch.where(is_best[:, None, None], best, mean),
+        torch.where(is_best, best_return, progress.expected_return),
+        torch.where(is_best, best_violation, violation),
+    )

@@ -1,4 +1,4 @@
-"""Random numbers for a search: the same for an environment whoever shares the call."""
+"""Random numbers for a search; an environment draws the same numbers whichever other environments share the call."""
 
 from __future__ import annotations
 
@@ -14,16 +14,16 @@ Generators = torch.Generator | Sequence[torch.Generator] | None
 class Streams:
     """The random streams of one plan.
 
-    Every plan takes two numbers from a generator, whatever its iterations, and draws from streams seeded with them.
-    So an environment keeps its random numbers when others stop earlier, start cold or join the call.
+    Every plan takes two numbers from a generator, whatever its number of iterations, and draws from streams that are
+    seeded with these numbers. An environment's random numbers therefore do not depend on the other environments.
 
     Args:
-        generator: One generator that all environments share, or one for each; None takes torch's default.
+        generator: One generator that all environments share, or a list with one each; None takes torch's default.
         batch: Number of environments.
-        device: Where the noise is needed.
+        device: Device of the noise.
 
     Raises:
-        ValueError: A list of generators does not hold one for each environment.
+        ValueError: The list of generators does not have one for each environment.
     """
 
     def __init__(self, generator: Generators, batch: int, device: torch.device) -> None:
@@ -37,7 +37,7 @@ class Streams:
         self._device = device
 
     def noise(self, num: int, horizon: int, action_dim: int, noise_beta: float, dtype: torch.dtype) -> Tensor:
-        """Unit Gaussian noise, (1 or batch, num, horizon, action); `noise_beta` above 0 correlates the steps."""
+        """Returns unit Gaussian noise, (1 or batch, num, horizon, action); a `noise_beta` above 0 correlates steps."""
         size = (num, horizon, action_dim)
         drawn = [torch.randn(size, generator=source, device=self._device, dtype=dtype) for source in self._noise]
         white = drawn[0][None] if len(drawn) == 1 else torch.stack(drawn)
@@ -47,7 +47,7 @@ class Streams:
         return torch.einsum("th,bnha->bnta", factor, white)
 
     def policy_generators(self) -> list[torch.Generator]:
-        """A stream for each environment's policy samples."""
+        """Returns a stream for each environment's policy samples."""
         return [torch.Generator(self._device).manual_seed(seed) for seed in self._policy_seeds]
 
 
@@ -59,11 +59,11 @@ def _draw_seeds(generator: torch.Generator | None) -> tuple[int, int]:
 
 @lru_cache(maxsize=32)
 def _colour_factor(horizon: int, noise_beta: float) -> list[list[float]]:
-    """Lower factor of the covariance over steps of noise with power 1 / frequency**noise_beta, unit variance.
+    """Returns the Cholesky factor of the covariance over steps of noise with power 1 / frequency**noise_beta.
 
-    The spectrum covers twice the horizon, so that the end of a sequence is not tied to its start (as it is when a
-    sequence of just the horizon's length is transformed). Pinneri et al. 2020, "Sample-efficient cross-entropy
-    method for real-time planning", section 3.1, has the idea.
+    The noise has unit variance. The spectrum covers twice the horizon: over the horizon alone the noise would be
+    periodic, and the last step correlated with the first. Coloured noise for CEM is from Pinneri et al. 2020,
+    "Sample-efficient cross-entropy method for real-time planning", section 3.1.
     """
     frequency = torch.arange(1, horizon + 1, dtype=torch.float64) / (2 * horizon)
     power = frequency**-noise_beta

@@ -1,4 +1,4 @@
-"""Candidate sequences through the model: what happens, and how good it is."""
+"""Imagines candidate sequences in the model and scores them."""
 
 from __future__ import annotations
 
@@ -27,15 +27,15 @@ from latentplan.planning.search.elites import Scores
 
 @dataclass(frozen=True)
 class Scorer:
-    """The search problem of one plan: a model, and what is maximised in it.
+    """The model, objective and constraints of one search.
 
     Attributes:
-        model: The model that imagines.
-        objective: What is maximised.
-        constraints: What candidates must keep: each gives a violation (rows,), 0 where it holds.
+        model: The model in which candidates are imagined.
+        objective: Maximised.
+        constraints: Each returns a violation (rows,), 0 where the constraint is satisfied.
         discounts: Powers of the discount, (horizon + 1,), in the precision of the returns.
-        use_continues: Whether the model's probability of going on discounts what follows.
-        penalty: What a unit of violation costs; None leaves the return as it is and ranks by violation first.
+        use_continues: Whether the model's probability that the episode goes on discounts the later rewards.
+        penalty: Return subtracted per unit of violation; None ranks candidates by violation first.
     """
 
     model: Model
@@ -57,10 +57,10 @@ class Scorer:
         use_continues: bool,
         penalty: float | None,
     ) -> Scorer:
-        """The scorer of a plan; without an objective, of predicted reward and (as `terminal_value` says) value.
+        """Returns the scorer of a search; without an objective it scores reward and, by `terminal_value`, value.
 
         Raises:
-            ValueError: The model lacks what a setting asks for.
+            ValueError: The model lacks a method that an option or term needs.
         """
         if use_continues:
             require(model, "continues", "use_continues=True")
@@ -72,12 +72,12 @@ class Scorer:
 
     @property
     def num_particles(self) -> int:
-        """Rollouts of each candidate: as many as objective or constraints ask for, else as many as the model."""
+        """Number of rollouts of each candidate, which the objective, a constraint or the model sets."""
         asked = max(term.num_particles for term in (self.objective, *self.constraints))
         return asked if asked > 1 else getattr(self.model, "num_particles", 1)
 
     def start_rows(self, state: State, num: int) -> State:
-        """Where `num` candidates per environment start: rows (batch sample particle) for a state of rows (batch,)."""
+        """Returns the start of `num` candidates per environment, rows (batch sample particle), of a state (batch,)."""
         particles = self.num_particles
         if particles == 1:
             return repeat_rows(state, num)
@@ -90,27 +90,27 @@ class Scorer:
         return tree_map(lambda leaf: repeat(leaf, pattern, particle=particles, num=num), several)
 
     def score(self, start: State, actions: Tensor) -> Scores:
-        """Scores of given sequences.
+        """Returns the scores of sequences.
 
         Args:
-            start: What `start_rows` gave.
+            start: Result of `start_rows`.
             actions: Candidates, (batch, sample, horizon, action).
         """
         batch, particles = actions.shape[0], self.num_particles
         rows = rearrange(actions, "batch sample horizon action -> (batch sample) horizon action")
         if particles > 1:
             rows = repeat_rows(rows, particles)
-        return self._judge(self._imagine(start, rows, batch, particles))
+        return self._score_rollout(self._imagine(start, rows, batch, particles))
 
     def propose(
         self, state: State, num: int, generators: Sequence[torch.Generator], bounds: tuple[Tensor, Tensor]
     ) -> Tensor:
-        """Sequences that the model's policy takes in imagination, its own mode first, (batch, num, horizon, action).
+        """Returns imagined sequences of the model's policy, its mode first, (batch, num, horizon, action).
 
         Args:
-            state: Where the plan starts, rows (batch,).
-            num: Sequences per environment; all but the first are sampled.
-            generators: One stream per environment, so that a sample does not depend on who shares the call.
+            state: Start of the plans, rows (batch,).
+            num: Number of sequences per environment; all but the first are sampled.
+            generators: One stream per environment, so that samples do not depend on the other environments.
             bounds: Lowest and highest action, each (action,).
 
         Returns:
@@ -136,7 +136,7 @@ class Scorer:
         return rearrange(rows, "(batch num) horizon action -> batch num horizon action", batch=batch)
 
     def act(self, state: State, bounds: tuple[Tensor, Tensor]) -> Tensor:
-        """The mode of the model's policy, within the bounds, (batch, action); not finite where the policy is not."""
+        """Returns the mode of the model's policy, within the bounds, (batch, action); NaN where the policy is NaN."""
         require(self.model, "policy", "num_policy_samples above 0")
         action = self.model.policy(state, None)  # type: ignore[attr-defined]
         low, high = bounds
@@ -146,7 +146,7 @@ class Scorer:
     def continue_by_policy(
         self, state: State, actions: Tensor, is_tail: Tensor, bounds: tuple[Tensor, Tensor]
     ) -> Tensor:
-        """The sequences (batch, horizon, action), with the policy's mode where is_tail (batch, horizon, 1)."""
+        """Returns the sequences (batch, horizon, action) with the policy's mode where is_tail (batch, horizon, 1)."""
         require(self.model, "policy", 'tail="policy"')
         filled: list[Tensor] = []
         for step in range(actions.shape[1]):
@@ -175,7 +175,7 @@ class Scorer:
     def _step_through(
         self, state: State, horizon: int, choose: Callable[[int, State], Tensor]
     ) -> tuple[Tensor, tuple[State, ...], Tensor]:
-        """Rewards (rows, horizon), the states after each step, and the weights of the steps."""
+        """Returns rewards (rows, horizon), the state after each step, and the weights of the steps."""
         states: list[State] = []
         rewards, continues = [], []
         for step in range(horizon):
@@ -193,7 +193,7 @@ class Scorer:
             weights = weights * torch.nn.functional.pad(survival, (1, 0), value=1.0)
         return torch.stack(rewards, dim=1).to(self.discounts.dtype), tuple(states), weights
 
-    def _judge(self, rollout: Rollout) -> Scores:
+    def _score_rollout(self, rollout: Rollout) -> Scores:
         returns = _per_candidate(self.objective(rollout), rollout, "mean", "the objective")
         if not self.constraints:
             return Scores(returns)
@@ -209,7 +209,7 @@ class Scorer:
 
 
 def _per_candidate(values: Tensor, rollout: Rollout, over_particles: str, name: str) -> Tensor:
-    """Values (rows,) as (batch, sample) in the precision of the rewards: a candidate is as good as its particles."""
+    """Returns values (rows,) as (batch, sample), reduced over particles, in the precision of the rewards."""
     check_shape(name, values, rollout.actions.shape[:1])
     pattern = "(batch sample particle) -> batch sample"
     sizes = {"batch": rollout.batch, "particle": rollout.num_particles}
@@ -219,12 +219,12 @@ def _per_candidate(values: Tensor, rollout: Rollout, over_particles: str, name: 
 
 
 def _policy_actions(model: Model, state: State, num: int, generators: Sequence[torch.Generator]) -> Tensor:
-    """The policy's mode for the first row of each environment and samples for the others, (rows, action).
+    """Returns the policy's mode for the first row of each environment and samples for the others, (rows, action).
 
     Args:
         model: A model with a policy.
-        state: (batch, num, ...).
-        num: Rows per environment.
+        state: States, (batch, num, ...).
+        num: Number of rows per environment.
         generators: One stream per environment.
     """
     mode = model.policy(tree_map(lambda leaf: leaf[:, 0], state), None)  # type: ignore[attr-defined]

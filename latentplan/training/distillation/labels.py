@@ -10,11 +10,11 @@ from torch import Tensor
 
 from latentplan.models import Gaussian, State, WorldModel
 from latentplan.models.symmetry import TurnedModel
-from latentplan.planning import CEMPlanner, Plan
+from latentplan.planning import Plan, Planner
 
 
 def plan_actions(
-    planner: CEMPlanner,
+    planner: Planner,
     model: WorldModel | TurnedModel,
     states: State,
     generator: torch.Generator,

@@ -1,4 +1,4 @@
-"""Goals of a search beside the loop: they travel, change on the way, and what cannot travel is refused."""
+"""Goals of a background planner: they are pickled, can change between requests, and are refused if not picklable."""
 
 import pickle
 import time
@@ -37,7 +37,7 @@ def refuse():
 
 
 class Unreadable:
-    """Can be sent, but not be read."""
+    """An objective that can be pickled, but not unpickled."""
 
     def __reduce__(self):
         return refuse, ()
@@ -56,6 +56,13 @@ def wait_for_plan(background, seconds=60.0):
     raise AssertionError("no plan came")
 
 
+@pytest.fixture(scope="module")
+def process():
+    """A background planner in a process, shared, because a process first imports torch for seconds."""
+    with BackgroundPlanner(CEM, MODEL) as background:
+        yield background
+
+
 TERMS = (
     learned_return() + 0.5 * action_penalty(),
     -1.0 * goal_term(torch.tensor([2.0])) * 2.0 - smoothness_penalty(),
@@ -65,7 +72,7 @@ TERMS = (
 
 
 @pytest.mark.parametrize("term", TERMS)
-def test_composed_terms_survive_the_way_to_another_process(term):
+def test_composed_terms_give_the_same_plan_after_pickling(term):
     arrived = pickle.loads(pickle.dumps(term))
     plans = [
         CEM.plan(MODEL, STATE, objective=objective, generator=torch.Generator().manual_seed(0))
@@ -74,39 +81,44 @@ def test_composed_terms_survive_the_way_to_another_process(term):
     assert torch.equal(plans[0].actions, plans[1].actions)
 
 
-@pytest.mark.parametrize("worker", ["process", "thread"])
-def test_goals_change_from_the_next_request_on(worker):
+def check_changes(background):
     constraint = at_every_state(to_the_left)
 
     def expected(**goals):
         return CEM.plan(MODEL, STATE, generator=torch.Generator().manual_seed(3), **goals).actions
 
-    with BackgroundPlanner(CEM, MODEL, worker=worker) as background:
-        for goals in ({}, {"objective": goal_term(torch.tensor([9.0]))}, {"constraints": [constraint]}, {}):
-            background.set_objective(**goals)
-            for tick in (1, 2):
-                assert background.request(STATE, tick, seed=3)
-                torch.testing.assert_close(wait_for_plan(background)[1].actions, expected(**goals))
-
-
-def test_goals_that_cannot_be_sent_are_refused_and_the_old_ones_stay():
-    with BackgroundPlanner(CEM, MODEL) as background:
-        goal = goal_term(torch.tensor([9.0]))
-        background.set_objective(goal)
-        with pytest.raises(TypeError, match="worker='thread'"):
-            background.set_objective(lambda rollout: rollout.rewards.sum(1))
-        background.request(STATE, 1, seed=3)
-        kept = CEM.plan(MODEL, STATE, objective=goal, generator=torch.Generator().manual_seed(3))
-        torch.testing.assert_close(wait_for_plan(background)[1].actions, kept.actions)
-
-
-def test_goals_that_cannot_be_read_there_fail_until_there_are_others():
-    with BackgroundPlanner(CEM, MODEL) as background:
-        background.set_objective(Unreadable())
+    for goals in ({}, {"objective": goal_term(torch.tensor([9.0]))}, {"constraints": [constraint]}, {}):
+        background.set_objective(**goals)
         for tick in (1, 2):
-            background.request(STATE, tick, seed=3)
-            with pytest.raises(ValueError, match="not here"):
-                wait_for_plan(background)
-        background.set_objective()
-        background.request(STATE, 3, seed=3)
-        assert wait_for_plan(background)[0] == 3
+            assert background.request(STATE, tick, seed=3)
+            torch.testing.assert_close(wait_for_plan(background)[1].actions, expected(**goals))
+
+
+def test_set_objective_takes_effect_at_the_next_request_in_a_process(process):
+    check_changes(process)
+
+
+def test_set_objective_takes_effect_at_the_next_request_in_a_thread():
+    with BackgroundPlanner(CEM, MODEL, worker="thread") as background:
+        check_changes(background)
+
+
+def test_set_objective_refuses_goals_that_cannot_be_pickled_and_keeps_the_old_ones(process):
+    goal = goal_term(torch.tensor([9.0]))
+    process.set_objective(goal)
+    with pytest.raises(TypeError, match="worker='thread'"):
+        process.set_objective(lambda rollout: rollout.rewards.sum(1))
+    process.request(STATE, 1, seed=3)
+    kept = CEM.plan(MODEL, STATE, objective=goal, generator=torch.Generator().manual_seed(3))
+    torch.testing.assert_close(wait_for_plan(process)[1].actions, kept.actions)
+
+
+def test_poll_raises_until_goals_change_when_the_process_cannot_unpickle_them(process):
+    process.set_objective(Unreadable())
+    for tick in (1, 2):
+        process.request(STATE, tick, seed=3)
+        with pytest.raises(ValueError, match="not here"):
+            wait_for_plan(process)
+    process.set_objective()
+    process.request(STATE, 3, seed=3)
+    assert wait_for_plan(process)[0] == 3

@@ -1,10 +1,10 @@
-"""A plan in a world that does not go as planned: the policy answers the difference, and nothing else."""
+"""The policy corrects a planned action by the difference between the real and the predicted state."""
 
 import pytest
 import torch
 
 from latentplan.planning import CEMPlanner, FunctionModel, PlanScheduler
-from latentplan.planning.realtime.nominal import NominalTrajectory
+from latentplan.planning.realtime.scheduler import NominalTrajectory
 
 GAIN = -0.5
 PLAN = torch.tensor([[[0.4], [-0.2], [0.1]], [[0.0], [0.3], [0.9]]])
@@ -28,24 +28,24 @@ def nominal():
     return NominalTrajectory(FunctionModel(dynamics, no_reward, policy=linear), START, PLAN)
 
 
-def test_states_are_those_that_the_actions_lead_to(nominal):
+def test_nominal_trajectory_has_the_states_of_the_plan(nominal):
     for age in (2, 0, 1, 3):
         torch.testing.assert_close(nominal.state_at(age), START + PLAN[:, :age].sum(dim=1))
 
 
 @pytest.mark.parametrize("age", [0, 1, 2])
-def test_where_the_world_goes_as_imagined_the_plan_stands(nominal, age):
+def test_nominal_trajectory_keeps_the_plan_when_the_state_is_as_predicted(nominal, age):
     torch.testing.assert_close(nominal.correct(age, nominal.state_at(age), linear), PLAN[:, age])
 
 
 @pytest.mark.parametrize("age", [0, 2])
-def test_the_policy_answers_the_difference(nominal, age):
+def test_nominal_trajectory_adds_the_policys_difference(nominal, age):
     push = torch.tensor([[0.3], [-0.7]])
     corrected = nominal.correct(age, nominal.state_at(age) + push, linear)
     torch.testing.assert_close(corrected, PLAN[:, age] + GAIN * push)
 
 
-def test_where_the_policy_is_not_finite_the_plan_stands(nominal):
+def test_nominal_trajectory_keeps_the_plan_when_the_policy_is_nan(nominal):
     def broken(state):
         return torch.where(state > 5.0, float("nan"), linear(state))
 
@@ -54,7 +54,7 @@ def test_where_the_policy_is_not_finite_the_plan_stands(nominal):
 
 
 class OnePlan:
-    """Gives the same plan for whatever tick it is asked for, at the next tick."""
+    """An executor that returns a plan at the tick after each request."""
 
     def __init__(self, planner, model):
         self.planner, self.model, self.work = planner, model, None
@@ -73,7 +73,7 @@ class OnePlan:
 
 
 def drive(model, push, ticks=40):
-    """Where a body ends that is pushed at every tick, planned for beside the loop: (mean distance, actions)."""
+    """Mean distance from the goal, and actions, of a body that is pushed at every tick."""
     planner = CEMPlanner(action_dim=1, horizon=4, num_samples=256, num_elites=16, num_iterations=6)
     scheduler = PlanScheduler(planner, model, OnePlan(planner, model))
     state, distances, actions = torch.tensor([[1.0]]), [], []
@@ -85,8 +85,8 @@ def drive(model, push, ticks=40):
     return sum(distances[5:]) / len(distances[5:]), torch.cat(actions)
 
 
-def test_a_pushed_body_stays_nearer_to_where_it_should_be():
-    """The plan for a tick knows nothing of the last push; the policy does."""
+def test_policy_correction_keeps_a_pushed_body_nearer_to_its_goal():
+    """The plan for a tick was made before the last push, and the policy acts on the state after it."""
 
     def reward(state, action):
         return -(state + action).square().sum(dim=1)

@@ -1,4 +1,4 @@
-"""A search beside the loop: the loop never waits, errors surface, and nothing is left behind."""
+"""A background planner: the loop never waits, errors reach the loop, and no process or thread is left behind."""
 
 import multiprocessing
 import os
@@ -16,12 +16,12 @@ from latentplan.planning import BackgroundPlanner, CEMPlanner, FunctionModel, Pl
 STATE = torch.tensor([[1.0]])
 CEM = CEMPlanner(action_dim=1, horizon=4, num_samples=16, num_elites=4, num_iterations=2)
 STARTING_SECONDS = 60.0  # a process imports torch first
-# A loop that waited for a search that hangs would take minutes; what a busy machine adds is far below this.
+# A loop that waits for a hanging search takes minutes; delays of a busy machine are far below this limit.
 DECISION_SECONDS = 1.0
 
 
 class StubbornError(Exception):
-    """Cannot be rebuilt from its message alone."""
+    """An error that cannot be unpickled from its message alone."""
 
     def __init__(self, first, second):
         super().__init__(f"{first} and {second}")
@@ -32,7 +32,7 @@ THROWS, THROWS_ODDLY, DIES, HANGS, HANGS_ON = (torch.tensor([[value]]) for value
 
 @dataclass
 class Scripted:
-    """The planner, after what some states make happen first, or every state after `num_good` searches."""
+    """A planner that fails in the way that the state names, or as `trouble` names after `num_good` searches."""
 
     trouble: torch.Tensor | None = None
     num_good: int = 0
@@ -70,12 +70,26 @@ def policy(state, generator):
 MODEL = FunctionModel(dynamics, reward, policy=policy)
 
 
-@pytest.fixture(scope="module", params=["process", "thread"])
+@pytest.fixture(scope="module")
+def process():
+    """A background planner in a process, interrupted while it starts; shared, because a process imports torch first."""
+    with BackgroundPlanner(Scripted(), MODEL) as background:
+        os.kill(background.process.pid, signal.SIGINT)
+        assert background.wait_until_ready(STARTING_SECONDS)
+        yield background
+
+
+@pytest.fixture(scope="module")
+def thread():
+    """A background planner in a thread, ready and shared."""
+    with start(Scripted(), "thread") as background:
+        yield background
+
+
+@pytest.fixture(params=["process", "thread"])
 def running(request):
-    """A background planner that is ready."""
-    background = start(Scripted(), request.param)
-    yield background
-    background.close()
+    """A background planner that is ready, of both kinds."""
+    return request.getfixturevalue(request.param)
 
 
 def start(planner, worker="process"):
@@ -95,7 +109,7 @@ def wait_for_plan(background, seconds=20.0):
 
 
 def drive(background, num, tick_seconds, check=lambda decision: None):
-    """Decisions at a rate; their sources, and the longest that one took."""
+    """Makes decisions at a rate; returns their sources and the longest duration of one."""
     scheduler, state, sources, longest = PlanScheduler(CEM, MODEL, background), STATE, [], 0.0
     for _ in range(num):
         started = time.monotonic()
@@ -108,7 +122,7 @@ def drive(background, num, tick_seconds, check=lambda decision: None):
     return sources, longest
 
 
-def test_a_plan_comes_back_with_its_tick_and_as_it_would_be_searched_here(running):
+def test_poll_returns_the_plan_of_a_direct_search_with_its_tick(running):
     assert running.poll() is None and running.is_idle
     assert running.request(STATE, 7, seed=3)
     assert not running.is_idle and not running.request(STATE, 8)
@@ -121,7 +135,7 @@ def test_a_plan_comes_back_with_its_tick_and_as_it_would_be_searched_here(runnin
     torch.testing.assert_close(wait_for_plan(running)[1].actions, warm.actions)
 
 
-def test_the_loop_keeps_its_rate_while_plans_are_slow_and_jitter(running):
+def test_decide_returns_at_once_while_plans_are_slow_and_jitter(running):
     sources, longest = drive(running, 60, 0.01)
     assert longest < DECISION_SECONDS
     assert {"plan", "tail"} & set(sources)
@@ -129,7 +143,7 @@ def test_the_loop_keeps_its_rate_while_plans_are_slow_and_jitter(running):
         wait_for_plan(running)
 
 
-def test_what_the_search_raises_surfaces_with_type_message_and_place(running):
+def test_poll_raises_the_search_error_with_type_message_and_traceback(running):
     for _ in range(2):  # the worker goes on
         assert running.request(THROWS, 0)
         with pytest.raises(KeyError, match="no such plan") as caught:
@@ -137,41 +151,34 @@ def test_what_the_search_raises_surfaces_with_type_message_and_place(running):
         assert "test_planner.py" in str(caught.value.__cause__)
 
 
-def test_an_error_that_cannot_travel_keeps_its_name_and_message(running):
+def test_poll_keeps_name_and_message_of_an_error_that_cannot_be_pickled(running):
     running.request(THROWS_ODDLY, 0)
     with pytest.raises(RuntimeError, match="StubbornError: this and that"):
         wait_for_plan(running)
 
 
-def test_a_failure_reaches_the_loop_and_the_loop_can_go_on():
+def test_scheduler_raises_a_search_error_and_the_executor_is_idle_again():
     with start(Scripted(THROWS, num_good=2), "thread") as background:
         with pytest.raises(KeyError, match="no such plan"):
             drive(background, 400, 0.005)
         assert background.is_idle
 
 
-def test_a_hanging_search_leaves_the_loop_to_the_tail_and_the_actor_and_can_be_closed():
-    background = start(Scripted(HANGS, num_good=4))
+def test_decide_returns_tail_then_actor_when_the_search_hangs_and_close_kills_it():
+    """The search even ignores the request to terminate."""
+    background = start(Scripted(HANGS_ON, num_good=4))
     sources, longest = drive(background, 80, 0.02)
     assert longest < DECISION_SECONDS
     assert {"plan", "tail"} & set(sources) and sources[-20:] == ["actor"] * 20
     process, started = background.process, time.monotonic()
     background.close()
     assert time.monotonic() - started < 5.0
-    assert not process.is_alive() and process.exitcode is not None
+    assert not process.is_alive() and process.exitcode == -signal.SIGKILL
     assert not background.is_idle and not background.request(STATE, 0) and background.poll() is None
     background.close()  # once more does no harm
 
 
-def test_a_process_that_ignores_being_terminated_is_killed():
-    background = start(Scripted())
-    background.request(HANGS_ON, 0)
-    time.sleep(0.5)
-    background.close()
-    assert background.process.exitcode == -signal.SIGKILL
-
-
-def test_a_process_that_dies_is_reported_once():
+def test_poll_raises_once_when_the_process_died():
     with BackgroundPlanner(Scripted(), MODEL) as background:
         assert background.request(DIES, 0)  # kept until the worker is ready
         with pytest.raises(RuntimeError, match=r"ended unexpectedly \(exit code 7\)"):
@@ -180,7 +187,7 @@ def test_a_process_that_dies_is_reported_once():
 
 
 @pytest.mark.parametrize("worker", ["process", "thread"])
-def test_closing_leaves_neither_process_nor_thread(worker):
+def test_close_ends_process_and_thread(worker):
     before = set(threading.enumerate())
     background = BackgroundPlanner(CEM, MODEL, worker=worker)
     background.request(STATE, 0)
@@ -190,31 +197,28 @@ def test_closing_leaves_neither_process_nor_thread(worker):
     assert process not in multiprocessing.active_children()
 
 
-def test_a_planner_that_is_dropped_ends_its_process():
+def test_process_ends_when_its_planner_is_dropped():
     background = BackgroundPlanner(CEM, MODEL)
     process = background.process
     del background
     assert not process.is_alive()
 
 
-def test_an_interrupt_while_it_starts_is_left_to_the_loop():
-    with BackgroundPlanner(CEM, MODEL) as background:
-        os.kill(background.process.pid, signal.SIGINT)
-        assert background.wait_until_ready(STARTING_SECONDS) and background.process.is_alive()
-        background.request(STATE, 0)
-        assert wait_for_plan(background)[0] == 0
+def test_process_survives_an_interrupt_while_it_starts(process):
+    assert process.process.is_alive()
+    process.request(STATE, 0)
+    assert wait_for_plan(process)[0] == 0
 
 
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="forks")
-def test_a_fork_leaves_the_worker_to_its_parent():
-    with start(CEM) as background:
-        child = os.fork()
-        if child == 0:
-            background.close()
-            os._exit(0)
-        os.waitpid(child, 0)
-        background.request(STATE, 0)
-        assert wait_for_plan(background)[0] == 0
+def test_close_in_a_fork_leaves_the_worker_running(process):
+    child = os.fork()
+    if child == 0:
+        process.close()
+        os._exit(0)
+    os.waitpid(child, 0)
+    process.request(STATE, 0)
+    assert wait_for_plan(process)[0] == 0
 
 
 class Leaves:
@@ -222,7 +226,7 @@ class Leaves:
         sys.exit(3)
 
 
-def test_a_search_that_leaves_its_thread_is_told_of():
+def test_poll_raises_when_a_search_exits_its_thread():
     with start(Leaves(), "thread") as background:
         for _ in range(2):
             background.request(STATE, 0)
@@ -230,7 +234,7 @@ def test_a_search_that_leaves_its_thread_is_told_of():
                 wait_for_plan(background)
 
 
-def test_the_program_ends_though_nobody_closed_and_leaves_no_process(run_python, tmp_path):
+def test_program_ends_without_close_and_leaves_no_process(run_python, tmp_path):
     (tmp_path / "program.py").write_text(
         "import torch\n"
         "from latentplan.planning import BackgroundPlanner\n"
@@ -248,15 +252,13 @@ def test_the_program_ends_though_nobody_closed_and_leaves_no_process(run_python,
 
 
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="reads /proc")
-def test_processes_are_spawned_not_forked():
-    with BackgroundPlanner(CEM, MODEL) as background:
-        background.wait_until_ready(60.0)  # a process that has not yet begun its program names none
-        command = open(f"/proc/{background.process.pid}/cmdline").read()
-        assert "spawn_main" in command
-        assert type(background.process).__name__ == "SpawnProcess" and background.process.daemon
+def test_background_planner_spawns_its_process(process):
+    command = open(f"/proc/{process.process.pid}/cmdline").read()
+    assert "spawn_main" in command
+    assert type(process.process).__name__ == "SpawnProcess" and process.process.daemon
 
 
-def test_what_cannot_be_sent_is_refused_with_the_way_out():
+def test_background_planner_refuses_what_cannot_be_pickled():
     model = FunctionModel(lambda state, action: state, reward)
     with pytest.raises(TypeError, match="worker='thread'"):
         BackgroundPlanner(CEM, model)

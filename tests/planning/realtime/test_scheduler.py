@@ -1,4 +1,4 @@
-"""Which action a tick takes, and what is asked for: no clock, no process, ticks only."""
+"""The action of each tick, and the plans that are requested, counted in ticks without a clock or process."""
 
 import itertools
 
@@ -20,7 +20,7 @@ def chosen(buffer, tick):
     return None if action is None else (round(action.item(), 4), source, age)
 
 
-def test_a_tick_takes_the_action_of_its_age():
+def test_buffer_returns_the_action_at_the_plans_age():
     buffer = PlanBuffer(fresh_ticks=1)
     buffer.submit(plan_of(1.0), 10)
     expected = [(1.0, "plan", 0), (1.1, "plan", 1), (1.2, "tail", 2), (1.3, "tail", 3), None]
@@ -28,19 +28,19 @@ def test_a_tick_takes_the_action_of_its_age():
     assert buffer.choose(15) == (None, None, None)
 
 
-def test_plans_are_dropped_by_age():
+def test_buffer_drops_plans_beyond_max_age():
     buffer = PlanBuffer(max_age=2, fresh_ticks=0)
     buffer.submit(plan_of(1.0), 10)
     assert [chosen(buffer, tick) for tick in (10, 12, 13)] == [(1.0, "plan", 0), (1.2, "tail", 2), None]
 
 
-def test_a_late_plan_is_used_from_the_action_that_the_tick_has_reached():
+def test_buffer_skips_the_first_actions_of_a_late_plan():
     buffer = PlanBuffer()
     buffer.submit(plan_of(1.0), 10)
     assert chosen(buffer, 12) == (1.2, "tail", 2)
 
 
-def test_a_plan_that_is_not_due_waits_while_the_last_one_goes_on():
+def test_buffer_uses_the_last_plan_until_the_next_one_is_due():
     buffer = PlanBuffer()
     buffer.submit(plan_of(1.0), 10)
     buffer.submit(plan_of(2.0), 12)
@@ -49,7 +49,7 @@ def test_a_plan_that_is_not_due_waits_while_the_last_one_goes_on():
     assert chosen(buffer, 16) is None and chosen(buffer, 20) == (3.0, "plan", 0)
 
 
-def test_an_older_plan_never_replaces_a_newer_one():
+def test_buffer_drops_a_plan_older_than_the_newest():
     buffer = PlanBuffer()
     buffer.submit(plan_of(2.0), 12)
     buffer.submit(plan_of(1.0), 11)
@@ -58,7 +58,7 @@ def test_an_older_plan_never_replaces_a_newer_one():
     assert chosen(buffer, 12)[0] == 3.0
 
 
-def test_looking_ahead_drops_nothing():
+def test_buffer_peek_drops_no_plan():
     buffer = PlanBuffer()
     buffer.submit(plan_of(1.0), 10)
     buffer.submit(plan_of(2.0), 12)
@@ -71,7 +71,7 @@ def test_looking_ahead_drops_nothing():
 
 
 @pytest.mark.parametrize("name", ["max_age", "fresh_ticks"])
-def test_negative_ages_are_refused(name):
+def test_buffer_refuses_negative_ages(name):
     with pytest.raises(ValueError, match=name):
         PlanBuffer(**{name: -1})
 
@@ -121,7 +121,7 @@ def model():
     return FunctionModel(dynamics, reward, policy=policy)
 
 
-def test_a_search_that_found_nothing_leaves_the_decisions_to_the_policy():
+def test_scheduler_takes_the_policy_when_a_search_found_nothing_finite():
     broken = FunctionModel(dynamics, lambda state, action: reward(state, action) * torch.nan, policy=policy)
     scheduler, executor = make(broken, itertools.repeat(0.5))
     with pytest.warns(RuntimeWarning, match="nothing finite"):
@@ -129,7 +129,7 @@ def test_a_search_that_found_nothing_leaves_the_decisions_to_the_policy():
     assert [(decision.source, decision.action.item()) for decision in decisions] == [("actor", pytest.approx(0.05))] * 6
 
 
-def test_what_the_policy_does_for_want_of_time_is_no_plan(model):
+def test_scheduler_ignores_plans_without_a_search(model):
     planner = CEMPlanner(action_dim=1, horizon=HORIZON, num_policy_samples=4, deadline_ms=1e-6)
     executor = VirtualExecutor(planner, model, itertools.repeat(0.5))
     decisions, _ = drive(PlanScheduler(planner, model, executor), executor, 6)
@@ -155,8 +155,8 @@ def drive(scheduler, executor, ticks, start=2.0):
     return decisions, states
 
 
-def test_plans_are_made_for_the_state_of_their_tick(model):
-    """In a world as modelled the state that a plan starts from is the one that its tick finds."""
+def test_requests_start_from_the_state_of_their_tick(model):
+    """If the model is exact, a plan starts from the state that its tick finds."""
     scheduler, executor = make(model, [2.5] * 100)
     _, states = drive(scheduler, executor, 30)
     asked = [(state, tick) for state, tick, _, _ in executor.requests if 6 < tick < 30]
@@ -165,7 +165,7 @@ def test_plans_are_made_for_the_state_of_their_tick(model):
         torch.testing.assert_close(state, states[tick])
 
 
-def test_the_latency_is_counted_in_ticks_and_the_first_left_out(model):
+def test_latency_is_counted_in_ticks_without_the_first(model):
     scheduler, executor = make(model, [3.5, *[1.5] * 100])
     drive(scheduler, executor, 5)
     assert scheduler.latency_ticks == 1
@@ -174,20 +174,20 @@ def test_the_latency_is_counted_in_ticks_and_the_first_left_out(model):
     assert {(decision.source, decision.age) for decision in decisions[-10:]} == {("plan", 0), ("plan", 1)}
 
 
-def test_the_expected_latency_is_no_more_than_a_plan_is_long(model):
+def test_latency_ticks_are_at_most_the_horizon(model):
     scheduler, executor = make(model, [1.0, *[50.0] * 10])
     drive(scheduler, executor, 200)
     assert scheduler.latency_ticks == HORIZON
 
 
-def test_a_jittering_latency_leaves_no_tick_without_a_plan(model):
+def test_scheduler_has_a_plan_at_every_tick_when_latency_jitters(model):
     scheduler, executor = make(model, [(0.4, 1.6, 1.2, 0.9, 2.3)[index % 5] for index in range(100)])
     decisions, _ = drive(scheduler, executor, 60)
     assert all(decision.source in ("plan", "tail") for decision in decisions[8:])
     assert all(decision.action.abs() <= 1.0 for decision in decisions)
 
 
-def test_a_plan_that_does_not_come_gives_way_to_the_tail_and_then_to_the_actor(model):
+def test_scheduler_takes_tail_then_actor_when_no_plan_arrives(model):
     scheduler, executor = make(model, [0.5] * 5 + [1e9])
     decisions, _ = drive(scheduler, executor, 16)
     sources = [decision.source for decision in decisions]
@@ -197,7 +197,7 @@ def test_a_plan_that_does_not_come_gives_way_to_the_tail_and_then_to_the_actor(m
     assert all(decision.action == 0.05 and decision.age is None for decision in decisions[9:])
 
 
-def test_each_search_starts_from_the_last_plan_shifted_to_its_tick(model):
+def test_requests_carry_the_last_plan_shifted_to_their_tick(model):
     scheduler, executor = make(model, [1.5] * 100)
     drive(scheduler, executor, 20)
     assert executor.requests[0][2] is None
@@ -208,7 +208,7 @@ def test_each_search_starts_from_the_last_plan_shifted_to_its_tick(model):
     assert all(previous is None for _, _, previous, _ in executor.requests)  # nothing of the last plan is left
 
 
-def test_requests_are_for_rising_ticks_and_have_seeds_of_their_own(model):
+def test_requests_have_rising_ticks_and_distinct_seeds(model):
     scheduler, executor = make(model, [(0.2, 2.5)[index % 2] for index in range(100)])
     drive(scheduler, executor, 60)
     ticks, seeds = [request[1] for request in executor.requests], [request[3] for request in executor.requests]
@@ -216,7 +216,7 @@ def test_requests_are_for_rising_ticks_and_have_seeds_of_their_own(model):
     assert len(set(seeds)) == len(seeds)
 
 
-def test_a_reset_forgets_the_plan_in_work_too(model):
+def test_scheduler_reset_drops_the_plan_of_the_running_request(model):
     scheduler, executor = make(model, [2.5] * 100)
     drive(scheduler, executor, 10)
     assert not executor.is_idle
@@ -230,14 +230,14 @@ def test_a_reset_forgets_the_plan_in_work_too(model):
     assert decisions[-1].source == "plan"
 
 
-def test_without_a_policy_zeros_within_the_bounds_stand_in():
+def test_scheduler_takes_clamped_zeros_without_a_policy():
     planner = CEMPlanner(action_dim=1, horizon=HORIZON, action_low=0.2)
     model = FunctionModel(dynamics, reward)
     scheduler = PlanScheduler(planner, model, VirtualExecutor(planner, model, [1e9]))
     assert scheduler.decide(torch.zeros(2, 1)).action.tolist() == [[pytest.approx(0.2)]] * 2
 
 
-def test_a_failure_surfaces_once_and_the_loop_goes_on(model):
+def test_scheduler_raises_a_search_error_once(model):
     scheduler, executor = make(model, [0.5] * 100)
     drive(scheduler, executor, 4)
     scheduler.executor.work = (executor.now, 4, KeyError("broken"))
@@ -247,7 +247,7 @@ def test_a_failure_surfaces_once_and_the_loop_goes_on(model):
     assert decisions[-1].source == "plan"
 
 
-def test_equal_streams_and_durations_give_equal_decisions(model):
+def test_scheduler_repeats_its_decisions_with_equal_seeds_and_durations(model):
     runs = []
     for _ in range(2):
         scheduler, executor = make(model, [1.3] * 100)
@@ -255,8 +255,8 @@ def test_equal_streams_and_durations_give_equal_decisions(model):
     assert torch.equal(*runs)
 
 
-def test_plans_for_an_objective_are_used_to_their_end(model):
-    """They may be longer than those for the model's own return."""
+def test_scheduler_uses_longer_plans_for_objectives_to_their_end(model):
+    """Plans for an objective may be longer than plans for the predicted return."""
     planner = CEMPlanner(action_dim=1, horizon=2, goal_horizon=6, num_samples=32, num_elites=4)
     executor = VirtualExecutor(planner, model, [0.5, 1e9])
     executor.plan_for = learned_return()
@@ -265,7 +265,7 @@ def test_plans_for_an_objective_are_used_to_their_end(model):
     assert [decision.source for decision in decisions] == ["actor", "plan", "plan", *["tail"] * 4, "actor", "actor"]
 
 
-def test_another_number_of_environments_forgets_the_plans(model):
+def test_scheduler_drops_plans_when_the_number_of_environments_changes(model):
     scheduler, executor = make(model, itertools.repeat(0.5))
     drive(scheduler, executor, 6)
     assert scheduler.decide(torch.ones(3, 1)).action.shape == (3, 1)

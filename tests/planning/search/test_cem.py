@@ -1,15 +1,16 @@
-"""Laws of a plan: where it stays, what it may ask for, what it does with numbers that cannot happen."""
+"""Plans stay in the bounds, ignore numbers that are not finite, and refuse models and options that do not fit."""
+
+import dataclasses
 
 import pytest
 import torch
 
-from latentplan.config import PlannerConfig
-from latentplan.planning import CEMPlanner, FunctionModel, ModelPredictiveController
+from latentplan.planning import FunctionModel, ModelPredictiveController
 
-RICH = {"num_policy_samples": 6, "keep_elite_fraction": 0.3, "noise_beta": 1.0, "start": "both", "tail": "policy"}
+RICH = {"num_policy_samples": 6, "keep_elite_fraction": 0.3, "noise_beta": 1.0, "tail": "policy"}
 
 
-def test_candidates_meet_their_own_environments_state(make_planner, seeded):
+def test_candidates_are_scored_from_their_own_environments_state(make_planner, seeded):
     """Each environment's goal is its state: pairing a candidate with another's state would miss it."""
     model = FunctionModel(lambda state, action: state, lambda state, action: -(action - state).square().sum(dim=1))
     goals = torch.tensor([[0.8, -0.6], [-0.7, 0.1], [0.0, 0.9]])
@@ -18,7 +19,7 @@ def test_candidates_meet_their_own_environments_state(make_planner, seeded):
 
 
 @pytest.mark.parametrize("options", [{}, RICH, {"final": "best"}, RICH | {"final": "better"}, {"gradient_steps": 3}])
-def test_asymmetric_bounds_hold_in_the_model_and_in_the_plan(point, states, make_planner, seeded, options):
+def test_actions_stay_within_asymmetric_bounds_in_model_and_plan(point, states, make_planner, seeded, options):
     low, high = torch.tensor([0.2, -3.0]), torch.tensor([0.7, -0.5])
     seen = []
 
@@ -34,13 +35,13 @@ def test_asymmetric_bounds_hold_in_the_model_and_in_the_plan(point, states, make
         assert (actions >= low).all() and (actions <= high).all()
 
 
-def test_a_plan_made_within_other_bounds_is_brought_into_these(point, states, make_planner, seeded):
+def test_previous_plan_is_clamped_into_narrower_bounds(point, states, make_planner, seeded):
     wide, narrow = (make_planner(action_high=high, keep_elite_fraction=0.5) for high in (9.0, 0.1))
     plan = narrow.plan(point, states, wide.plan(point, states, generator=seeded()), generator=seeded())
     assert plan.elites.max() <= 0.1 and plan.actions.max() <= 0.1
 
 
-def test_the_zero_tail_and_the_cold_start_lie_within_asymmetric_bounds(make_planner, seeded):
+def test_zero_tail_and_cold_start_are_clamped_into_the_bounds(make_planner, seeded):
     model = FunctionModel(lambda state, action: state, lambda state, action: 0 * action.sum(dim=1))
     planner = make_planner(action_low=0.5, action_high=1.5, init_std=0.0, num_elites=64, smoothing=1.0)
     cold = planner.plan(model, torch.zeros(1, 4), generator=seeded())
@@ -49,7 +50,7 @@ def test_the_zero_tail_and_the_cold_start_lie_within_asymmetric_bounds(make_plan
     torch.testing.assert_close(warm.mean, torch.full_like(cold.mean, 0.5))
 
 
-def test_bounds_and_start_std_are_in_action_units(make_planner, seeded):
+def test_init_std_is_in_action_units(make_planner, seeded):
     seen = []
     model = FunctionModel(
         lambda state, action: state, lambda state, action: (seen.append(action.clone()), action.sum(dim=1))[1]
@@ -59,13 +60,21 @@ def test_bounds_and_start_std_are_in_action_units(make_planner, seeded):
     torch.testing.assert_close(torch.cat(seen).std(dim=0), torch.tensor([2.0, 5.0]), rtol=0.05, atol=0)
 
 
-def test_the_default_start_std_is_half_the_range(make_planner, seeded):
-    plan = make_planner(action_low=-1.0, action_high=3.0, num_iterations=1, smoothing=1e-9).plan(
-        FunctionModel(lambda state, action: state, lambda state, action: action.sum(dim=1)),
-        torch.zeros(1, 4),
-        generator=seeded(),
-    )
-    torch.testing.assert_close(plan.var, torch.full_like(plan.var, 4.0))
+def test_init_std_is_a_quarter_of_the_range_by_default(make_planner, seeded):
+    planner = make_planner(init_std=None, action_low=(-1.0, 0.0), action_high=(3.0, 1.0), num_iterations=1)
+    planner = dataclasses.replace(planner, smoothing=1e-9)
+    model = FunctionModel(lambda state, action: state, lambda state, action: action.sum(dim=1))
+    plan = planner.plan(model, torch.zeros(1, 4), generator=seeded())
+    torch.testing.assert_close(plan.var, torch.tensor([1.0, 0.0625]).expand_as(plan.var))
+
+
+def test_min_std_is_at_most_a_derived_init_std(make_planner, seeded):
+    """Without that cap a floor of 0.05 would throw every sample onto the bounds of a narrow range."""
+    model = FunctionModel(lambda state, action: state, lambda state, action: action.sum(dim=1))
+    for init_std, expected in ((None, 0.005), (0.005, 0.05)):
+        planner = make_planner(action_low=-0.01, action_high=0.01, init_std=init_std, min_std=0.05, smoothing=1e-9)
+        std = planner.plan(model, torch.zeros(1, 4), generator=seeded()).info["std"]
+        torch.testing.assert_close(std, torch.full_like(std, expected))
 
 
 def test_min_std_floors_the_sampling_and_not_the_variance(point, states, make_planner, seeded):
@@ -78,8 +87,8 @@ def test_min_std_floors_the_sampling_and_not_the_variance(point, states, make_pl
 
 
 @pytest.mark.parametrize("broken", [float("nan"), float("inf")])
-def test_nonfinite_candidates_never_win_and_are_counted(states, make_planner, seeded, broken):
-    """Everything with a positive first action is broken: the plan must not go there."""
+def test_nonfinite_candidates_are_counted_and_never_elites(states, make_planner, seeded, broken):
+    """Every positive first action has a return that is not finite, so the plan must avoid it."""
 
     def reward(state, action):
         return torch.where(action[:, 0] > 0, broken, action[:, 0])
@@ -90,8 +99,8 @@ def test_nonfinite_candidates_never_win_and_are_counted(states, make_planner, se
     assert (plan.info["num_nonfinite"] > 0).all() and not plan.info["is_fallback"].any()
 
 
-@pytest.mark.parametrize("options", [{}, {"warm_start": False}, {"start": "policy", "num_policy_samples": 4}])
-def test_when_nothing_is_finite_the_last_plans_tail_is_executed(point, states, make_planner, seeded, options):
+@pytest.mark.parametrize("options", [{}, {"warm_start": False}, {"num_policy_samples": 4}])
+def test_last_plans_tail_is_executed_when_no_return_is_finite(point, states, make_planner, seeded, options):
     planner = make_planner(action_low=-0.4, **options)
     last = planner.plan(point, states, generator=seeded())
     broken = FunctionModel(
@@ -103,18 +112,17 @@ def test_when_nothing_is_finite_the_last_plans_tail_is_executed(point, states, m
     assert (plan.actions[0] == 0).all() and (plan.actions[:, -1] == 0).all()
 
 
-@pytest.mark.parametrize("start", ["shifted", "policy", "both"])
-def test_a_policy_that_answers_nan_is_left_out(point, states, make_planner, seeded, start):
+def test_proposals_are_no_elites_when_they_are_nan(states, make_planner, seeded):
     model = FunctionModel(
         lambda state, action: state,
-        lambda state, action: torch.nan_to_num(action[:, 0], nan=9.0),  # would reward what is not a number
+        lambda state, action: torch.nan_to_num(action[:, 0], nan=9.0),  # gives an action that is NaN a high reward
         policy=lambda state, generator: torch.full_like(state[:, :2], float("nan")),
     )
-    plan = make_planner(num_policy_samples=8, start=start).plan(model, states, generator=seeded())
+    plan = make_planner(num_policy_samples=8).plan(model, states, generator=seeded())
     assert torch.isfinite(plan.mean).all() and not plan.info["is_fallback"].any()
 
 
-def test_a_done_candidate_ends_only_itself(make_planner, seeded):
+def test_use_continues_ends_only_the_candidate_that_is_done(make_planner, seeded):
     """Reward 1 for every step alive; action above 0 ends the episode."""
 
     def dynamics(state, action):
@@ -133,8 +141,8 @@ def test_a_done_candidate_ends_only_itself(make_planner, seeded):
     torch.testing.assert_close(plan.expected_return, torch.full((2,), 16.0))
 
 
-def test_nothing_counts_after_an_end_however_the_model_goes_on(make_planner, seeded):
-    """The episode ends on arriving in state 2; states after that would pay well."""
+def test_use_continues_ignores_rewards_after_the_end(make_planner, seeded):
+    """The episode ends in state 2; later states would have a high reward."""
     model = FunctionModel(
         lambda state, action: state + 1,
         lambda state, action: 1.0 + state[:, 0] + 0 * action[:, 0],
@@ -155,7 +163,7 @@ def test_expected_return_is_discounted_reward_plus_discounted_value(make_planner
     assert plan.expected_return.item() == pytest.approx(0 + 0.5 * 1 + 0.25 * 2 + 0.125 * 300)
 
 
-def test_asking_for_what_the_model_lacks_is_an_error(point, states, make_planner):
+def test_plan_names_the_method_that_an_option_needs(point, states, make_planner):
     bare = FunctionModel(point.dynamics, point.reward)
     for options, method in [
         ({"terminal_value": True}, "value"),
@@ -169,7 +177,7 @@ def test_asking_for_what_the_model_lacks_is_an_error(point, states, make_planner
         make_planner(tail="policy").plan(bare, states, last)
 
 
-def test_the_terminal_value_is_used_when_the_model_has_one_unless_it_is_refused(point, states, make_planner, seeded):
+def test_terminal_value_is_used_by_default_when_the_model_has_a_value(point, states, make_planner, seeded):
     detected, asked, refused = (
         make_planner(terminal_value=choice).plan(point, states, generator=seeded()).mean
         for choice in (None, True, False)
@@ -177,8 +185,8 @@ def test_the_terminal_value_is_used_when_the_model_has_one_unless_it_is_refused(
     assert torch.equal(detected, asked) and not torch.equal(detected, refused)
 
 
-def test_the_shifted_last_plan_is_always_a_candidate(make_planner, seeded):
-    """Only the last plan, shifted, is worth anything: it wins although nothing is sampled near it."""
+def test_shifted_last_plan_is_a_candidate(make_planner, seeded):
+    """Only the shifted last plan has a reward, and no other candidate is sampled near it."""
     last_actions = torch.linspace(-0.9, 0.9, 12).reshape(1, 6, 2)
     wanted = torch.cat([last_actions[:, 1:], torch.zeros(1, 1, 2)], dim=1)
 
@@ -190,22 +198,16 @@ def test_the_shifted_last_plan_is_always_a_candidate(make_planner, seeded):
         return ((action - target).abs().amax(dim=1) < 1e-6).float()
 
     model = FunctionModel(dynamics, reward)
-    for start in ("shifted", "policy"):
-        model.policy = lambda state, generator: torch.full((len(state), 2), 0.99)
-        planner = make_planner(
-            init_std=1e-4, num_policy_samples=4, start=start, final="best", num_elites=1, num_iterations=3
-        )
-        previous = planner.plan(model, torch.zeros(1, 2), generator=seeded())
-        previous = type(previous)(last_actions, last_actions, *[getattr(previous, name) for name in _REST])
-        plan = planner.plan(model, torch.zeros(1, 2), previous, generator=seeded())
-        torch.testing.assert_close(plan.actions, wanted)
+    model.policy = lambda state, generator: torch.full((len(state), 2), 0.99)
+    planner = make_planner(init_std=1e-4, num_policy_samples=4, final="best", num_elites=1, num_iterations=3)
+    previous = planner.plan(model, torch.zeros(1, 2), generator=seeded())
+    previous = dataclasses.replace(previous, actions=last_actions, mean=last_actions)
+    plan = planner.plan(model, torch.zeros(1, 2), previous, generator=seeded())
+    torch.testing.assert_close(plan.actions, wanted)
 
 
-_REST = ("var", "expected_return", "info", "elites", "is_warm", "elapsed")
-
-
-def test_the_policys_mode_is_among_the_candidates(make_planner, seeded):
-    """A sampled policy is useless here: only the mode itself earns anything."""
+def test_policy_mode_is_a_candidate(make_planner, seeded):
+    """Only the mode of the policy has a reward, and its samples have none."""
     model = FunctionModel(
         lambda state, action: state,
         lambda state, action: (action - 0.625).abs().amax(dim=1).lt(1e-6).float(),
@@ -217,7 +219,7 @@ def test_the_policys_mode_is_among_the_candidates(make_planner, seeded):
     torch.testing.assert_close(plan.actions, torch.full_like(plan.actions, 0.625))
 
 
-def test_plans_are_ordinary_tensors_without_gradient(point, states, make_planner):
+def test_plan_tensors_carry_no_gradient_and_are_usable_as_targets(point, states, make_planner):
     weight = torch.ones(2, requires_grad=True)
     model = FunctionModel(point.dynamics, lambda state, action: point.reward(state, action * weight))
     plan = make_planner().plan(model, states)
@@ -225,19 +227,12 @@ def test_plans_are_ordinary_tensors_without_gradient(point, states, make_planner
     (plan.mean * weight).sum().backward()  # usable as a training target
 
 
-def test_double_states_are_planned_in_double(point, states, make_planner):
+def test_plan_is_float64_when_the_state_is_float64(point, states, make_planner):
     plan = make_planner().plan(point, states.double())
     assert plan.mean.dtype == plan.expected_return.dtype == torch.float64
 
 
-def test_a_planner_follows_its_configuration(point, states, seeded):
-    config = PlannerConfig(horizon=4, num_samples=32, num_elites=5, num_policy_samples=3, final="best")
-    planner = CEMPlanner.from_config(config, action_dim=2, discount=0.9)
-    assert (planner.horizon, planner.num_elites, planner.final, planner.discount) == (4, 5, "best", 0.9)
-    assert planner.plan(point, states, generator=seeded()).mean.shape == (5, 4, 2)
-
-
-def test_the_optimum_of_a_point_mass_is_found(point, make_planner, seeded):
+def test_controller_brings_a_point_mass_to_rest(point, make_planner, seeded):
     """Controlled for 40 steps, the mass comes to rest at the origin."""
     planner = make_planner(horizon=10, num_samples=256, num_elites=24, num_iterations=4, warm_start_iterations=3)
     controller = ModelPredictiveController(planner, point, generator=seeded())
@@ -254,7 +249,8 @@ def test_the_optimum_of_a_point_mass_is_found(point, make_planner, seeded):
         ({"num_policy_samples": 64}, "num_policy_samples"),
         ({"smoothing": 0.0}, "smoothing"),
         ({"discount": 1.1}, "discount"),
-        ({"start": "middle"}, "start"),
+        ({"tail": "middle"}, "tail"),
+        ({"final": "worst"}, "final"),
         ({"action_low": 1.0, "action_high": -1.0}, "action_low"),
         ({"action_low": [0.0, 0.0, 0.0]}, "action_low"),
         ({"action_high": float("inf")}, "action_high"),
@@ -266,7 +262,6 @@ def test_the_optimum_of_a_point_mass_is_found(point, make_planner, seeded):
         ({"min_std": 1e300}, "min_std"),
         ({"init_std": 1e300}, "init_std"),
         ({"noise_beta": 101}, "noise_beta"),
-        ({"stop_std": float("nan")}, "stop_std"),
         ({"noise_beta": float("nan")}, "noise_beta"),
         ({"constraint_penalty": float("nan")}, "constraint_penalty"),
         ({"horizon": 2.5}, "horizon"),
@@ -277,12 +272,12 @@ def test_the_optimum_of_a_point_mass_is_found(point, make_planner, seeded):
         ({"gradient_steps": -1}, "gradient_steps"),
     ],
 )
-def test_bad_settings_are_named(make_planner, options, name):
+def test_planner_names_a_bad_option(make_planner, options, name):
     with pytest.raises(ValueError, match=name):
         make_planner(**options)
 
 
-def test_wrong_shapes_from_the_model_are_named(point, states, make_planner):
+def test_plan_names_wrong_shapes_from_the_model(point, states, make_planner):
     with pytest.raises(ValueError, match=r"step\(\)'s reward must have shape \(320,\), got \(320, 1\)"):
         make_planner().plan(FunctionModel(point.dynamics, lambda state, action: state[:, :1]), states)
     with pytest.raises(TypeError, match="tensor or a pytree"):

@@ -1,4 +1,4 @@
-"""What is executed of a finished search: of the mean and the policy's mode the better, by predicted return."""
+"""`final="better"` executes the mean or the policy's mode, by predicted return."""
 
 import math
 
@@ -11,7 +11,7 @@ NAN = float("nan")
 
 
 def needle(state, action):
-    """Near the state's number everything is paid a little, at exactly 0.625 a lot."""
+    """The reward is small near the number of the state, and high at exactly 0.625."""
     return 1 - (action - state[:, :1]).square().sum(dim=1) + 10 * (action - 0.625).abs().amax(dim=1).lt(1e-6).float()
 
 
@@ -23,7 +23,7 @@ def constant(number):
     return lambda state, generator: torch.full((len(state), 2), number)
 
 
-def test_each_environment_executes_the_better_of_the_mean_and_the_policys_mode(make_planner, seeded):
+def test_final_better_executes_mean_or_policy_mode_by_return(make_planner, seeded):
     states = torch.tensor([[0.2], [-0.4], [0.3]])
     knows = torch.tensor([[0.2], [0.3]])  # the first and the last policy know where the needle is
     model = make_model(lambda state, generator: torch.where(torch.isin(state, knows), 0.625, 0.0).expand(len(state), 2))
@@ -37,7 +37,7 @@ def test_each_environment_executes_the_better_of_the_mean_and_the_policys_mode(m
 
 
 @pytest.mark.parametrize("policy", [NAN, 5.0])
-def test_a_mode_that_is_no_number_is_not_executed_and_one_out_of_bounds_is_brought_in(make_planner, seeded, policy):
+def test_final_better_ignores_a_nan_mode_and_clamps_one_out_of_bounds(make_planner, seeded, policy):
     def reward(state, action):
         return torch.nan_to_num(action, nan=9.0).sum(dim=1)
 
@@ -48,7 +48,7 @@ def test_a_mode_that_is_no_number_is_not_executed_and_one_out_of_bounds_is_broug
     torch.testing.assert_close(plan.actions, expected)
 
 
-def test_the_policy_has_no_say_in_what_it_does_not_know(make_planner, seeded):
+def test_final_better_is_mean_when_the_policy_makes_no_valid_proposal(make_planner, seeded):
     model, states = make_model(constant(0.625)), torch.tensor([[0.2], [-0.4]])
     planner = make_planner(num_policy_samples=4, final="better")
     for given in ({"objective": learned_return()}, {"constraints": [lambda rollout: rollout.rewards[:, 0] * 0.0]}):
@@ -58,7 +58,7 @@ def test_the_policy_has_no_say_in_what_it_does_not_know(make_planner, seeded):
     assert torch.equal(alone.actions, alone.mean)
 
 
-def test_where_nothing_is_finite_the_last_plan_goes_on(point, states, make_planner, seeded):
+def test_final_better_executes_the_last_plan_when_no_return_is_finite(point, states, make_planner, seeded):
     planner = make_planner(num_policy_samples=4, final="better")
     last = planner.plan(point, states, generator=seeded())
     broken = make_model(point.policy, lambda state, action: torch.full_like(state[:, 0], NAN))

@@ -1,4 +1,4 @@
-"""A plan depends on its own environment, its stream and what the model says, and on nothing else."""
+"""A plan depends on its own environment, random stream and model only."""
 
 from typing import NamedTuple
 
@@ -28,11 +28,11 @@ def pick(plan, index):
     )
 
 
-RICH = {"num_policy_samples": 6, "keep_elite_fraction": 0.3, "noise_beta": 1.0, "start": "both", "tail": "policy"}
+RICH = {"num_policy_samples": 6, "keep_elite_fraction": 0.3, "noise_beta": 1.0, "tail": "policy"}
 
 
 @pytest.mark.parametrize("options", [{}, RICH])
-def test_an_environment_has_the_same_plan_alone_and_in_company(point, states, make_planner, seeded, options):
+def test_plan_is_the_same_alone_and_with_other_environments(point, states, make_planner, seeded, options):
     planner = make_planner(**options)
     together = planner.plan(point, states, generator=seeded())
     warm = planner.plan(point, states + 0.1, together.forget(torch.tensor([0, 1, 0, 0, 1]).bool()), generator=seeded(1))
@@ -44,7 +44,7 @@ def test_an_environment_has_the_same_plan_alone_and_in_company(point, states, ma
         assert_same_plan(planner.plan(point, states[row] + 0.1, before, generator=seeded(1)), pick(warm, row))
 
 
-def test_an_environment_has_the_same_plan_among_64(point, make_planner, seeded):
+def test_plan_is_the_same_among_64_environments(point, make_planner, seeded):
     many = torch.randn(64, 4, generator=seeded(9))
     planner = make_planner(num_policy_samples=4)
     together = planner.plan(point, many, generator=seeded())
@@ -53,13 +53,13 @@ def test_an_environment_has_the_same_plan_among_64(point, make_planner, seeded):
         assert_same_plan(planner.plan(point, many[row], generator=seeded()), pick(together, row))
 
 
-def test_the_order_of_environments_does_not_matter(point, states, make_planner, seeded):
+def test_plan_is_the_same_in_another_order_of_environments(point, states, make_planner, seeded):
     planner, order = make_planner(num_policy_samples=4), torch.tensor([3, 0, 4, 2, 1])
     plan = planner.plan(point, states, generator=seeded())
     assert_same_plan(planner.plan(point, states[order], generator=seeded()), pick(plan, order))
 
 
-def test_a_list_of_generators_gives_each_environment_its_own_stream(point, states, make_planner, seeded):
+def test_list_of_generators_gives_each_environment_its_own_stream(point, states, make_planner, seeded):
     planner = make_planner(num_policy_samples=4)
     plan = planner.plan(point, states, generator=[seeded(seed) for seed in range(5)])
     alone = planner.plan(point, states[3:4], generator=seeded(3))
@@ -68,7 +68,7 @@ def test_a_list_of_generators_gives_each_environment_its_own_stream(point, state
         planner.plan(point, states, generator=[seeded()])
 
 
-def test_a_stream_stays_aligned_when_a_neighbour_starts_cold(point, states, make_planner, seeded):
+def test_plan_is_the_same_when_another_environment_starts_cold(point, states, make_planner, seeded):
     planner = make_planner(num_iterations=4, warm_start_iterations=2)
     pair, single = seeded(5), seeded(5)
     both = planner.plan(point, states[:2], generator=pair)
@@ -81,14 +81,14 @@ def test_a_stream_stays_aligned_when_a_neighbour_starts_cold(point, states, make
     assert_same_plan(one, pick(both, slice(0, 1)))
 
 
-def test_equal_seeds_give_equal_plans_and_others_do_not(point, states, make_planner, seeded):
+def test_plan_depends_on_the_seed(point, states, make_planner, seeded):
     planner = make_planner()
     first, again, other = (planner.plan(point, states, generator=seeded(seed)) for seed in (0, 0, 1))
     assert torch.equal(first.mean, again.mean)
     assert not torch.equal(first.mean, other.mean)
 
 
-def test_a_broken_environment_does_not_disturb_its_neighbours(point, states, make_planner, seeded):
+def test_plan_is_the_same_when_another_environment_is_nan(point, states, make_planner, seeded):
     planner = make_planner()
     spoiled = states.clone()
     spoiled[2] = float("nan")
@@ -98,7 +98,7 @@ def test_a_broken_environment_does_not_disturb_its_neighbours(point, states, mak
     assert_same_plan(pick(plan, others), pick(good, others))
 
 
-def test_a_fused_rollout_gives_the_same_plan_as_steps(point, states, make_planner, seeded):
+def test_fused_rollout_gives_the_same_plan_as_steps(point, states, make_planner, seeded):
     def rollout(state, actions):
         rewards = []
         for action in actions.unbind(1):
@@ -117,7 +117,7 @@ class Nested(NamedTuple):
     rest: dict
 
 
-def test_states_may_be_nested(point, states, make_planner, seeded):
+def test_plan_is_the_same_when_the_state_is_nested(point, states, make_planner, seeded):
     def flat(state):
         return torch.cat([state.position, state.rest["velocity"]], dim=1)
 

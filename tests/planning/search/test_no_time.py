@@ -1,4 +1,4 @@
-"""What a planner does that has no time to plan."""
+"""Plans of a search that has no time for one iteration."""
 
 from dataclasses import replace
 
@@ -55,12 +55,12 @@ def planner(model):
 
 @pytest.fixture
 def last(planner, model, state):
-    """The last plan of a planner that knows what it takes: 4 ms for the policy's proposals, 10 ms for an iteration."""
+    """The last plan of a planner that has measured 4 ms for the policy's proposals and 10 ms for an iteration."""
     planner.plan(model, state)
     return planner.plan(model, state)
 
 
-def test_the_policy_acts_where_it_fits(planner, model, state, last):
+def test_policy_sequence_is_executed_when_no_iteration_fits(planner, model, state, last):
     before = model.seconds
     plan = planner.plan(model, state, last, deadline_ms=9)
     assert 1000 * (model.seconds - before) <= 9
@@ -69,14 +69,14 @@ def test_the_policy_acts_where_it_fits(planner, model, state, last):
     assert torch.allclose(plan.action, (0.25 + 0.1 * state).clamp(-1.0, 1.0))
 
 
-def test_the_policy_of_a_learned_goal_acts_where_it_fits(planner, model, state, last):
+def test_policy_of_a_learned_goal_is_executed_when_no_iteration_fits(planner, model, state, last):
     own = planner.plan(model, state, last, deadline_ms=5.0)
     plan = planner.plan(model, state, last, objective=conditioned(lambda seen: seen), deadline_ms=5.0)
     assert plan.info["stopped"] == "deadline" and bool(plan.info["is_policy"].all())
     assert torch.equal(plan.actions, own.actions)
 
 
-def test_what_a_slower_model_takes_is_not_expected_of_this_one(planner, model, state, last):
+def test_pace_separates_models_of_different_types(planner, model, state, last):
     class Slower(SlowModel):
         def rollout(self, state, actions):
             model.seconds += 0.09
@@ -88,7 +88,7 @@ def test_what_a_slower_model_takes_is_not_expected_of_this_one(planner, model, s
 
 
 @pytest.mark.parametrize("previous", ["last", None])
-def test_else_the_policy_acts_once_however_little_time_there_is(planner, model, state, last, previous):
+def test_policy_action_is_held_when_its_sequence_does_not_fit(planner, model, state, last, previous):
     before = model.seconds
     plan = planner.plan(model, state, last if previous else None, deadline_ms=0)
     assert 1000 * (model.seconds - before) <= 1.001
@@ -96,19 +96,19 @@ def test_else_the_policy_acts_once_however_little_time_there_is(planner, model, 
     assert torch.allclose(plan.actions, (0.25 + 0.1 * state).clamp(-1.0, 1.0)[:, None].expand(-1, HORIZON, -1))
 
 
-def test_without_a_policy_the_last_plan_goes_on(planner, model, state, last):
+def test_last_plan_is_executed_without_time_and_policy(planner, model, state, last):
     shifted = replace(planner, num_policy_samples=0).plan(model, state, last, deadline_ms=0)
     assert shifted.source == "tail"
     assert torch.equal(shifted.actions[:, :-1], last.actions[:, 1:])
 
 
 @pytest.mark.parametrize("wanted", [{"objective": first_reward}, {"constraints": [first_reward]}])
-def test_a_policy_is_not_asked_for_what_it_was_not_trained_for(planner, model, state, last, wanted):
+def test_last_plan_is_executed_without_time_when_another_objective_is_set(planner, model, state, last, wanted):
     plan = planner.plan(model, state, last, deadline_ms=9, **wanted)
     assert torch.equal(plan.actions[:, :-1], last.actions[:, 1:])
 
 
-def test_a_policy_that_fails_leaves_the_last_plan(planner, model, state, last):
+def test_last_plan_is_executed_without_time_when_the_policy_is_nan(planner, model, state, last):
     model.policy = lambda state, generator=None: torch.full_like(state, float("nan"))
     plan = planner.plan(model, state, last, deadline_ms=9)
     assert torch.equal(plan.actions[:, :-1], last.actions[:, 1:])

@@ -1,100 +1,126 @@
-"""Every option changes the plan, and does what it says."""
+"""Every option of the search does what it says."""
+
+import dataclasses
 
 import pytest
 import torch
 
+from latentplan.config import PlannerConfig
 from latentplan.planning import CEMPlanner, FunctionModel, icem_planner, learned_return, mppi_planner, refit
+from latentplan.planning.search.options import SearchOptions
 from latentplan.planning.search.sampling import Streams
 
-CHANGES = [
-    {"horizon": 5},
-    {"num_samples": 50},
-    {"num_elites": 5},
-    {"num_iterations": 2},
-    {"smoothing": 0.5},
-    {"action_low": -0.2},
-    {"action_high": [0.1, 1.0]},
-    {"init_std": 0.3},
-    {"min_std": 0.9},
-    {"discount": 0.5},
-    {"num_policy_samples": 8},
-    {"num_policy_samples": 8, "start": "policy"},
-    {"num_policy_samples": 8, "start": "both"},
-    {"terminal_value": False},
-    {"use_continues": True},
-    {"noise_beta": 2.0},
-    {"keep_elite_fraction": 0.5},
-    {"stop_std": 0.9},
-    {"temperature": 0.5},
-    {"adapt_std": False},
-]
-CHANGES_OF_THE_CHOICE = [{"final": "best"}, {"gradient_steps": 2}]
-CHANGES_WHEN_WARM = [
-    {"warm_start_iterations": 1},
-    {"warm_start": False},
-    {"tail": "hold"},
-    {"tail": "policy"},
-    {"warm_start_variance": "keep"},
-    {"warm_start_variance": "inflate"},
-]
+
+class Recorder:
+    """A model whose state stays, and that keeps the candidates of every iteration."""
+
+    def __init__(self):
+        self.candidates = []
+
+    def step(self, state, action):
+        raise NotImplementedError("only whole sequences are imagined")
+
+    def rollout(self, state, actions):
+        self.candidates.append(actions.clone())
+        return -(actions - 0.3).square().sum(dim=2), state
 
 
 @pytest.fixture
-def model(point):
-    point.continues = lambda state: torch.sigmoid(2.0 - state[:, 0])
-    return point
-
-
-@pytest.mark.parametrize("options", CHANGES, ids=str)
-def test_option_changes_a_cold_plan(model, states, make_planner, seeded, options):
-    plain = make_planner().plan(model, states, generator=seeded())
-    changed = make_planner(**options).plan(model, states, generator=seeded())
-    assert plain.mean.shape != changed.mean.shape or not torch.equal(plain.mean, changed.mean)
-
-
-def test_the_goal_horizon_changes_plans_for_objectives_alone(model, states, make_planner, seeded):
-    plain, changed = make_planner(), make_planner(goal_horizon=9)
-    own, same = (planner.plan(model, states, generator=seeded()) for planner in (plain, changed))
-    assert torch.equal(own.mean, same.mean)
-    given = {"objective": learned_return(), "generator": seeded()}
-    assert changed.plan(model, states, **given).actions.shape[1] == 9 != plain.horizon
-
-
-@pytest.mark.parametrize("options", CHANGES_OF_THE_CHOICE, ids=str)
-def test_option_changes_what_is_executed_and_not_the_search(model, states, make_planner, seeded, options):
-    plain = make_planner().plan(model, states, generator=seeded())
-    changed = make_planner(**options).plan(model, states, generator=seeded())
-    assert not torch.equal(plain.actions, changed.actions)
-
-
-@pytest.mark.parametrize("options", CHANGES_WHEN_WARM, ids=str)
-def test_option_changes_a_warm_plan_and_no_cold_one(model, states, make_planner, seeded, options):
-    plain, changed = make_planner(), make_planner(**options)
-    last = plain.plan(model, states, generator=seeded())
-    assert torch.equal(last.mean, changed.plan(model, states, generator=seeded()).mean)
-    warm, other = (planner.plan(model, states, last, generator=seeded(1)) for planner in (plain, changed))
-    assert not torch.equal(warm.mean, other.mean)
-
-
-def test_every_option_is_covered_here(make_planner):
-    import dataclasses
-
-    named = {name for options in CHANGES + CHANGES_OF_THE_CHOICE + CHANGES_WHEN_WARM for name in options}
-    named |= {"goal_horizon"}  # changes nothing but plans that are given an objective
-    elsewhere = {"action_dim", "constraint_penalty", "gradient_step_size", "deadline_ms", "clock"}
-    assert {field.name for field in dataclasses.fields(make_planner())} == named | elsewhere
+def recorder():
+    return Recorder()
 
 
 def frozen(make_planner, **options):
-    """A planner that samples nothing but its start: what it plans is where the search began."""
+    """A planner that samples only its start: the plan is where the search began."""
     return make_planner(init_std=0.0, num_iterations=1, **options)
+
+
+def test_planner_config_and_planner_share_options_defaults_and_checks():
+    for kind, own in (
+        (PlannerConfig, {"method", "surprise_limit"}),
+        (CEMPlanner, {"action_dim", "action_low", "action_high", "discount", "clock"}),
+    ):
+        fields = {field.name: field.default for field in dataclasses.fields(kind)}
+        shared = {field.name: field.default for field in dataclasses.fields(SearchOptions)}
+        assert fields.keys() - own == shared.keys()
+        assert all(fields[name] == default for name, default in shared.items())
+    for bad in ({"num_elites": 129}, {"smoothing": 0.0}, {"tail": "head"}, {"temperature": -1.0}):
+        messages = []
+        for make in (lambda bad=bad: PlannerConfig(**bad), lambda bad=bad: CEMPlanner(action_dim=1, **bad)):
+            with pytest.raises(ValueError, match=next(iter(bad))) as caught:
+                make()
+            messages.append(str(caught.value))
+        assert messages[0] == messages[1]
+
+
+def test_sizes_set_the_number_of_candidates_iterations_and_steps(make_planner, recorder):
+    make_planner(horizon=5, num_samples=50, num_iterations=2).plan(recorder, torch.zeros(1, 4))
+    assert [tuple(each.shape) for each in recorder.candidates] == [(50, 5, 2)] * 2
+
+
+def test_num_elites_sets_how_many_candidates_refit_the_mean(make_planner, recorder):
+    plan = make_planner(num_elites=5, num_iterations=1, smoothing=1.0).plan(recorder, torch.zeros(1, 4))
+    candidates = recorder.candidates[0]
+    best = (-(candidates - 0.3).square().sum(dim=(1, 2))).topk(5).indices
+    torch.testing.assert_close(plan.mean[0], candidates[best].mean(dim=0))
+
+
+def test_smoothing_weighs_the_new_statistics(point, states, make_planner, seeded):
+    full, half = (
+        make_planner(num_iterations=1, smoothing=smoothing).plan(point, states, generator=seeded())
+        for smoothing in (1.0, 0.5)
+    )
+    torch.testing.assert_close(half.mean, full.mean / 2)
+    torch.testing.assert_close(half.var, (full.var + 1.0) / 2)
+
+
+def test_adapt_std_refits_the_variance(point, states, make_planner, seeded):
+    fixed, fitted = (make_planner(adapt_std=adapt).plan(point, states, generator=seeded()) for adapt in (False, True))
+    assert (fixed.var == 1.0).all() and (fitted.var < 0.5).any()
+
+
+def test_num_policy_samples_replaces_that_many_samples_by_proposals(make_planner, recorder, seeded):
+    recorder.propose = lambda state, num, horizon, generators: torch.full((num, horizon, 2), 0.625)
+    recorder.policy = lambda state, generator: torch.full((len(state), 2), 0.625)
+    for asked, expected in ((None, 16), (5, 5), (0, 0)):  # None: a quarter of 64 candidates
+        make_planner(num_policy_samples=asked, num_iterations=1).plan(recorder, torch.zeros(1, 4), generator=seeded())
+        is_proposal = (recorder.candidates[-1] == 0.625).flatten(1).all(dim=1)
+        assert len(is_proposal) == 64 and is_proposal.sum() == expected
+    del recorder.policy
+    make_planner(num_policy_samples=None).plan(recorder, torch.zeros(1, 4), generator=seeded())
+
+
+def test_num_policy_samples_is_24_by_default_when_there_are_enough_candidates():
+    assert SearchOptions().num_proposals(has_policy=True) == 24
+    assert SearchOptions().num_proposals(has_policy=False) == 0
+
+
+def test_warm_start_iterations_are_half_of_the_cold_ones_by_default(make_planner, point, states, seeded):
+    assert [SearchOptions(num_iterations=num).num_warm_iterations for num in (1, 3, 4)] == [1, 2, 2]
+    planner = make_planner(num_iterations=5, warm_start_iterations=None)
+    last = planner.plan(point, states, generator=seeded())
+    assert last.info["iterations"].tolist() == [5] * 5
+    assert planner.plan(point, states, last, generator=seeded()).info["iterations"].tolist() == [3] * 5
+
+
+def test_warm_start_false_ignores_the_last_plan(point, states, make_planner, seeded):
+    last = make_planner().plan(point, states, generator=seeded())
+    cold = make_planner(warm_start=False).plan(point, states, last, generator=seeded(1))
+    assert torch.equal(cold.mean, make_planner().plan(point, states, generator=seeded(1)).mean)
+
+
+def test_goal_horizon_sets_the_length_of_plans_for_objectives_only(point, states, make_planner, seeded):
+    planner = make_planner(goal_horizon=9)
+    own = planner.plan(point, states, generator=seeded())
+    assert torch.equal(own.mean, make_planner().plan(point, states, generator=seeded()).mean)
+    assert planner.plan(point, states, objective=learned_return(), generator=seeded()).actions.shape[1] == 9
 
 
 @pytest.mark.parametrize(
     ("tail", "expected"),
     [("zero", 0.0), ("hold", "last"), ("policy", "policy")],
 )
-def test_the_tail_is_filled_as_asked(point, states, make_planner, seeded, tail, expected):
+def test_tail_fills_the_end_of_the_shifted_plan(point, states, make_planner, seeded, tail, expected):
     last = make_planner().plan(point, states, generator=seeded())
     plan = frozen(make_planner, tail=tail).plan(point, states, last, generator=seeded())
     torch.testing.assert_close(plan.mean[:, :-1], last.actions[:, 1:])
@@ -110,56 +136,28 @@ def test_the_tail_is_filled_as_asked(point, states, make_planner, seeded, tail, 
         assert (end == 0).all()
 
 
-@pytest.mark.parametrize(("choice", "share"), [("reset", 1.0), ("keep", 0.0), ("inflate", 0.5)])
-def test_the_variance_of_a_warm_start(point, states, make_planner, seeded, choice, share):
+def test_warm_start_resets_the_variance(point, states, make_planner, seeded):
     last = make_planner().plan(point, states, generator=seeded())
-    planner = make_planner(warm_start_variance=choice, num_iterations=1, smoothing=1e-9)
-    plan = planner.plan(point, states, last, generator=seeded())
-    torch.testing.assert_close(plan.var[:, :-1], share + (1 - share) * last.var[:, 1:])
-    torch.testing.assert_close(plan.var[:, -1], torch.ones_like(plan.var[:, -1]))
+    plan = make_planner(num_iterations=1, smoothing=1e-9).plan(point, states, last, generator=seeded())
+    torch.testing.assert_close(plan.var, torch.ones_like(plan.var))
 
 
-def test_a_search_from_the_policy_begins_at_its_mode_sequence(point, states, make_planner, seeded):
-    plan = frozen(make_planner, start="policy", num_policy_samples=1, num_elites=1, smoothing=1e-9).plan(
-        point, 0.3 * states, generator=seeded()
-    )
-    state = 0.3 * states
-    for step in range(6):
-        action = point.policy(state, None).clamp(-1, 1)
-        torch.testing.assert_close(plan.mean[:, step], action)
-        state = point.dynamics(state, action)
-
-
-def test_without_policy_samples_the_policy_is_never_asked(point, states, make_planner, seeded):
+def test_policy_is_not_called_when_num_policy_samples_is_0(point, states, make_planner, seeded):
     def forbidden(state, generator):
-        raise AssertionError("the policy was asked")
+        raise AssertionError("the policy was called")
 
     model = FunctionModel(point.dynamics, point.reward, policy=forbidden)
-    make_planner(num_policy_samples=0, start="policy").plan(model, states, generator=seeded())
+    make_planner(num_policy_samples=0, final="better").plan(model, states, generator=seeded())
 
 
-def test_a_search_stops_early_where_its_distribution_is_narrow(states, make_planner, seeded):
-    """The first environment's return falls steeply away from its optimum, the second's hardly varies."""
-    model = FunctionModel(
-        lambda state, action: state,
-        lambda state, action: -(state[:, 0] * action.square().sum(dim=1)),
-    )
-    planner = make_planner(num_iterations=10, stop_std=0.3, num_samples=256)
-    plan = planner.plan(model, torch.tensor([[1.0], [0.0]]), generator=seeded())
-    iterations = plan.info["iterations"]
-    assert iterations[0] < 10 and iterations[1] >= iterations[0]
-    alone = planner.plan(model, torch.ones(1, 1), generator=seeded())
-    torch.testing.assert_close(alone.mean, plan.mean[:1], atol=1e-5, rtol=0)
-
-
-def test_warm_and_cold_environments_get_their_own_iterations(point, states, make_planner, seeded):
+def test_warm_and_cold_environments_have_their_own_iterations(point, states, make_planner, seeded):
     planner = make_planner(num_iterations=5, warm_start_iterations=2)
     last = planner.plan(point, states, generator=seeded()).forget(torch.tensor([1, 0, 0, 1, 0]).bool())
     assert planner.plan(point, states, last, generator=seeded()).info["iterations"].tolist() == [5, 2, 2, 5, 2]
 
 
 @pytest.mark.parametrize("beta", [0.0, 1.0, 3.0])
-def test_coloured_noise_has_unit_variance_and_more_likeness_between_steps(beta):
+def test_coloured_noise_has_unit_variance_and_correlated_steps(beta):
     streams = Streams(torch.Generator().manual_seed(0), 1, torch.device("cpu"))
     noise = streams.noise(20_000, 12, 1, beta, torch.float64)[0, :, :, 0]
     torch.testing.assert_close(noise.var(dim=0), torch.ones(12, dtype=torch.float64), atol=0.05, rtol=0)
@@ -170,7 +168,9 @@ def test_coloured_noise_has_unit_variance_and_more_likeness_between_steps(beta):
 
 
 def test_mppi_equals_its_formula(point, states, seeded):
-    planner = mppi_planner(action_dim=2, horizon=4, num_samples=128, temperature=0.5, init_std=0.4)
+    planner = mppi_planner(
+        action_dim=2, horizon=4, num_samples=128, num_policy_samples=0, temperature=0.5, init_std=0.4
+    )
     plan = planner.plan(point, states[:1], generator=seeded())
     streams = Streams(seeded(), 1, torch.device("cpu"))
     candidates = (0.4 * streams.noise(128, 4, 2, 0.0, torch.float32)[0]).clamp(-1, 1)
@@ -187,7 +187,7 @@ def test_mppi_equals_its_formula(point, states, seeded):
     torch.testing.assert_close(plan.var, torch.full_like(plan.var, 0.16))
 
 
-def test_a_lower_temperature_trusts_the_best_more(point, states, seeded):
+def test_lower_temperature_raises_the_expected_return(point, states, seeded):
     values = [
         mppi_planner(action_dim=2, horizon=4, temperature=temperature).plan(point, states, generator=seeded())
         for temperature in (0.1, 1.0, 10.0)
@@ -248,7 +248,7 @@ def test_gradient_steps_work_under_inference_mode_and_refuse_what_cannot_be_diff
         planner.plan(blind, states, generator=seeded())
 
 
-def test_refits_of_a_plan_are_the_public_equation(seeded):
+def test_planner_iteration_equals_refit_of_its_candidates(seeded):
     """One iteration of the planner is `refit` of the candidates it drew."""
     seen = []
 
@@ -263,11 +263,11 @@ def test_refits_of_a_plan_are_the_public_equation(seeded):
     plan = planner.plan(model, torch.zeros(1, 1), generator=seeded())
     candidates = seen[0][:, None]
     returns = -(seen[0] - 0.3).square().sum(dim=1)
-    mean, var = refit(candidates, returns, torch.zeros(1, 2), torch.ones(1, 2), num_elites=4, smoothing=0.7)
+    mean, var = refit(candidates, returns, torch.zeros(1, 2), torch.full((1, 2), 0.25), num_elites=4, smoothing=0.7)
     torch.testing.assert_close((plan.mean[0], plan.var[0]), (mean, var))
 
 
-def test_nothing_leaves_the_bounds_not_even_by_rounding(seeded):
+def test_actions_stay_within_bounds_when_rounded(seeded):
     options = {"final": "best", "num_iterations": 6, "temperature": 1.0, "smoothing": 1.0}
     planner = CEMPlanner(
         action_dim=1, horizon=3, num_samples=100, num_elites=10, action_low=1.2, action_high=1.7, **options
@@ -278,7 +278,7 @@ def test_nothing_leaves_the_bounds_not_even_by_rounding(seeded):
         assert plan.actions.min() >= torch.tensor(1.2) and plan.actions.max() <= torch.tensor(1.7)
 
 
-def test_a_refinement_that_finds_nothing_leaves_what_was_found(seeded):
+def test_gradient_steps_keep_the_result_when_refinement_is_nan(seeded):
     model = FunctionModel(
         lambda state, action: state,
         lambda state, action: torch.where((action[:, 0] > 0.5) | (action[:, 0] < -0.5), action[:, 0].abs(), torch.nan),
@@ -289,12 +289,12 @@ def test_a_refinement_that_finds_nothing_leaves_what_was_found(seeded):
 
 
 @pytest.mark.parametrize("name", ["horizon", "num_samples", "action_dim"])
-def test_sizes_are_whole_numbers(name):
+def test_planner_refuses_sizes_that_are_not_whole(name):
     sizes = {"action_dim": 2, "horizon": 3, "num_samples": 16, "num_elites": 4}
     with pytest.raises(ValueError, match=f"{name} must be a whole number"):
         CEMPlanner(**sizes | {name: float(sizes[name])})
 
 
-def test_a_state_without_rows_is_refused(point, make_planner):
+def test_plan_refuses_a_state_without_rows(point, make_planner):
     with pytest.raises(ValueError, match="at least one row"):
         make_planner().plan(point, torch.zeros(0, 4))

@@ -1,4 +1,4 @@
-"""The equations, against the worked example and against what people get wrong."""
+"""The refit equation, on a worked example, its wrong variants, and returns that are not finite."""
 
 import pytest
 import torch
@@ -23,13 +23,13 @@ def test_refit_gives_the_worked_example_exactly():
     assert mean[0].item() == pytest.approx(0.52, abs=1e-12)
 
 
-def test_batched_refit_gives_the_worked_example_in_every_environment():
+def test_refit_gives_the_worked_example_in_every_environment_when_batched():
     batch = (CANDIDATES.expand(3, 4, 2, 1), RETURNS.expand(3, 4), MEAN.expand(3, 2, 1), VAR.expand(3, 2, 1))
     mean, var = refit(*batch, num_elites=2, smoothing=0.8)
     assert all(is_worked_example(mean[i], var[i]) for i in range(3))
 
 
-def test_wrong_variants_fail_the_worked_example():
+def test_worked_example_rejects_wrong_variants_of_refit():
     elites = CANDIDATES[[2, 0]]
     elite_mean, elite_var = elites.mean(dim=0), elites.var(dim=0, correction=0)
     mean, var = 0.8 * elite_mean + 0.2 * MEAN, 0.8 * elite_var + 0.2 * VAR
@@ -42,7 +42,7 @@ def test_wrong_variants_fail_the_worked_example():
     assert not is_worked_example(weight_on_the_old, 0.2 * elite_var + 0.8 * VAR)
 
 
-def test_warm_start_of_the_worked_example_is_shifted_and_zero_padded():
+def test_rollout_controller_shifts_the_worked_example():
     class WorkedExample(CEMTrajectoryOptimizer):
         def plan(self, initial_state, rollout_fn, warm_start_mean=None):
             mean, var = refit(CANDIDATES, RETURNS, MEAN, VAR, num_elites=2, smoothing=0.8)
@@ -54,7 +54,7 @@ def test_warm_start_of_the_worked_example_is_shifted_and_zero_padded():
 
 
 @pytest.mark.parametrize("broken", [float("nan"), float("inf"), float("-inf")])
-def test_nonfinite_returns_never_become_elites(broken):
+def test_refit_ignores_nonfinite_returns(broken):
     returns = torch.tensor([3.2, 1.0, broken, -0.5], dtype=torch.float64)
     mean, var = refit(CANDIDATES, returns, MEAN, VAR, num_elites=2, smoothing=1.0)
     expected = CANDIDATES[[0, 1]]
@@ -62,7 +62,7 @@ def test_nonfinite_returns_never_become_elites(broken):
     torch.testing.assert_close(var, expected.var(dim=0, correction=0))
 
 
-def test_fewer_finite_candidates_than_elites_are_used_alone():
+def test_refit_uses_only_finite_candidates_when_fewer_than_elites():
     returns = torch.tensor([float("nan"), 1.0, float("nan"), float("nan")], dtype=torch.float64)
     mean, var = refit(CANDIDATES, returns, MEAN, VAR, num_elites=3, smoothing=1.0)
     torch.testing.assert_close(mean, CANDIDATES[1])
@@ -70,14 +70,14 @@ def test_fewer_finite_candidates_than_elites_are_used_alone():
 
 
 @pytest.mark.parametrize("temperature", [None, 0.5])
-def test_a_distribution_without_finite_candidates_stays(temperature):
+def test_refit_keeps_the_distribution_when_no_return_is_finite(temperature):
     nothing = torch.full((4,), float("nan"), dtype=torch.float64)
     mean, var = refit(CANDIDATES, nothing, MEAN, VAR, num_elites=2, smoothing=0.8, temperature=temperature)
     torch.testing.assert_close(mean, MEAN)
     torch.testing.assert_close(var, VAR)
 
 
-def test_an_action_that_is_nan_does_not_leak_into_the_mean():
+def test_refit_ignores_a_nan_action_without_finite_return():
     candidates = CANDIDATES.clone()
     candidates[3] = float("nan")
     returns = torch.tensor([1.0, 2.0, float("nan"), float("nan")], dtype=torch.float64)
@@ -85,19 +85,19 @@ def test_an_action_that_is_nan_does_not_leak_into_the_mean():
     assert torch.isfinite(mean).all() and torch.isfinite(var).all()
 
 
-def test_one_elite_gives_variance_zero_and_no_nan():
+def test_refit_gives_variance_zero_for_one_elite():
     mean, var = refit(CANDIDATES, RETURNS, MEAN, VAR, num_elites=1, smoothing=1.0)
     torch.testing.assert_close(mean, CANDIDATES[2])
     torch.testing.assert_close(var, torch.zeros_like(var))
 
 
-def test_temperature_weighs_by_the_exponential_of_the_return():
+def test_refit_weighs_by_the_exponential_of_the_return_over_temperature():
     weights = torch.softmax(RETURNS / 0.7, dim=0)[:, None, None]
     mean, _ = refit(CANDIDATES, RETURNS, MEAN, VAR, num_elites=4, smoothing=1.0, temperature=0.7)
     torch.testing.assert_close(mean, (weights * CANDIDATES).sum(dim=0))
 
 
-def test_temperature_survives_returns_far_from_zero():
+def test_refit_with_temperature_is_the_same_when_returns_are_shifted():
     shifted = refit(CANDIDATES, RETURNS + 1e6, MEAN, VAR, num_elites=4, smoothing=1.0, temperature=0.7)
     plain = refit(CANDIDATES, RETURNS, MEAN, VAR, num_elites=4, smoothing=1.0, temperature=0.7)
     torch.testing.assert_close(shifted, plain, atol=1e-6, rtol=0)
@@ -116,7 +116,7 @@ def test_refit_names_shapes_that_do_not_fit():
         refit(CANDIDATES, RETURNS, MEAN, VAR, num_elites=5, smoothing=0.8)
 
 
-def test_feasible_candidates_come_first_and_outweigh_the_others():
+def test_select_elites_ranks_and_weighs_feasible_candidates_first():
     violations = torch.tensor([[0.0, 0.0, 2.0, 1.0]], dtype=torch.float64)
     scores = Scores(RETURNS[None], violations)
     order = select_elites(CANDIDATES[None], scores, num_elites=4, temperature=None)
@@ -128,7 +128,7 @@ def test_feasible_candidates_come_first_and_outweigh_the_others():
     torch.testing.assert_close(none.weights[0], torch.softmax(-torch.tensor([1.0, 1.0, 2.0, 3.0]).double(), dim=0))
 
 
-def test_returns_may_be_whole_numbers_and_precisions_differ():
+def test_refit_accepts_integer_returns_and_mixed_precisions():
     candidates = torch.randn(6, 3, 2, generator=torch.Generator().manual_seed(0))
     numbers, zeros = torch.tensor([3, 1, 4, 1, 5, 9]), torch.zeros(3, 2, dtype=torch.float64)
     settings = {"num_elites": 2, "smoothing": 0.8}

@@ -1,0 +1,116 @@
+"""Planners by name, and what a controller asks of a planner.
+
+A new planner is one module with a class that satisfies `Planner`, and one line in `PLANNERS`.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import difflib
+from collections.abc import Callable, Sequence
+from typing import Any, Protocol
+
+from latentplan.config import UserError
+from latentplan.planning.model import Bound, State
+from latentplan.planning.objectives import Constraint, Term
+from latentplan.planning.plan import Plan
+from latentplan.planning.search.cem import CEMPlanner, icem_planner, mppi_planner
+from latentplan.planning.search.options import SearchOptions
+from latentplan.planning.search.sampling import Generators
+
+
+class SupportsPlan(Protocol):
+    """An object that can search; see `Planner` for the attributes that a controller reads besides."""
+
+    def plan(
+        self,
+        model: Any,
+        state: State,
+        previous: Plan | None = None,
+        *,
+        objective: Term | None = None,
+        constraints: Sequence[Constraint] = (),
+        generator: Generators = None,
+        deadline_ms: float | None = None,
+    ) -> Plan:
+        """Returns the best plan found from each state; see `CEMPlanner.plan`."""
+        ...
+
+
+class Planner(SupportsPlan, Protocol):
+    """A planner, as controllers, schedulers and agents see it. A planner keeps no plan between calls."""
+
+    @property
+    def action_dim(self) -> int:
+        """Numbers in an action."""
+        ...
+
+    @property
+    def action_low(self) -> Bound:
+        """Lowest action, one number or one per dimension."""
+        ...
+
+    @property
+    def action_high(self) -> Bound:
+        """Highest action, one number or one per dimension."""
+        ...
+
+    @property
+    def discount(self) -> float:
+        """Discount per model step, in (0, 1]."""
+        ...
+
+    @property
+    def horizon(self) -> int:
+        """Model steps of a plan for the predicted return."""
+        ...
+
+    @property
+    def goal_horizon(self) -> int | None:
+        """Model steps of a plan for another objective; None is `horizon`."""
+        ...
+
+    @property
+    def min_std(self) -> float:
+        """Floor of the sampling standard deviation, in action units; 0 without one."""
+        ...
+
+    @property
+    def terminal_value(self) -> bool | None:
+        """Whether the model's value completes the predicted return; None where the model has a value."""
+        ...
+
+
+PLANNERS: dict[str, Callable[..., Planner]] = {
+    "cem": CEMPlanner,
+    "icem": icem_planner,
+    "mppi": mppi_planner,
+}
+"""A function per name that makes the planner of keyword arguments: a problem's `action_dim`, `action_low`,
+`action_high` and `discount`, and any option of `SearchOptions`."""
+
+
+def make_planner(name: str, options: SearchOptions | None = None, **settings: Any) -> Planner:
+    """Returns the planner that is registered under a name.
+
+    Options that have their default value leave the choice to the planner: `icem` and `mppi` then take their own values.
+
+    Args:
+        name: A name in `PLANNERS`.
+        options: Options of the search, such as an agent's `PlannerConfig`; None leaves all to the planner.
+        **settings: The problem (`action_dim`, `action_low`, `action_high`, `discount`), and options that replace those
+            of `options` and of the planner, their default values included.
+
+    Raises:
+        UserError: There is no planner of this name; the message names the nearest one.
+        ValueError: An option has a value that is not allowed.
+    """
+    if name not in PLANNERS:
+        nearest = difflib.get_close_matches(name, PLANNERS, n=1, cutoff=0.5)
+        hint = f"; did you mean {nearest[0]!r}?" if nearest else ""
+        raise UserError(f"unknown planner {name!r}; available: {', '.join(PLANNERS)}{hint}")
+    changed: dict[str, Any] = {}
+    if options is not None:
+        fields = dataclasses.fields(SearchOptions)
+        changed = {f.name: getattr(options, f.name) for f in fields if getattr(options, f.name) != f.default}
+    return PLANNERS[name](**changed | settings)
