@@ -29,10 +29,8 @@ def play(controller: ModelPredictiveController | None, seed: int) -> Tensor:
     env, transitions, over = gymnasium.make("Pendulum-v1"), [], False
     obs, _ = env.reset(seed=seed)
     while not over:
-        action = act(torch.tensor(obs)[None])[0].numpy()
-        next_obs, reward, _, over, _ = env.step(
-            2.0 * action
-        )  # torques lie in [-2, 2], the planner's actions in [-1, 1]
+        action = 2 * torch.rand(1) - 1 if controller is None else controller.act(torch.tensor(obs)[None])[0]
+        next_obs, reward, _, over, _ = env.step(2 * action.numpy())  # torques lie in [-2, 2], actions in [-1, 1]
         transitions.append([*obs, *action, *next_obs, reward])
         obs = next_obs
     return torch.tensor(np.array(transitions), dtype=torch.float32)
