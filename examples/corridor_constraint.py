@@ -1,6 +1,6 @@
-"""Close a corridor with a constraint: the plan of a point mass then takes the way around.
+"""Close a corridor with a constraint: the plan of a point mass then takes the detour.
 
-Prints where each path crosses the wall, its depth in the wall and its end's distance from the goal; `corridor.png`.
+Prints where each path crosses the wall, how deep it gets into it and how far from the goal it ends (`corridor.png`).
 """
 
 import sys
@@ -49,8 +49,8 @@ def main(out: str = ".") -> None:
         depth, distance = depth_in_wall(states, *openings).max(), (states[-1, :2] - GOAL).norm()
         print(f"{name}: crosses at y {y[x.abs().argmin()]:.2f}, depth {depth:.2f}, distance {distance:.2f}")
         axes.plot(x, y, ".-", label=name)
-    for low, high, color in [(-0.4, -0.15, "gray"), (*CORRIDOR, "moccasin"), (0.15, 0.6, "gray"), (0.9, 1.2, "gray")]:
-        axes.fill_between([-WALL, WALL], low, high, color=color)
+    axes.bar(0.0, [0.25, 0.45, 0.3], 2 * WALL, [-0.4, CORRIDOR[1], DETOUR[1]], color="gray", label="wall")
+    axes.bar(0.0, 2 * CORRIDOR[1], 2 * WALL, CORRIDOR[0], color="moccasin", label="corridor")
     axes.set(xlabel="x", ylabel="y", title="From (-1, 0) to (1, 0)", aspect="equal")
     axes.legend()
     axes.figure.savefig(f"{out}/corridor.png")

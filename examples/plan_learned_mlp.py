@@ -24,8 +24,8 @@ class LearnedModel(nn.Sequential):
         return state + prediction[:, :3], prediction[:, 3]
 
 
-def play(controller: ModelPredictiveController | None, seed: int) -> Tensor:
-    """One episode, (step, 8): observation (3), action (1), next observation (3), reward (1); None acts at random."""
+def play(seed: int, controller: ModelPredictiveController | None = None) -> Tensor:
+    """Transitions of an episode, (step, 8): observation (3), action (1, random by default), next observation, reward."""
     env, transitions, over = gymnasium.make("Pendulum-v1"), [], False
     obs, _ = env.reset(seed=seed)
     while not over:
@@ -39,7 +39,7 @@ def play(controller: ModelPredictiveController | None, seed: int) -> Tensor:
 def main() -> None:
     """Collect at random, learn, plan, and print both returns."""
     torch.manual_seed(0)
-    data = torch.cat([play(None, seed) for seed in range(25)])
+    data = torch.cat([play(seed) for seed in range(25)])
     obs, action, next_obs, reward = data.split([3, 1, 3, 1], dim=1)
     model = LearnedModel(torch.cat([next_obs - obs, reward], dim=1).std(dim=0))
     optimizer = torch.optim.Adam(model.parameters(), lr=2e-3)
@@ -50,7 +50,7 @@ def main() -> None:
         ((predicted - data[rows, 4:]) / model.scale).square().mean().backward()
         optimizer.step()
     planner = CEMPlanner(action_dim=1, horizon=20, num_samples=200, num_iterations=3, noise_beta=1.0)
-    planned = torch.cat([play(ModelPredictiveController(planner, model), seed) for seed in range(3)])
+    planned = torch.cat([play(seed, ModelPredictiveController(planner, model)) for seed in range(3)])
     print(f"random actions: return {reward.sum() / 25:.0f}\nplans: return {planned[:, -1].sum() / 3:.0f}")
 
 
