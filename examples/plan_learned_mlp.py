@@ -25,7 +25,7 @@ class LearnedModel(nn.Sequential):
 
 
 def play(seed: int, controller: ModelPredictiveController | None = None) -> Tensor:
-    """Transitions of an episode, (step, 8): observation (3), action (1, random by default), next observation, reward."""
+    """Transitions of an episode, (step, 8): observation, action (random without a controller), next, reward."""
     env, transitions, over = gymnasium.make("Pendulum-v1"), [], False
     obs, _ = env.reset(seed=seed)
     while not over:

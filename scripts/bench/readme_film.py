@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
+from typing import Any
 
 from PIL import Image
 
@@ -22,7 +23,7 @@ QUALITY = 60  # of the WebP encoder, in [0, 100]
 
 def draw_film(path: Path, first: int = FIRST, last: int = LAST) -> int:
     """Number of pictures written to an endless animated WebP of decisions `first` to `last`, in real time."""
-    agent = load_agent("checkpoints/walker-walk", surprise_limit=None)
+    agent: Any = load_agent("checkpoints/walker-walk", surprise_limit=None)
     env = make_env(EnvConfig(domain="walker", task="walk", render_quality="exact"))
     frame, _ = env.reset(seed=0)
     agent.seed(0)
