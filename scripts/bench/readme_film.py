@@ -15,7 +15,7 @@ from PIL import Image
 from latentplan import load_agent
 from latentplan.config import EnvConfig
 from latentplan.envs import make_env
-from latentplan.reporting.video import PANEL_SIZE, compose_frame
+from latentplan.reporting.film import PANEL_SIZE, compose_frame
 
 FIRST, LAST = 80, 190  # decisions that the film shows; the walker has found its gait by the first
 QUALITY = 60  # of the WebP encoder, in [0, 100]
