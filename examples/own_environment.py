@@ -48,7 +48,7 @@ def main(out: str = ".") -> None:
     model = ModelConfig(deter_dim=32, hidden_dim=32, encoder_channels=(8, 8, 8))
     learning = LearningConfig(batch_size=8, sequence_length=8, model_learning_rate=3e-3, behaviour_learning_rate=1e-3)
     collection = CollectionConfig(prefill_decisions=200, round_decisions=100, updates_per_decision=1.0, overlap=False)
-    run = RunConfig(frames=600, threads=1, run_dir=f"{out}/dot")
+    run = RunConfig(frames=500, threads=1, run_dir=f"{out}/dot")
     train(Config(model=model, learning=learning, collection=collection, run=run), make_env=make_env)
     for mode in ("planner", "random"):
         agent, env = load_agent(f"{out}/dot", mode), wrap_user_env(make_env(), action_repeat=2)
