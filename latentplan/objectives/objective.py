@@ -192,7 +192,7 @@ def predicted_quantities(rollout: Rollout) -> Lookup:
 
 
 def _plan_expression(
-    expression: Expression, model: Any, env: EnvConfig, planner: CEMPlanner, encode_goal: Callable[[str], Tensor]
+    expression: Expression, model: Any, env: EnvConfig, planner: Planner, encode_goal: Callable[[str], Tensor]
 ) -> Term | None:
     """The planner's objective for an expression; None if the expression is the learned return."""
     require_labels([node for _, node in expression.terms], model.label_names)

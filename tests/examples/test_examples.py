@@ -1,0 +1,90 @@
+"""Every example runs, and what it prints and draws is what it promises."""
+
+import ast
+import re
+
+import cv2
+import pytest
+
+PUBLIC = {
+    "latentplan",
+    "latentplan.config",
+    "latentplan.envs",
+    "latentplan.evaluation",
+    "latentplan.planning",
+    "latentplan.training",
+}
+NAMES = ("corridor_constraint", "own_environment", "plan_learned_mlp", "plan_your_dynamics", "trained_agent_new_goal")
+
+
+@pytest.fixture
+def run_example(root, run_python, tmp_path):
+    """Runs an example in an empty folder; returns the numbers of each line "label: ..." that it prints."""
+
+    def run(name):
+        result = run_python(root / "examples" / f"{name}.py", cwd=tmp_path, timeout=300)
+        assert result.returncode == 0, result.stderr
+        labelled = re.findall(r"^([\w ]+): (.*)$", result.stdout, flags=re.MULTILINE)
+        return {label: [float(text) for text in re.findall(r"-?\d+\.?\d*", line)] for label, line in labelled}
+
+    return run
+
+
+def assert_is_drawn(path):
+    """The picture can be read, is of a size to look at, and is not blank."""
+    picture = cv2.imread(str(path))
+    assert picture.shape[0] >= 300 and picture.shape[1] >= 300
+    assert picture.std() > 10.0
+
+
+def test_planning_in_own_dynamics_swings_the_pendulum_up(run_example, tmp_path):
+    numbers = run_example("plan_your_dynamics")
+    (planned_cost, planned_height), (idle_cost, idle_height) = numbers["planned"], numbers["no torque"]
+    assert planned_cost < 1.5 and planned_height > 0.95
+    assert idle_cost == 4.0 and idle_height == -1.0
+    assert_is_drawn(tmp_path / "own_dynamics.png")
+
+
+def test_planning_in_a_learned_network_beats_random_actions(run_example):
+    numbers = run_example("plan_learned_mlp")
+    assert numbers["random actions"][0] < -900.0
+    assert numbers["plans"][0] > -250.0
+
+
+def test_closed_corridor_sends_the_plan_around(run_example, tmp_path):
+    numbers = run_example("corridor_constraint")
+    (open_y, *open_end), (closed_y, *closed_end) = numbers["corridor open"], numbers["corridor closed"]
+    assert abs(open_y) < 0.15
+    assert 0.6 < closed_y < 0.9
+    for depth, distance in (open_end, closed_end):
+        assert depth == 0.0 and distance < 0.1
+    assert_is_drawn(tmp_path / "corridor.png")
+
+
+def test_trained_agent_reaches_a_new_goal(run_example, tmp_path):
+    numbers = run_example("trained_agent_new_goal")
+    (task_cart, task_upright), (goal_cart, goal_upright) = numbers["trained task"], numbers["new goal"]
+    assert abs(task_cart) < 0.3 and task_upright > 0.9
+    assert abs(goal_cart - 0.8) < 0.15 and goal_upright < -0.9
+    assert_is_drawn(tmp_path / "new_goal.png")
+
+
+def test_own_environment_is_learned_within_seconds(run_example, tmp_path):
+    numbers = run_example("own_environment")
+    assert numbers["planner"][0] > 14.0 > 12.0 > numbers["random"][0]
+    assert (tmp_path / "dot" / "checkpoints" / "best").is_dir()
+    assert (tmp_path / "dot" / "metrics.csv").is_file()
+
+
+def test_every_example_is_run_here(root):
+    assert {path.stem for path in (root / "examples").glob("*.py")} == set(NAMES)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_example_is_short_and_uses_the_public_interface(name, root):
+    source = (root / "examples" / f"{name}.py").read_text()
+    assert len(source.splitlines()) <= 60
+    tree = ast.parse(source)
+    assert ast.get_docstring(tree)
+    modules = {node.module for node in ast.walk(tree) if isinstance(node, ast.ImportFrom)}
+    assert {module for module in modules if module.startswith("latentplan")} <= PUBLIC
