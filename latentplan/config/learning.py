@@ -35,7 +35,6 @@ class LearningConfig:
         discount: Discount per decision; None derives 1 - 5 / (decisions per episode).
         replay_value_scale: Weight of the value loss on replayed rewards beside the imagined one.
         entropy_scale: Weight of the actor's entropy, in units of the normalised return.
-        imitation_scale: Weight of the actor's KL to the plans it was collected with; 0 leaves it out.
         target_rate: Share of the value network that its slow target takes over at each update.
         average_rate: Least weight of the latest update in the average of the weights that acts, is judged and is kept:
             0.01 averages over some hundred updates (early on over fewer), 1 over none.
@@ -67,7 +66,6 @@ class LearningConfig:
     discount: float | None = None
     replay_value_scale: float = 0.3
     entropy_scale: float = 1e-3
-    imitation_scale: float = 0.0
     target_rate: float = 0.02
     average_rate: float = 0.01
     curriculum_task: str | None = None
@@ -80,7 +78,7 @@ class LearningConfig:
         )
         at_least(self, reconstruction_scale=0.0, dynamics_scale=0.0, representation_scale=0.0, free_nats=0.0)
         at_least(self, overshooting_scale=0.0, reward_scale=0.0, replay_value_scale=0.0, entropy_scale=0.0)
-        at_least(self, imitation_scale=0.0, random_shift=0, curriculum_frames=0)
+        at_least(self, random_shift=0, curriculum_frames=0)
         above_zero(
             self, "model_learning_rate", "behaviour_learning_rate", "max_grad_norm", "target_rate", "average_rate"
         )
@@ -98,7 +96,6 @@ class CollectionConfig:
         behaviour: Who acts while collecting: `planner`, `actor`, or `both` in alternate rounds.
         noise_std: Standard deviation of the noise added to the planner's action.
         noise_correlation: Of the planner's and the actor's noise between one decision and the next, in [0, 1).
-        noise_share: Share of the rounds with that noise; in the others planner and actor act as they are evaluated.
         goals: Expressions such as `speed -> 2.0 and height > 1.1` that the planner pursues in turn in some rounds, so
             that the model knows more than the way to the reward.
         goal_share: Share of all rounds in which it does; planner and actor have the others.
@@ -113,7 +110,6 @@ class CollectionConfig:
     behaviour: str = "both"
     noise_std: float = 0.4
     noise_correlation: float = 0.5
-    noise_share: float = 1.0
     goals: tuple[str, ...] = ()
     goal_share: float = 0.0
     goals_after: int = 0
@@ -126,7 +122,7 @@ class CollectionConfig:
     def __post_init__(self) -> None:
         one_of(self, behaviour=BEHAVIOURS)
         at_least(self, noise_std=0.0, prefill_decisions=1, round_decisions=1, goals_after=0)
-        within(self, noise_correlation=(0.0, 0.99), noise_share=(0.0, 1.0), goal_share=(0.0, 1.0))
+        within(self, noise_correlation=(0.0, 0.99), goal_share=(0.0, 1.0))
         if self.goal_share > 0.0 and not self.goals:
             raise ValueError("goal_share needs goals; name at least one expression in collection.goals")
         if self.goals and self.goal_share == 0.0:

@@ -12,6 +12,7 @@ from typing import Any
 from latentplan.config.checks import MAX_THREADS, UserError, above_zero, at_least, one_of, within
 from latentplan.config.learning import CollectionConfig, LearningConfig
 from latentplan.config.planner import PlannerConfig
+from latentplan.config.removed import drop_removed
 
 LATENT_DIM = 32
 RENDER_QUALITIES = ("exact", "fast", "fastest")
@@ -187,10 +188,11 @@ def to_dict(config: Any) -> dict[str, Any]:
 
 
 def from_dict(values: dict[str, Any]) -> Config:
-    """The inverse of `to_dict`; absent fields take their defaults.
+    """The inverse of `to_dict`; absent fields take their defaults, and settings that no longer exist are dropped.
 
     Raises:
-        ValueError: A section or field is unknown, or a value is not allowed.
+        ValueError: A section or field is unknown, a value is not allowed, or a setting that no longer exists has a
+            value other than the one that had no effect.
     """
     sections = {f.name: f.default_factory for f in dataclasses.fields(Config)}
     built = {}
@@ -199,6 +201,7 @@ def from_dict(values: dict[str, Any]) -> Config:
             raise ValueError(f"unknown section {section!r}; available: {', '.join(sections)}")
         kind: Any = sections[section]
         names = {f.name for f in dataclasses.fields(kind)}
+        settings = drop_removed(section, settings)
         for name in settings:
             if name not in names:
                 raise ValueError(f"unknown setting {section}.{name}; available: {', '.join(sorted(names))}")
