@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 from latentplan.commands.flags import overrides
@@ -31,6 +32,12 @@ class Request(LearningRequest):
         DistillConfig(**self.settings)
 
 
+def resolve(request: Request) -> dict[str, Any]:
+    """The request, with every setting of the distillation and of the search that labels."""
+    asked = {**vars(request), "settings": DistillConfig(**request.settings)}
+    return asked if request.checkpoint is None else {**asked, "planner": _search_settings(request, request.checkpoint)}
+
+
 def run(request: Request) -> int:
     """Distil, or continue a distillation, and return the exit code."""
     from latentplan.agents.checkpoint import read_info
@@ -38,7 +45,7 @@ def run(request: Request) -> int:
     info = {} if request.checkpoint is None else read_info(request.checkpoint)
     planner = None
     if request.planner and request.checkpoint is not None:
-        planner = search_settings(saved_config(request.checkpoint, info).planner, request.planner)
+        planner = _search_settings(request, request.checkpoint)
     device = request.use_device()
     from latentplan.training import distill, resume_distillation
 
@@ -48,3 +55,9 @@ def run(request: Request) -> int:
     out = request.out or name_folder("distilled", info)
     settings = DistillConfig(**request.settings)
     return distill(request.checkpoint, out, settings, planner=planner, device=device).exit_code
+
+
+def _search_settings(request: Request, checkpoint: Path) -> PlannerConfig:
+    from latentplan.agents.checkpoint import read_info
+
+    return search_settings(saved_config(checkpoint, read_info(checkpoint)).planner, request.planner)

@@ -90,7 +90,7 @@ def resolve(request: Request) -> dict[str, Any]:
     from latentplan.agents.checkpoint import read_info
 
     saved = saved_config(request.checkpoint, read_info(request.checkpoint))
-    return {**to_dict(request), "planner": to_dict(search_settings(saved.planner, request.planner))}
+    return {**vars(request), "planner": search_settings(saved.planner, request.planner)}
 
 
 def run(request: Request) -> int:

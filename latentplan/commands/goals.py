@@ -31,6 +31,11 @@ class Request(LearningRequest):
         GoalsConfig(**self.settings)
 
 
+def resolve(request: Request) -> dict[str, Any]:
+    """The request, with every setting of the learning."""
+    return {**vars(request), "settings": GoalsConfig(**request.settings)}
+
+
 def run(request: Request) -> int:
     """Learn goals, or continue to, and return the exit code."""
     from latentplan.agents.checkpoint import read_info

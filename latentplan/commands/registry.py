@@ -8,14 +8,12 @@ which takes a request and returns the exit code. A module may have a function `r
 from __future__ import annotations
 
 import importlib
-import sys
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 from typing import Any, NamedTuple
 
 from latentplan import __version__
 from latentplan.commands.flags import format_flags, read_request
-from latentplan.config import to_dict
+from latentplan.config.files import to_yaml
 from latentplan.config.parsing import raise_unknown
 
 
@@ -75,10 +73,7 @@ def call(program: str, command: Command, argv: Sequence[str]) -> int:
         return 0
     request = read_request(module.Request, [word for word in argv if word != "--print-config"])
     if "--print-config" in argv:
-        import yaml
-
-        resolved = getattr(module, "resolve", lambda request: request)(request)
-        yaml.safe_dump(_plain(to_dict(resolved)), sys.stdout, sort_keys=False, allow_unicode=True)
+        print(to_yaml(module.resolve(request) if hasattr(module, "resolve") else request), end="")
         return 0
     code: int = module.run(request)
     return code
@@ -87,12 +82,3 @@ def call(program: str, command: Command, argv: Sequence[str]) -> int:
 def _print_version() -> int:
     print(f"latentplan {__version__}")
     return 0
-
-
-def _plain(value: Any) -> Any:
-    """A value that YAML can write."""
-    if isinstance(value, dict):
-        return {name: _plain(inner) for name, inner in value.items()}
-    if isinstance(value, list | tuple):
-        return [_plain(inner) for inner in value]
-    return str(value) if isinstance(value, Path) else value

@@ -17,7 +17,7 @@ from typing import Any
 from latentplan.config.checks import UserError
 from latentplan.config.parsing import Setting, list_settings, raise_unknown, read_values
 from latentplan.config.removed import drop_removed
-from latentplan.config.settings import Config, to_dict
+from latentplan.config.settings import Config
 
 Layer = dict[str, dict[str, Any]]
 
@@ -84,11 +84,16 @@ def read_config(path: Path) -> Config:
 
 def dump_config(config: Config, path: Path) -> None:
     """Write every setting as YAML, in the order of `latentplan/config`; the file is replaced whole."""
+    part = path.with_name(f"{path.name}.part")
+    part.write_text(to_yaml(config))
+    part.replace(path)
+
+
+def to_yaml(settings: Any) -> str:
+    """A dataclass of settings, or a dictionary of them, as YAML."""
     import yaml
 
-    part = path.with_name(f"{path.name}.part")
-    part.write_text(yaml.safe_dump(to_dict(config), sort_keys=False))
-    part.replace(path)
+    return str(yaml.safe_dump(_plain(settings), sort_keys=False, allow_unicode=True))
 
 
 def read_layer(path: Path) -> Layer:
@@ -101,7 +106,7 @@ def read_layer(path: Path) -> Layer:
 
     try:
         layer = yaml.safe_load(path.read_text()) or {}
-    except (OSError, ValueError) as error:
+    except (OSError, ValueError, RecursionError) as error:
         raise UserError(f"cannot read {path}: {getattr(error, 'strerror', None) or 'not a text file'}") from None
     except yaml.YAMLError as error:
         mark = getattr(error, "problem_mark", None)
@@ -148,6 +153,17 @@ def field_names(section: str) -> list[str]:
 @functools.cache
 def _all_settings() -> list[Setting]:
     return list_settings(Config)
+
+
+def _plain(value: Any) -> Any:
+    """A value that YAML can write: dataclasses as dictionaries, tuples as lists, paths as text."""
+    if dataclasses.is_dataclass(value):
+        return {field.name: _plain(getattr(value, field.name)) for field in dataclasses.fields(value)}
+    if isinstance(value, dict):
+        return {name: _plain(inner) for name, inner in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(inner) for inner in value]
+    return str(value) if isinstance(value, Path) else value
 
 
 def _read_optional(stem: str) -> Layer:

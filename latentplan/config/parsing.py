@@ -14,7 +14,7 @@ import math
 import re
 import types
 import typing
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -127,7 +127,7 @@ def read_values(
 
 def alternatives(hint: Any) -> tuple[Any, ...]:
     """The types that a hint allows: `int | None` as (int, NoneType), any other hint alone."""
-    return typing.get_args(hint) if isinstance(hint, types.UnionType) else (hint,)
+    return typing.get_args(hint) if typing.get_origin(hint) in (typing.Union, types.UnionType) else (hint,)
 
 
 def choices(hint: Any) -> tuple[str, ...]:
@@ -171,8 +171,18 @@ class _FiniteNumber(float):
 def _register_numbers() -> None:
     from jsonargparse.typing import register_type
 
-    for kind, read, plain in ((_WholeNumber, _whole_number, int), (_FiniteNumber, _finite_number, float)):
-        register_type(kind, plain, read, type_check=lambda value, _, plain=plain: type(value) is plain)  # type: ignore[misc]
+    register_type(_WholeNumber, int, _whole_number, type_check=lambda value, _: _is_plain(value, int, _whole_number))
+    register_type(
+        _FiniteNumber, float, _finite_number, type_check=lambda value, _: _is_plain(value, float, _finite_number)
+    )
+
+
+def _is_plain(value: Any, kind: type, read: Callable[[Any], Any]) -> bool:
+    """Whether a value needs no reading: it has the type, and lies in the range that `read` allows."""
+    try:
+        return type(value) is kind and read(value) == value
+    except ValueError:
+        return False
 
 
 def _whole_number(value: Any) -> int:

@@ -25,8 +25,13 @@ class Removed(NamedTuple):
 
 
 REMOVED = {
-    "planner.start": Removed("shifted", "a search always starts from the shifted last plan"),
-    "planner.warm_start_variance": Removed("reset", "a warm start always begins with the standard deviation init_std"),
+    "planner.start": Removed(
+        "shifted",
+        "a search starts from the shifted previous plan; raise planner.num_policy_samples to rely more on the policy",
+    ),
+    "planner.warm_start_variance": Removed(
+        "reset", "a warm start resets the variance; lower planner.init_std to search closer to the previous plan"
+    ),
     "learning.imitation_scale": Removed(0.0, "scripts/distill.py teaches the actor from the planner"),
     "collection.noise_share": Removed(1.0, "every round is collected with noise of collection.noise_std"),
 }

@@ -77,7 +77,7 @@ def without_actor(base: PlannerConfig) -> dict[str, Any]:
     """The settings that keep the actor out of a search."""
     tail = {"tail": "zero"} if base.tail == "policy" else {}
     trust = {} if base.surprise_limit is None else {"surprise_limit": None}
-    return {"num_policy_samples": 0, "start": "shifted", **tail, **trust}
+    return {"num_policy_samples": 0, **tail, **trust}
 
 
 def play_arm(checkpoint: str, arm: Arm, seeds: Sequence[int], device: str, threads: int) -> Outcome:

@@ -1,4 +1,5 @@
 import csv
+import importlib
 import json
 import sys
 from dataclasses import replace
@@ -11,6 +12,7 @@ import torch
 from latentplan.agents.actor import ActorAgent
 from latentplan.agents.checkpoint import save_checkpoint
 from latentplan.agents.planning import PlanningAgent
+from latentplan.commands.flags import list_flags
 from latentplan.config import Config, EnvConfig, LearningConfig, ModelConfig, PlannerConfig, UserError
 from latentplan.models import WorldModel
 
@@ -80,9 +82,10 @@ def ablated(tmp_path, checkpoint, arms, *flags):
         (["learn", "--tasks", "walkr-walk"], "'walker'"),
         (["learn", "--frames", "many"], "frames"),
         (["learn", "--seeds", "0,-1"], "--seeds"),
+        (["learn", "--seeds", "0,one"], "--seeds must be whole numbers, separated by ',', got '0,one'"),
     ],
 )
-def test_bad_input_is_one_line_that_names_it(capsys, arguments, named):
+def test_main_refuses_bad_flags_in_one_line_that_names_the_flag(capsys, arguments, named):
     assert benchmark.main(arguments) == 2
     captured = capsys.readouterr()
     assert captured.out == ""
@@ -91,13 +94,31 @@ def test_bad_input_is_one_line_that_names_it(capsys, arguments, named):
     assert named in captured.err
 
 
-def test_help_lists_every_command_and_its_flags(capsys):
+def test_help_lists_every_command_and_every_flag(capsys):
     assert benchmark.main([]) == 0
     overview = capsys.readouterr().out
-    for command in benchmark.COMMANDS:
-        assert command in overview
-        assert benchmark.main([command, "--help"]) == 0
-        assert "  --" in capsys.readouterr().out
+    for name, command in benchmark.COMMANDS.items():
+        assert f"  {name} " in overview and command.summary in overview
+        assert benchmark.main([name, "--help-all"]) == 0
+        text = capsys.readouterr().out
+        for flag in list_flags(importlib.import_module(command.module).Request):
+            assert f"  {flag.names[0]} " in text and flag.setting.meaning
+
+
+def test_every_flag_of_the_benchmarks_keeps_its_default():
+    found = {
+        name: {
+            flag.names[0]: flag.setting.default
+            for flag in list_flags(importlib.import_module(command.module).Request)
+            if "." not in flag.names[0]
+        }
+        for name, command in benchmark.COMMANDS.items()
+    }
+    assert found["train"].items() >= {"--updates": 20, "--domain": None, "--threads": None}.items()
+    assert found["plan"].items() >= {"--samples": 500, "--horizon": 20, "--iterations": 5, "--plans": 30}.items()
+    assert found["soak"].items() >= {"--control-hz": 50.0, "--decisions": 10_000, "--block": 250}.items()
+    assert found["learn"].items() >= {"--seeds": (0, 1), "--thresholds": (250, 500, 750), "--mode": "planner"}.items()
+    assert found["decide"].items() >= {"--batch": 1, "--decisions": 50, "--checkpoint": None}.items()
 
 
 def test_tables_align_columns_and_show_what_is_missing():
@@ -120,9 +141,9 @@ def test_own_arms_lay_typed_settings_over_the_planner():
     assert short == Arm("short", "planner", {"horizon": 2})
 
 
-def test_without_the_actor_nothing_of_the_search_asks_it():
-    _, arm = parse_arms("no_actor", replace(PLANNER, start="policy", tail="policy", surprise_limit=2.0))
-    assert arm.planner == {"num_policy_samples": 0, "start": "shifted", "tail": "zero", "surprise_limit": None}
+def test_parse_arms_no_actor_removes_every_use_of_the_actor():
+    _, arm = parse_arms("no_actor", replace(PLANNER, tail="policy", surprise_limit=2.0))
+    assert arm.planner == {"num_policy_samples": 0, "tail": "zero", "surprise_limit": None}
 
 
 @pytest.mark.parametrize(

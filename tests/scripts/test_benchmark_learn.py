@@ -88,9 +88,9 @@ def test_a_folder_of_other_settings_is_not_taken_for_these(tmp_path):
 @pytest.mark.parametrize(
     ("flag", "own"), [("--run.seed", "--seeds"), ("--env.task", "--tasks"), ("--run.frames", "--frames")]
 )
-def test_what_tells_the_runs_apart_is_given_by_its_own_flag(tmp_path, capsys, flag, own):
+def test_request_refuses_settings_that_its_own_flags_set(tmp_path, capsys, flag, own):
     assert benchmark.main(["learn", flag, "5", "--out", str(tmp_path / "out")]) == 2
-    assert f"{flag} is what {own} says here" in capsys.readouterr().err
+    assert f"{own} sets {flag} here" in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
 
 

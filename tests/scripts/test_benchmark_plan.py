@@ -156,7 +156,7 @@ def test_without_peers_there_are_limits_and_growth_but_no_ratios_to_peers(tmp_pa
         (["--model.deter_dim", "x"], "model.deter_dim"),
     ],
 )
-def test_bad_input_is_one_line_that_names_it(capsys, arguments, named):
+def test_main_refuses_bad_flags_in_one_line_that_names_the_flag(capsys, arguments, named):
     assert benchmark.main(["plan", *arguments]) == 2
     captured = capsys.readouterr()
     assert captured.out == ""

@@ -66,7 +66,7 @@ def sleeper(milliseconds):
         (["soak", "--checkpoint", "no-such-folder"], "no-such-folder"),
     ],
 )
-def test_bad_input_is_one_line_that_names_it(capsys, arguments, named):
+def test_main_refuses_bad_flags_in_one_line_that_names_the_flag(capsys, arguments, named):
     assert benchmark.main(arguments) == 2
     captured = capsys.readouterr()
     assert captured.out == ""

@@ -16,7 +16,7 @@ from latentplan.models import WorldModel
 sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "scripts"))
 
 import benchmark  # noqa: E402
-from bench.zero_shot import CONSTRAINT_PLAYERS, OBJECTIVE_PLAYERS, PURSUERS, list_jobs  # noqa: E402
+from bench.zero_shot import CONSTRAINT_PLAYERS, OBJECTIVE_PLAYERS, PURSUERS, Request, list_jobs  # noqa: E402
 
 ENV = EnvConfig(domain="cartpole", task="swingup", action_repeat=200, render_quality="fastest")
 MODEL = ModelConfig(deter_dim=8, hidden_dim=8, encoder_channels=(4, 4), decoder_channels=2, num_bins=5)
@@ -117,8 +117,8 @@ def test_the_plain_gate_acts_by_its_actor_wherever_it_does_not_plan(checkpoint):
     assert set(sources["random moments"]) == {"plan", "tail"}
 
 
-def test_goals_are_listed_once_in_order():
-    jobs = list_jobs({"--objectives": "cart > 1; 500: cart < 1 | upright | upright |"})
+def test_list_jobs_lists_each_goal_once_in_order():
+    jobs = list_jobs(Request(checkpoint=Path("agent"), objectives="cart > 1; 500: cart < 1 | upright | upright |"))
     assert [job.objective for job in jobs[:: len(OBJECTIVE_PLAYERS)]] == ["cart > 1; 500: cart < 1", "upright"]
 
 
@@ -133,7 +133,7 @@ def test_goals_are_listed_once_in_order():
         (("--objectives", "cart > 1", "--trained", "nowhere"), "nowhere"),
     ],
 )
-def test_bad_goals_are_one_line(capsys, checkpoint, flags, reason):
+def test_zero_shot_refuses_bad_goals_in_one_line(capsys, checkpoint, flags, reason):
     assert benchmark.main(["zero-shot", "--checkpoint", str(checkpoint), *flags]) == 2
     error = capsys.readouterr().err
     assert error.startswith("error: ") and error.count("\n") == 1 and reason in error
