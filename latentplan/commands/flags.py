@@ -20,6 +20,11 @@ from latentplan.config.removed import REMOVED
 
 Request = TypeVar("Request")
 
+GENERAL_FLAGS = {
+    "--help": "print the flags that people use",
+    "--help-all": "print every flag",
+    "--print-config": "print the settings as YAML instead of running",
+}
 _METAVARS = {int: "N", float: "X", bool: "true|false", str: "TEXT", Path: "PATH", tuple: "[A,B]"}
 _WIDTH = 110
 
@@ -168,11 +173,7 @@ def format_flags(request: type, program: str, summary: str, every_flag: bool) ->
         usage=" ".join([program, *needed, "[--name value ...]"]),
     )
     parser.description = summary
-    for name, meaning in (
-        ("--help", "print the flags that people use"),
-        ("--help-all", "print every flag"),
-        ("--print-config", "print the settings as YAML instead of running"),
-    ):
+    for name, meaning in GENERAL_FLAGS.items():
         parser.add_argument(name, action="store_true", help=meaning)
     notes = vars(request).get("NOTES", "")
     resumable = getattr(request, "RESUMABLE", ())
@@ -222,7 +223,7 @@ class _Parser(argparse.ArgumentParser):
         removed = REMOVED.get(name[2:])
         if removed is not None:
             raise UserError(f"{name} no longer exists: {removed.advice}")
-        raise_unknown("flag", name, self._option_string_actions)
+        raise_unknown("flag", name, [*self._option_string_actions, *GENERAL_FLAGS, "--version"])
 
 
 class _Join(argparse.Action):

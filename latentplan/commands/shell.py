@@ -7,9 +7,8 @@ import os
 import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Literal
 
-from latentplan.config import MAX_THREADS, UserError
+from latentplan.config import MAX_THREADS, Device, UserError
 from latentplan.config.checks import within
 from latentplan.config.parsing import option
 
@@ -52,7 +51,7 @@ class ComputeRequest:
         threads: CPU threads, in [1, 1024]; None takes torch's own number, or 1 where more threads gain nothing.
     """
 
-    device: Literal["auto", "cpu", "cuda"] = option("auto", is_last=True)
+    device: Device = option("auto", is_last=True)
     threads: int | None = option(None, is_last=True)
 
     def __post_init__(self) -> None:

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 from latentplan.commands.flags import overrides
 from latentplan.config import Config, UserError
-from latentplan.config.files import compose, read_config, read_layer
+from latentplan.config.files import Preset, compose, read_config, read_layer
 from latentplan.config.parsing import option
 
 SHORT_FLAGS = {
@@ -37,7 +37,7 @@ class Request:
     NOTES = "Values shown are the defaults before configs/<domain>.yaml and the preset are laid over them."
 
     settings: dict[str, Any] = overrides(Config, SHORT_FLAGS)
-    preset: Literal["auto", "cpu", "gpu"] = "auto"
+    preset: Preset = "auto"
     config: Path | None = option(None, metavar="FILE")
     resume: Path | None = option(None, metavar="DIR")
 
@@ -62,8 +62,10 @@ def resolve(request: Request) -> Config:
         return compose(read_layer(request.config) if request.config else {}, request.settings, request.preset)
     if not (request.resume / "config.yaml").is_file():
         raise UserError(f"nothing to resume in {request.resume}: give the folder of a run, which holds config.yaml")
-    saved = read_config(request.resume / "config.yaml")
+    saved, changes = read_config(request.resume / "config.yaml"), request.settings.get("run", {})
+    if "frames" in changes or "minutes" in changes:  # a new budget replaces the saved one, of either kind
+        changes = {"frames": None, "minutes": None, **changes}
     try:
-        return replace(saved, run=replace(saved.run, **request.settings.get("run", {})))
+        return replace(saved, run=replace(saved.run, **changes))
     except ValueError as error:
         raise UserError(f"run.{error}") from None

@@ -12,7 +12,7 @@ import functools
 import importlib.metadata
 import os
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from latentplan.config.checks import UserError
 from latentplan.config.parsing import Setting, list_settings, raise_unknown, read_values
@@ -22,7 +22,7 @@ from latentplan.config.settings import Config
 Layer = dict[str, dict[str, Any]]
 
 SECTIONS: dict[str, Any] = {field.name: field.default_factory for field in dataclasses.fields(Config)}
-PRESETS = ("auto", "cpu", "gpu")
+Preset = Literal["auto", "cpu", "gpu"]
 DOMAINS = (
     *("acrobot", "ball_in_cup", "cartpole", "cheetah", "dog", "finger", "fish", "hopper", "humanoid", "humanoid_CMU"),
     *("lqr", "manipulator", "pendulum", "point_mass", "quadruped", "reacher", "stacker", "swimmer", "walker"),

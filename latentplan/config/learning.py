@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Literal, get_args
 
 from latentplan.config.checks import above_zero, at_least, one_of, within
 
-BEHAVIOURS = ("planner", "actor", "both")
+Behaviour = Literal["planner", "actor", "both"]
+BEHAVIOURS = get_args(Behaviour)
 
 
 @dataclass(frozen=True)
@@ -107,7 +109,7 @@ class CollectionConfig:
         overlap: Whether the next round is collected in another process, on the CPU, while this one is learned from.
     """
 
-    behaviour: str = "both"
+    behaviour: Behaviour = "both"
     noise_std: float = 0.4
     noise_correlation: float = 0.5
     goals: tuple[str, ...] = ()

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, Literal, get_args
 
 from latentplan.config.checks import MAX_THREADS, UserError, above_zero, at_least, one_of, within
 from latentplan.config.learning import CollectionConfig, LearningConfig
@@ -15,9 +15,12 @@ from latentplan.config.planner import PlannerConfig
 from latentplan.config.removed import drop_removed
 
 LATENT_DIM = 32
-RENDER_QUALITIES = ("exact", "fast", "fastest")
-FLOORS = ("suite", "endless")
-DEVICES = ("auto", "cpu", "cuda")
+RenderQuality = Literal["exact", "fast", "fastest"]
+Floor = Literal["suite", "endless"]
+Device = Literal["auto", "cpu", "cuda"]
+RENDER_QUALITIES = get_args(RenderQuality)
+FLOORS = get_args(Floor)
+DEVICES = get_args(Device)
 USER_DOMAIN = "user"  # the domain of runs in an environment of the user's own
 
 
@@ -43,8 +46,8 @@ class EnvConfig:
     task: str | None = None
     action_repeat: int = 2
     camera: int = 0
-    render_quality: str = "fast"
-    floor: str = "suite"
+    render_quality: RenderQuality = "fast"
+    floor: Floor = "suite"
     num_envs: int = 1
     objective: str | None = None
 
@@ -138,7 +141,7 @@ class RunConfig:
     frames: int | None = None
     minutes: float | None = None
     seed: int = 0
-    device: str = "auto"
+    device: Device = "auto"
     threads: int | None = None
     run_dir: str | None = None
 

@@ -18,9 +18,9 @@ from bench.learn_plot import Curve, Point, plot_runs
 from bench.report import format_table, interval, number, write_csv, write_json
 from latentplan.commands import train
 from latentplan.commands.flags import overrides, read_request
-from latentplan.config import Config, RunConfig, UserError, make_folder, to_dict
+from latentplan.config import Config, Device, RunConfig, UserError, make_folder, to_dict
 from latentplan.config.checks import above_zero
-from latentplan.config.files import read_config
+from latentplan.config.files import Preset, read_config
 from latentplan.config.parsing import option
 
 OWN_FLAGS = {  # settings that these runs differ in, or are told by
@@ -61,8 +61,8 @@ class Request:
     thresholds: tuple[int, ...] = option((250, 500, 750), separator=",")
     mode: Literal["planner", "actor"] = "planner"
     out: Path = option(Path("runs/learn"), metavar="DIR")
-    preset: Literal["auto", "cpu", "gpu"] | None = None
-    device: Literal["auto", "cpu", "cuda"] | None = None
+    preset: Preset | None = None
+    device: Device | None = None
     config: Path | None = option(None, metavar="FILE")
     settings: dict[str, Any] = overrides(Config)
 

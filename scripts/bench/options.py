@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
 
 from latentplan.commands.shell import ComputeRequest
 from latentplan.config import Config
 from latentplan.config.checks import at_least
-from latentplan.config.files import Layer, compose
+from latentplan.config.files import Layer, Preset, compose
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -22,7 +21,7 @@ class ComposeRequest(ComputeRequest):
     """
 
     domain: str | None = None
-    preset: Literal["auto", "cpu", "gpu"] | None = None
+    preset: Preset | None = None
     action_dim: int | None = None
 
     def __post_init__(self) -> None:
