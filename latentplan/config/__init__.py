@@ -1,4 +1,4 @@
-"""Every setting of latentplan, one frozen dataclass per component; imports the standard library alone."""
+"""Every setting of latentplan: one frozen dataclass per component, built on the standard library alone."""
 
 from latentplan.config.checks import MAX_THREADS, UserError, derive_seed, make_folder, output_file
 from latentplan.config.distill import DistillConfig

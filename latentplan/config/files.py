@@ -1,4 +1,4 @@
-"""Settings from several sources, laid over one another into one validated `Config`.
+"""YAML files and flags, laid over one another into one validated `Config`.
 
 Later sources win: the defaults of `latentplan/config`, `configs/default.yaml`, `configs/<domain>.yaml`,
 `configs/<domain>-<task>.yaml`, `configs/<preset>.yaml`, the file given with `--config`, the command line.
@@ -176,7 +176,9 @@ def _overlay(*layers: Layer) -> Layer:
     for layer in layers:
         run = layer.get("run", {})
         for given, other in (("frames", "minutes"), ("minutes", "frames")):
-            if given in run and other not in run:  # a budget replaces the other kind, set by an earlier layer
+            if (
+                given in run and other not in run
+            ):  # a budget of frames replaces an earlier budget of minutes, and conversely
                 merged.get("run", {}).pop(other, None)
         for section, fields in layer.items():
             merged[section] = {**merged.get(section, {}), **fields}

@@ -97,32 +97,14 @@ def read_values(
         UserError: A key is unknown or a value has the wrong type; the message names the setting, the value and what is
             allowed.
     """
-    import argparse
-
-    from jsonargparse import ArgumentParser
-
     names = names or {}
     known = [setting.key for setting in settings]
     for key in values:
         if key not in known:
             raise_unknown("setting", key, known)
-    _register_numbers()
-    given = [setting for setting in settings if setting.key in values]
-    parser = ArgumentParser(exit_on_error=False)
-    for index, setting in enumerate(given):
-        parser.add_argument(f"--value{index}", type=_parsed_type(setting.hint))
-    texts = {f"value{index}": values[setting.key] for index, setting in enumerate(given)}
-    try:
-        parsed = parser.parse_object(texts, defaults=False)
-    except argparse.ArgumentError as error:
-        found = re.search(r'"value(\d+)', str(error))
-        if found is None:
-            raise UserError(str(error)) from None
-        raise _wrong_type(given[int(found[1])], values, names) from None
-    for index, setting in enumerate(given):
-        if parsed[f"value{index}"] is None and type(None) not in alternatives(setting.hint):
-            raise _wrong_type(setting, values, names)
-    return {setting.key: parsed[f"value{index}"] for index, setting in enumerate(given)}
+    texts = {setting.key: values[setting.key] for setting in settings if _is_text(setting, values)}
+    given = [setting for setting in settings if setting.key in values and setting.key not in texts]
+    return {**texts, **_parse_values(given, values, names)} if given else texts
 
 
 def alternatives(hint: Any) -> tuple[Any, ...]:
@@ -147,6 +129,34 @@ def raise_unknown(kind: str, name: str, known: Iterable[str]) -> typing.NoReturn
     nearest = difflib.get_close_matches(str(name), known, n=1, cutoff=0.5)
     few = f"; available: {', '.join(known)}" if len(known) <= 20 else "; --help-all lists all"
     raise UserError(f"unknown {kind} {_shown(name)}" + (f"; did you mean {nearest[0]!r}?" if nearest else few))
+
+
+def _is_text(setting: Setting, values: Mapping[str, Any]) -> bool:
+    """Whether a value is text for a setting that takes any text, so that nothing has to be parsed."""
+    return setting.hint is str and isinstance(values.get(setting.key), str)
+
+
+def _parse_values(given: Sequence[Setting], values: Mapping[str, Any], names: Mapping[str, str]) -> dict[str, Any]:
+    import argparse
+
+    from jsonargparse import ArgumentParser
+
+    _register_numbers()
+    parser = ArgumentParser(exit_on_error=False)
+    for index, setting in enumerate(given):
+        parser.add_argument(f"--value{index}", type=_parsed_type(setting.hint))
+    texts = {f"value{index}": values[setting.key] for index, setting in enumerate(given)}
+    try:
+        parsed = parser.parse_object(texts, defaults=False)
+    except argparse.ArgumentError as error:
+        found = re.search(r'"value(\d+)', str(error))
+        if found is None:
+            raise UserError(str(error)) from None
+        raise _wrong_type(given[int(found[1])], values, names) from None
+    for index, setting in enumerate(given):
+        if parsed[f"value{index}"] is None and type(None) not in alternatives(setting.hint):
+            raise _wrong_type(setting, values, names)
+    return {setting.key: parsed[f"value{index}"] for index, setting in enumerate(given)}
 
 
 def _meanings(kind: type) -> dict[str, str]:
