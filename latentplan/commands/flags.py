@@ -1,4 +1,4 @@
-"""The command line of a command, made of the dataclass that says what the command can be asked for.
+"""Flags, help and errors of a command, made from the dataclass of its request.
 
 A field `control_hz` becomes the flag `--control-hz`; a field made by `overrides` stands for the settings of another
 dataclass, as `--planner.horizon`. Types, defaults and meanings are those of the dataclass; its `__post_init__` checks
@@ -12,7 +12,7 @@ import dataclasses
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, TypeVar
 
 from latentplan.config import UserError, output_file
 from latentplan.config.parsing import Setting, alternatives, choices, list_settings, raise_unknown, read_values
@@ -34,8 +34,8 @@ class Flag:
     """A setting on the command line.
 
     Attributes:
-        names: Its spellings, the usual one first.
-        setting: What the flag sets; the key is the path of its value inside the request.
+        names: Spellings of the flag, the usual one first.
+        setting: The setting; its key is the path of the value inside the request.
         is_common: Whether `--help` shows the flag; `--help-all` shows every flag.
     """
 
@@ -50,7 +50,7 @@ class Flag:
 
     @property
     def metavar(self) -> str:
-        """What stands for the value in `--help`."""
+        """The placeholder for the value in `--help`."""
         kind = alternatives(self.setting.hint)[0]
         shown = "|".join(choices(self.setting.hint)) or _METAVARS.get(getattr(kind, "__origin__", kind), "VALUE")
         if "separator" in self.setting.options:
@@ -61,7 +61,7 @@ class Flag:
     def help(self) -> str:
         """The meaning of the flag, with its default where it has one."""
         default = self.setting.default
-        if default in (None, dataclasses.MISSING, ()):
+        if default in (None, dataclasses.MISSING, (), ""):
             return self.setting.meaning
         shown = str(default).lower() if isinstance(default, bool) else default
         if isinstance(default, tuple):
@@ -70,25 +70,13 @@ class Flag:
         return f"{self.setting.meaning} (default: {shown})"
 
 
-class Words(NamedTuple):
-    """A command line, read but not yet checked by the request.
-
-    Attributes:
-        flags: Every flag that the command has.
-        values: Typed values of the flags that were given, by key.
-    """
-
-    flags: Sequence[Flag]
-    values: dict[str, Any]
-
-
 def overrides(kind: type, short: Mapping[str, str] | None = None, prefix: str = "") -> Any:
-    """A field that holds the settings of a dataclass that were given, by name: `{"horizon": 3}`.
+    """A field that holds those settings of a dataclass that were given, by name: `{"horizon": 3}`.
 
     Args:
         kind: The dataclass; settings of dataclasses inside it are in nested dictionaries.
         short: Short names for settings, by dotted name: `{"run.frames": "--frames"}`.
-        prefix: What the flags begin with, such as `planner.`.
+        prefix: First part of every flag, such as `planner.`.
     """
     return field(default_factory=dict, metadata={"overrides": kind, "short": short or {}, "prefix": prefix})
 
@@ -116,8 +104,9 @@ def read_request(request: type[Request], argv: Sequence[str]) -> Request:
     Raises:
         UserError: A flag or value is wrong or an output cannot be written; the message says what to give instead.
     """
-    flags, values = read_words(request, argv)
+    flags = list_flags(request)
     names = {flag.setting.key: flag.names[0] for flag in flags}
+    values = read_values([flag.setting for flag in flags], _read_texts(flags, argv), names)
     _check_resumed(request, [names[key] for key in values])
     _check_outputs(flags, values)
     for flag in flags:
@@ -138,23 +127,6 @@ def read_request(request: type[Request], argv: Sequence[str]) -> Request:
         first, _, rest = str(error).partition(" ")
         named = [name for key, name in names.items() if key.rpartition(".")[2] == first]
         raise UserError(f"{named[0] if named else first} {rest}") from None
-
-
-def read_words(request: type, argv: Sequence[str]) -> Words:
-    """The flags of a request, and the typed values of the flags that a command line gives.
-
-    Raises:
-        UserError: A word is no flag, or a value is missing or has the wrong type.
-    """
-    flags = list_flags(request)
-    texts = vars(_Parser(flags).parse_args(list(argv)))
-    for flag in flags:
-        separator = flag.setting.options.get("separator")
-        if separator and flag.setting.key in texts:
-            texts[flag.setting.key] = _split(flag.names[0], texts[flag.setting.key], separator)
-    return Words(
-        flags, read_values([flag.setting for flag in flags], texts, {f.setting.key: f.names[0] for f in flags})
-    )
 
 
 def format_flags(request: type, program: str, summary: str, every_flag: bool) -> str:
@@ -214,7 +186,7 @@ class _Parser(argparse.ArgumentParser):
         return found
 
     def _parse_optional(self, arg_string: str) -> Any:
-        """What argparse asks of every word: whether the word is a flag."""
+        """The flag that a word is, or None for a value; argparse calls this for every word."""
         if not arg_string.startswith("--"):
             return None
         name = arg_string.partition("=")[0]
@@ -241,6 +213,16 @@ class _HelpFormatter(argparse.HelpFormatter):
     def _format_action_invocation(self, action: argparse.Action) -> str:
         metavar = f" {action.metavar}" if action.metavar else ""
         return f"{', '.join(action.option_strings)}{metavar}"
+
+
+def _read_texts(flags: Sequence[Flag], argv: Sequence[str]) -> dict[str, Any]:
+    """The text of every flag that was given, by key; lists are split."""
+    texts = vars(_Parser(flags).parse_args(list(argv)))
+    for flag in flags:
+        separator = flag.setting.options.get("separator")
+        if separator and flag.setting.key in texts:
+            texts[flag.setting.key] = _split(flag.names[0], texts[flag.setting.key], separator)
+    return texts
 
 
 def _check_resumed(request: type, given: Sequence[str]) -> None:

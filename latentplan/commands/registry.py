@@ -1,8 +1,8 @@
-"""A table of commands, and how one of them is called.
+"""A table of commands, and how a command is called by its name.
 
-A command is a module with a dataclass `Request`, which says what the command can be asked for, and a function `run`,
-which takes a request and returns the exit code. A module may have a function `resolve`, which returns the settings that
-`--print-config` prints; without it the request itself is printed.
+A command is a module with a dataclass `Request`, whose fields are the flags, and a function `run`, which takes a
+request and returns the exit code. A module may have a function `resolve`, which takes a request and returns the
+settings that `--print-config` prints; without `resolve` the request itself is printed.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Typed values from text: the settings that a dataclass declares, and how jsonargparse reads a value for each.
+"""The settings that a dataclass declares, and how jsonargparse reads a typed value for each from text.
 
 Names, types, defaults and meanings come from the dataclass alone, so that flags, YAML files and `--help` agree.
 jsonargparse is imported when the first value is read, because `--help` does not need it.
@@ -41,7 +41,7 @@ class Setting:
         key: Dotted name, such as `planner.horizon`.
         hint: Type of the values.
         default: Value unless one is given; `dataclasses.MISSING` where one must be given.
-        meaning: What the dataclass's docstring says about the field.
+        meaning: Description of the field in the docstring of the dataclass.
         options: Metadata of the field.
     """
 
@@ -57,8 +57,8 @@ def option(default: Any = dataclasses.MISSING, **options: Any) -> Any:
 
     Args:
         default: The default; without one the flag must be given.
-        options: `metavar` (stands for the value in `--help`), `join` (text between the values of a repeated flag),
-            `separator` (text between the items of a tuple), `is_output` (the flag names a file to be written),
+        options: `metavar` (the placeholder for the value in `--help`), `join` (text between the values of a repeated
+            flag), `separator` (text between the items of a tuple), `is_output` (the flag names a file to be written),
             `is_rare` (only `--help-all` shows the flag) and `is_last` (`--help` shows the flag after the others).
     """
     return dataclasses.field(default=default, metadata=options)
@@ -69,7 +69,7 @@ def list_settings(kind: type, prefix: str = "") -> list[Setting]:
 
     Args:
         kind: The dataclass.
-        prefix: What every key begins with, such as `planner.`.
+        prefix: First part of every key, such as `planner.`.
     """
     hints, meanings = typing.get_type_hints(kind), _meanings(kind)
     settings = []
@@ -91,7 +91,7 @@ def read_values(
     Args:
         settings: Every setting that may have a value.
         values: Text or plain values, by key. `1e5` and `100000.0` are whole numbers.
-        names: What an error calls each setting, by key, where that differs from the key.
+        names: Names of settings in errors, by key; without one the key is used.
 
     Raises:
         UserError: A key is unknown or a value has the wrong type; the message names the setting, the value and what is
@@ -121,7 +121,7 @@ def raise_unknown(kind: str, name: str, known: Iterable[str]) -> typing.NoReturn
     """Raise a `UserError` that names the nearest known name, or all of them where none is near.
 
     Args:
-        kind: What is named, such as `domain`.
+        kind: Kind of thing that the name belongs to, such as `domain`.
         name: The unknown name.
         known: The names that are allowed.
     """
