@@ -11,7 +11,7 @@ from typing import Any
 from latentplan.commands.flags import list_flags
 from latentplan.commands.registry import Command
 from latentplan.config import UserError
-from latentplan.config.parsing import alternatives, choices, raise_unknown
+from latentplan.config.parsing import alternatives, raise_unknown
 
 SHELLS = ("bash", "zsh")
 
@@ -43,7 +43,7 @@ def completion_script(program: str, commands: Mapping[str, Command], shell: str)
             part.add_argument(word, action="store_true", help=meaning)
         for flag in list_flags(importlib.import_module(command.module).Request):
             hint = flag.setting.hint
-            words = ("true", "false") if hint is bool else choices(hint)
+            words = ("true", "false") if hint is bool else flag.setting.choices
             argument: Any = part.add_argument(*flag.names, help=flag.help.replace("%", "%%"), choices=words or None)
             if Path in alternatives(hint):
                 argument.complete = shtab.DIRECTORY if flag.metavar == "DIR" else shtab.FILE

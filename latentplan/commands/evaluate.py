@@ -12,13 +12,13 @@ import os
 import sys
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 
 from latentplan.commands.flags import overrides
 from latentplan.commands.saved import saved_config, search_settings
 from latentplan.commands.shell import ComputeRequest
 from latentplan.config import EnvConfig, PlannerConfig, UserError, to_dict
-from latentplan.config.checks import above_zero, at_least, within
+from latentplan.config.checks import above_zero, at_least, one_of, within
 from latentplan.config.parsing import option
 
 if TYPE_CHECKING:
@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from latentplan.evaluation.timed import TimedEpisode
 
 PLANNING_MODES = ("planner", "gated", "background")  # modes that pursue an objective; the others are only scored on it
+MODES = (*PLANNING_MODES, "actor", "random")
 ON_ONE_THREAD = ("actor", "background")  # a single frame is too little work for several threads
 
 
@@ -38,7 +39,7 @@ class Request(ComputeRequest):
     Attributes:
         checkpoint: Folder of a trained agent, or of a run (its best checkpoint).
         episodes: Episodes to play.
-        mode: What chooses the actions.
+        mode: Agent that chooses the actions.
         objective: Objective in place of the task, such as 'speed -> 2.0 and height > 1.1'.
         constraint: Condition that must hold at every moment, such as 'cart < 0.5'; may be repeated.
         planning_budget: Share of its decisions that a gated agent may plan, in [0, 1]; None takes the agent's own.
@@ -54,7 +55,7 @@ class Request(ComputeRequest):
 
     checkpoint: Path = option(metavar="DIR")
     episodes: int = 10
-    mode: Literal["planner", "gated", "background", "actor", "random"] = "planner"
+    mode: str = option("planner", choices=lambda: MODES)
     objective: str | None = None
     constraint: str | None = option(None, join="; ")
     planning_budget: float | None = None
@@ -68,6 +69,7 @@ class Request(ComputeRequest):
     def __post_init__(self) -> None:
         super().__post_init__()
         at_least(self, episodes=1, seed=0)
+        one_of(self, mode=MODES)
         above_zero(self, "control_hz")
         if self.planner and self.mode not in PLANNING_MODES:
             raise UserError(

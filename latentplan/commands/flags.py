@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from latentplan.config import UserError, output_file
-from latentplan.config.parsing import Setting, alternatives, choices, list_settings, raise_unknown, read_values
+from latentplan.config.parsing import Setting, alternatives, list_settings, raise_unknown, read_values
 from latentplan.config.removed import REMOVED
 
 Request = TypeVar("Request")
@@ -52,7 +52,7 @@ class Flag:
     def metavar(self) -> str:
         """The placeholder for the value in `--help`."""
         kind = alternatives(self.setting.hint)[0]
-        shown = "|".join(choices(self.setting.hint)) or _METAVARS.get(getattr(kind, "__origin__", kind), "VALUE")
+        shown = "|".join(self.setting.choices) or _METAVARS.get(getattr(kind, "__origin__", kind), "VALUE")
         if "separator" in self.setting.options:
             shown = self.setting.options["separator"].join(["A", "B", "..."])
         return str(self.setting.options.get("metavar", shown))

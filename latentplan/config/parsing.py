@@ -51,15 +51,24 @@ class Setting:
     meaning: str
     options: Mapping[str, Any]
 
+    @property
+    def choices(self) -> tuple[str, ...]:
+        """The words that the setting allows, from a `Literal` or the option `choices`; empty where it allows others."""
+        if "choices" in self.options:
+            return tuple(self.options["choices"]())
+        literals = (kind for kind in alternatives(self.hint) if typing.get_origin(kind) is typing.Literal)
+        return next((typing.get_args(kind) for kind in literals), ())
+
 
 def option(default: Any = dataclasses.MISSING, **options: Any) -> Any:
     """A field of a dataclass with notes for the command line.
 
     Args:
         default: The default; without one the flag must be given.
-        options: `metavar` (the placeholder for the value in `--help`), `join` (text between the values of a repeated
-            flag), `separator` (text between the items of a tuple), `is_output` (the flag names a file to be written),
-            `is_rare` (only `--help-all` shows the flag) and `is_last` (`--help` shows the flag after the others).
+        options: `choices` (a function that returns the allowed words, for text), `metavar` (the placeholder for the
+            value in `--help`), `join` (text between the values of a repeated flag), `separator` (text between the items
+            of a tuple), `is_output` (the flag names a file to be written), `is_rare` (only `--help-all` shows the flag)
+            and `is_last` (`--help` shows the flag after the others).
     """
     return dataclasses.field(default=default, metadata=options)
 
@@ -103,6 +112,9 @@ def read_values(
         if key not in known:
             raise_unknown("setting", key, known)
     texts = {setting.key: values[setting.key] for setting in settings if _is_text(setting, values)}
+    for setting in settings:
+        if setting.key in texts and setting.choices and texts[setting.key] not in setting.choices:
+            raise _wrong_type(setting, values, names)
     given = [setting for setting in settings if setting.key in values and setting.key not in texts]
     return {**texts, **_parse_values(given, values, names)} if given else texts
 
@@ -110,11 +122,6 @@ def read_values(
 def alternatives(hint: Any) -> tuple[Any, ...]:
     """The types that a hint allows: `int | None` as (int, NoneType), any other hint alone."""
     return typing.get_args(hint) if typing.get_origin(hint) in (typing.Union, types.UnionType) else (hint,)
-
-
-def choices(hint: Any) -> tuple[str, ...]:
-    """The words that a hint allows; empty unless the hint is a `Literal` or an optional one."""
-    return next((typing.get_args(kind) for kind in alternatives(hint) if typing.get_origin(kind) is typing.Literal), ())
 
 
 def raise_unknown(kind: str, name: str, known: Iterable[str]) -> typing.NoReturn:
@@ -229,7 +236,7 @@ def _parsed_type(hint: Any) -> Any:
 
 def _wrong_type(setting: Setting, values: Mapping[str, Any], names: Mapping[str, str]) -> UserError:
     name, value = names.get(setting.key, setting.key), values[setting.key]
-    words = choices(setting.hint)
+    words = setting.choices
     if words:
         nearest = difflib.get_close_matches(str(value), words, n=1, cutoff=0.5)
         hint = f"; did you mean {nearest[0]!r}?" if nearest else ""

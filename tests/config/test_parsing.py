@@ -6,7 +6,7 @@ from typing import Literal
 import pytest
 
 from latentplan.config import UserError
-from latentplan.config.parsing import choices, list_settings, option, raise_unknown, read_values
+from latentplan.config.parsing import list_settings, option, raise_unknown, read_values
 
 
 @dataclass(frozen=True)
@@ -39,10 +39,12 @@ class Outer:
     Attributes:
         name: Any text.
         weights: Numbers.
+        mode: A word.
     """
 
     name: str
     weights: tuple[float, ...] = option((1.0,), separator=",")
+    mode: str = option("fast", choices=lambda: ["fast", "slow"])
     inner: Inner = field(default_factory=Inner)
 
 
@@ -51,6 +53,7 @@ def test_list_settings_takes_keys_defaults_and_meanings_from_dataclasses_and_the
     assert found == {
         "outer.name": (MISSING, "Any text."),
         "outer.weights": ((1.0,), "Numbers."),
+        "outer.mode": ("fast", "A word."),
         "outer.inner.size": (3, "Size of everything."),
         "outer.inner.colour": (None, "One word."),
     }
@@ -84,6 +87,7 @@ def test_read_values_gives_values_the_types_of_their_fields(key, text, value):
         ("weights", ["1", "nan"], "weights must be finite numbers, separated by ',', got '1,nan'"),
         ("inner.colour", "gren", "inner.colour must be one of red, green, got 'gren'; did you mean 'green'?"),
         ("inner.sise", "1", "unknown setting 'inner.sise'; did you mean 'inner.size'?"),
+        ("mode", "fst", "mode must be one of fast, slow, got 'fst'; did you mean 'fast'?"),
         ("name", None, "name must be text, got None"),
     ],
 )
@@ -98,9 +102,10 @@ def test_read_values_uses_given_names_in_errors():
         read_values(list_settings(Outer), {"inner.size": "x"}, {"inner.size": "--size"})
 
 
-def test_choices_are_the_words_of_a_literal():
-    assert choices(Literal["a", "b"] | None) == ("a", "b")
-    assert choices(str) == choices(int | None) == ()
+def test_choices_are_those_of_a_literal_or_an_option():
+    found = {setting.key: setting.choices for setting in list_settings(Outer)}
+    expected = {"name": (), "weights": (), "mode": ("fast", "slow"), "inner.size": (), "inner.colour": ("red", "green")}
+    assert found == expected
 
 
 def test_raise_unknown_names_the_nearest_or_all():
