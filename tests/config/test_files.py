@@ -132,7 +132,7 @@ def test_build_config_gives_values_the_types_of_their_fields():
         ("planner.horizon", None, "planner.horizon must be a whole number, got None"),
         ("planner.horizon", [1], "planner.horizon must be a whole number, got [1]"),
         ("planner.horizon", "1" * 400, "planner.horizon must be a whole number, got '111"),
-        ("planner.horizon", 0, "planner.horizon must be at least 1, got 0"),
+        ("learning.batch_size", 0, "learning.batch_size must be at least 1, got 0"),
         ("run.frames", "many", "run.frames must be a whole number or null, got 'many'"),
         ("run.minutes", float("nan"), "run.minutes must be a finite number or null, got nan"),
         ("run.minutes", 10**400, "run.minutes must be a finite number or null, got 1000"),
