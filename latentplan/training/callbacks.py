@@ -139,16 +139,12 @@ def turn(settings: CollectionConfig, rounds: int, env_frames: int) -> tuple[str,
     if share > 0.0 and env_frames >= settings.goals_after:
         goals = int(rounds * share)
         if int((rounds + 1) * share) > goals:
-            return "planner", _has_noise(settings, goals), settings.goals[goals % len(settings.goals)]
+            return "planner", True, settings.goals[goals % len(settings.goals)]
     own, behaviour = rounds - goals, settings.behaviour
     if behaviour == "both":
         own, who = divmod(own, 2)
         behaviour = ("planner", "actor")[who]
-    return behaviour, _has_noise(settings, own), None
-
-
-def _has_noise(settings: CollectionConfig, own: int) -> bool:
-    return int((own + 1) * settings.noise_share) > int(own * settings.noise_share)
+    return behaviour, True, None
 
 
 class Save(lightning.Callback):

@@ -8,7 +8,8 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from latentplan.config import PlannerConfig, UserError, to_dict
-from latentplan.config.files import build_config, field_names, raise_unknown
+from latentplan.config.files import build_config, field_names
+from latentplan.config.parsing import raise_unknown
 from latentplan.config.planner import override_planner
 
 REFERENCE = "full"
@@ -76,7 +77,7 @@ def without_actor(base: PlannerConfig) -> dict[str, Any]:
     """Settings of a search that does not use the actor."""
     tail = {"tail": "zero"} if base.tail == "policy" else {}
     trust = {} if base.surprise_limit is None else {"surprise_limit": None}
-    return {"num_policy_samples": 0, "start": "shifted", **tail, **trust}
+    return {"num_policy_samples": 0, **tail, **trust}
 
 
 def play_arm(checkpoint: str, arm: Arm, seeds: Sequence[int], device: str, threads: int) -> Outcome:

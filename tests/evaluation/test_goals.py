@@ -12,7 +12,7 @@ from dm_control.utils.rewards import tolerance
 from latentplan.agents.checkpoint import load_agent, save_checkpoint
 from latentplan.agents.planning import PlanningAgent
 from latentplan.agents.random import RandomAgent
-from latentplan.commands import evaluate
+from latentplan.commands.main import main
 from latentplan.config import Config, EnvConfig, ModelConfig, PlannerConfig, UserError
 from latentplan.config.quantities import scales
 from latentplan.envs import make_env
@@ -57,12 +57,12 @@ def old_checkpoint(tmp_path_factory):
 def evaluate_agent(folder, tmp_path, *flags):
     result = tmp_path / "result.json"
     arguments = ["--checkpoint", folder, "--json", result, "--device", "cpu", "--episodes", 2, *flags]
-    assert evaluate.main([str(argument) for argument in arguments]) == 0
+    assert main(["eval", *map(str, arguments)]) == 0
     return json.loads(result.read_text())
 
 
 def error_of(capsys, *flags):
-    assert evaluate.main([str(flag) for flag in flags]) == 2
+    assert main(["eval", *map(str, flags)]) == 2
     captured = capsys.readouterr()
     assert captured.err.startswith("error: ") and captured.err.count("\n") == 1
     return captured.err

@@ -18,9 +18,7 @@ from latentplan.training.learner.augmentation import quarter_turns
 from latentplan.training.learner.losses import (
     Learned,
     imagine,
-    imitation_loss,
     lambda_return,
-    mean_within,
     value_loss,
     world_model_loss,
 )
@@ -173,25 +171,15 @@ class Learner(lightning.LightningModule):
         with self.model.trunk_precision(cache=False):
             imagined = value_loss(self.model.value_head, dream.features[:-1], returns, reach)
             replayed = self._replayed_value_loss(learned, batch)
-            imitation = self._imitation(states, batch)
         parts = {
             "actor": actor.detach(),
-            "imitation": imitation.detach(),
+            "imitation": batch.rewards.new_zeros(()),
             "value": imagined.detach(),
             "imagined_return": returns[0].detach().mean(),
             "entropy": dream.entropies.detach().mean(),
         }
         loss = actor + imagined + config.replay_value_scale * replayed
-        return loss + config.imitation_scale * imitation, parts
-
-    def _imitation(self, states: State, batch: Batch) -> Tensor:
-        """Divergence of the actor from the plans stored with the frames, in nats; over the rows that have one."""
-        if self.config.imitation_scale == 0.0:
-            return batch.rewards.new_zeros(())
-        mean, std = batch.plan.chunk(2, -1)
-        has_plan = (std > 0.0).all(-1)
-        divergence = imitation_loss(self.model.actor, states.features[:, :-1], mean, std)
-        return mean_within(divergence, has_plan * batch.within)
+        return loss, parts
 
     def _replayed_value_loss(self, learned: Learned, batch: Batch) -> Tensor:
         """The value against replayed rewards, at what was seen and at what had been predicted of it without looking.
