@@ -15,6 +15,7 @@ COMMANDS = {
     "train": Command("bench.train", "time of an update, part by part, beside what the machine can do at best"),
     "render": Command("bench.render", "milliseconds per frame and change of the picture in each render quality"),
     "decide": Command("bench.decide", "milliseconds per decision of planner and actor"),
+    "paths": Command("bench.paths", "milliseconds of every fast path of the world model beside plain torch"),
     "plan": Command("bench.plan", "milliseconds per search beside other planners, on the same model and settings"),
     "compile": Command("bench.compile", "milliseconds per search in small models, stepped and with compile_rollout"),
     "ablate": Command("bench.ablate", "return of a trained planner without each of its parts, in paired episodes"),

@@ -1,1 +1,1 @@
-"""Agents: a world model and a way to choose actions with it, and how an agent is kept."""
+"""Agents: how actions are chosen with a world model, and how agents are saved, loaded and exported."""

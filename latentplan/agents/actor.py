@@ -1,4 +1,4 @@
-"""An agent that decides by the learned actor alone."""
+"""The agent that acts by the learned actor alone, without planning."""
 
 from __future__ import annotations
 
@@ -9,20 +9,19 @@ from torch import Tensor
 from latentplan.agents.base import ModelAgent
 from latentplan.config import Config
 from latentplan.models import State, WorldModel
-from latentplan.models.fast import reflex
 from latentplan.models.heads import sample_action
 from latentplan.models.symmetry import flat, mean_over_turns
 
 
 class ActorAgent(ModelAgent):
-    """Decides by the actor alone: its mode, or samples when it explores.
+    """Executes the mode of the actor's distribution, or a sample from it for exploration.
 
     Args:
         model: The world model.
         config: Settings it was trained with.
         explore: Whether actions are sampled.
-        noise_correlation: Of the samples, between decisions.
-        seed: Of the agent's own random stream.
+        noise_correlation: Correlation of the sampling noise between one decision and the next, in [0, 1).
+        seed: Seed of the agent's own random stream.
     """
 
     def __init__(
@@ -39,15 +38,12 @@ class ActorAgent(ModelAgent):
 
     @torch.inference_mode()
     def act(self, frame: np.ndarray) -> np.ndarray:
-        """The action in [-1, 1], float32 (action,) or (batch, action), for uint8 frame(s).
-
-        Raises:
-            ValueError: The frame has another shape or dtype, or the batch changed without a reset.
-        """
+        """The action in [-1, 1], float32 (action,) or (batch, action); see `ModelAgent.act`."""
         return super().act(frame)
 
     def _choose(self, state: State) -> Tensor:
-        mean, std = (mean_over_turns(part, state) for part in reflex.act(self._weights, flat(state)))
+        raw = self.model.backend.act(self.model, flat(state))
+        mean, std = (mean_over_turns(part, state) for part in raw)
         if not self.explore:
             return mean
         return sample_action(mean, std, self.noise.draw(mean, self.generator, self._forget))

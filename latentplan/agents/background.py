@@ -1,4 +1,4 @@
-"""An agent for worlds that do not wait: it acts at once, and plans beside the control loop."""
+"""The agent for real time: it acts at once, and a worker plans beside the control loop."""
 
 from __future__ import annotations
 
@@ -22,7 +22,11 @@ from latentplan.planning.objectives import Constraint, Term
 
 @dataclass(frozen=True)
 class LatentPlanner:
-    """A planner that searches in a world model at the precision of its trunk, as `PlanningAgent` does."""
+    """Searches in a world model at the precision of the model's trunk, as `PlanningAgent` does.
+
+    Attributes:
+        search: The planner.
+    """
 
     search: CEMPlanner
 
@@ -33,27 +37,29 @@ class LatentPlanner:
 
 
 class BackgroundAgent(ModelAgent):
-    """Takes each action from the newest plan that is due, or from the actor, while the next plan is searched beside.
+    """Takes each action from the newest plan that is due, or from the actor, while a worker searches the next plan.
 
-    A decision costs no more than seeing the frame and a few steps of the model. Several environments share each plan's
-    search, so `reset` drops the plans of all of them, whatever the mask. Close it, or use it in a `with` block.
+    A decision costs one update of the belief and a few steps of the model. All environments of a batch share each
+    search, so `reset` drops the plans of all environments, whatever its mask. The agent has to be closed: call `close`
+    or use a `with` block.
 
     Attributes:
-        last_source: Where the most recent action came from: "plan", "tail" (of a plan whose successor is late) or
+        last_source: Origin of the most recent action: "plan", "tail" (the rest of a plan whose successor is late) or
             "actor".
-        plan_age: Decisions between the one that the plan was made for and the most recent; None with the actor.
-        scheduler: The rules, with the buffer and the executor; see `PlanScheduler`.
+        plan_age: Decisions since the one that the present plan was made for; None where the actor acted.
+        scheduler: Decides when plans are requested and which plan is due; see `PlanScheduler`.
 
     Args:
-        model: The world model; a process works with a copy of it, made now.
-        config: Settings it was trained with.
-        discount: Per decision, as learned.
+        model: The world model; a worker process gets a copy of it, made now.
+        config: Settings the model was trained with.
+        discount: Discount per decision, as learned.
         planner: Settings of the search; None takes those of `config`.
-        seed: Of the agent's own random stream.
-        worker: Where plans are searched: `process` or `thread` (for models on a GPU).
+        seed: Seed of the agent's own random stream.
+        worker: Where plans are searched: in a `process`, or in a `thread` (for models on a GPU).
         max_age: See `PlanBuffer`.
-        fresh_ticks: See `PlanBuffer`; None follows the measured latency.
-        make_executor: Makes what computes plans, of planner and model; None takes `BackgroundPlanner`.
+        fresh_ticks: See `PlanBuffer`; None derives it from the measured latency.
+        make_executor: Makes the executor that computes plans, from a planner and a model; None takes
+            `BackgroundPlanner`.
     """
 
     def __init__(
@@ -81,53 +87,54 @@ class BackgroundAgent(ModelAgent):
         self.plan_age: int | None = None
 
     def reset(self, mask: np.ndarray | None = None) -> None:
-        """Forget the past, everywhere or where mask (batch,) is true, and all plans."""
+        """Forgets the past of all environments, or of those where mask (batch,) is true, and all plans."""
         super().reset(mask)
         self.scheduler.reset()
 
     def set_objective(
         self, objective: str | Expression | Term | None = None, constraints: str | Sequence[Constraint] = ()
     ) -> None:
-        """Changes what plans asked for from now on pursue; those made before are followed until these come.
+        """Sets the objective and the constraints of all plans requested from now on.
 
-        The actor, which acts where no plan is due, goes on with what it was trained for.
+        Plans made before stay in use until the first new plan is due. Where no plan is due the actor acts for the
+        reward that it was trained on.
 
         Args:
             objective: See `PlanningAgent.set_objective`.
             constraints: See `PlanningAgent.set_objective`.
 
         Raises:
-            UserError: The text is no expression, or is about what this agent does not predict.
+            UserError: The text is no expression, or names a quantity that the agent does not predict.
             TypeError: A term cannot be sent to the process that plans.
         """
         self.scheduler.set_objective(*self._plan_goals(objective, constraints, self.scheduler.planner))
 
     @torch.no_grad()
     def imagine(self) -> np.ndarray | None:
-        """The decoded last state of the plan in use, uint8 (32, 32, 3), of the first environment; None without one."""
+        """The decoded end of the first environment's present plan, uint8 (32, 32, 3); None without a plan."""
         remaining = self.scheduler.buffer.remaining(self.scheduler.tick - 1)
         if remaining is None or self.state is None:
             return None
         return self._picture(self.state, remaining)
 
     def wait_until_ready(self, seconds: float = 60.0) -> bool:
-        """Wait until plans can be searched at once, at most so long; whether they can (or the worker has failed)."""
+        """Waits until the worker is ready (or has failed), at most so many seconds; returns whether it is."""
         executor = self.scheduler.executor
         return not isinstance(executor, BackgroundPlanner) or executor.wait_until_ready(seconds)
 
     def close(self) -> None:
-        """End the worker; the agent goes on with what is left of its plan, then with the actor."""
+        """Ends the worker; from then on the agent executes the rest of its plan, then the actor's actions."""
         if isinstance(self.scheduler.executor, BackgroundPlanner):
             self.scheduler.executor.close()
 
     def __enter__(self) -> BackgroundAgent:
-        """Nothing but the agent itself."""
+        """Returns the agent."""
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, where: TracebackType | None
     ) -> None:
-        """Close."""
+        """Closes the agent."""
         self.close()
 
     def _choose(self, state: State) -> Tensor:

@@ -1,8 +1,9 @@
-"""Agents: a world model, and a way to choose actions with it."""
+"""What agents have in common: the protocol of every agent, and the belief of agents with a world model."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Protocol
 
 import numpy as np
 import torch
@@ -11,32 +12,54 @@ from torch import Tensor
 from latentplan.agents.noise import CorrelatedNoise
 from latentplan.config import Config
 from latentplan.models import State, WorldModel
-from latentplan.models.fast import reflex
-from latentplan.models.symmetry import TurnedModel, flat, folded, per_turn, turned, unturned
+from latentplan.models.symmetry import TurnedModel, first_turn, flat, folded, per_turn, turned
 from latentplan.objectives.expression import Expression
 from latentplan.objectives.objective import plan_goals, read_goal_image
 from latentplan.planning import CEMPlanner
 from latentplan.planning.objectives import Constraint, Term
 
 
-class ModelAgent:
-    """What planning and acting agents share: a belief that follows the frames.
+class Agent(Protocol):
+    """Turns frames into actions.
 
-    One frame (64, 64, 3) in gives one action (action,) out; several, (batch, 64, 64, 3), give (batch, action).
-    The belief is the posterior's mean, of the frame alone or (`model.turns`) of its four quarter turns.
+    An agent may have an attribute `last_source` with the origin of the most recent action: "plan", "tail" (the rest of
+    an older plan) or "actor". An agent without the attribute counts as one that does not plan.
+    """
+
+    def act(self, frame: np.ndarray) -> np.ndarray:
+        """The action, float32 (action,), for a frame, uint8 (height, width, channel)."""
+        ...
+
+    def reset(self) -> None:
+        """Forgets the past; called before every episode."""
+        ...
+
+    def seed(self, seed: int) -> None:
+        """Restarts the agent's own random stream."""
+        ...
+
+
+class ModelAgent:
+    """An agent with a world model: keeps a belief about each environment; subclasses choose actions from it.
+
+    The agent turns one frame (64, 64, 3) into one action (action,), or a batch of frames (batch, 64, 64, 3), one of
+    each environment, into (batch, action). The belief is a state of the world model at the posterior's mean. Where
+    `config.model.turns` is 4 the agent keeps one belief for each of the frame's four quarter turns.
 
     Attributes:
-        state: The belief, `deter` (batch, deter) and `stoch` (batch, latent); (batch, 4, ...) where it is of all turns.
-        imagined: The world model as planners see it, whose states are these beliefs.
-        last_source: Of the latest action, "plan", "tail" (of an older plan) or "actor"; a list where these can differ.
-        steps_ahead: Model steps from the belief to what `imagine` pictured last.
+        state: The belief, `deter` (batch, deter) and `stoch` (batch, latent), or (batch, 4, ...) with four turns; None
+            before the first frame.
+        imagined: The world model as planners use it; its states are beliefs of this agent.
+        last_source: Origin of the most recent action: "plan", "tail" (the rest of an older plan) or "actor"; a list
+            where the environments of a batch can differ.
+        steps_ahead: Model steps from the belief to the picture that `imagine` returned last.
 
     Args:
         model: The world model; put into evaluation mode and never changed.
-        config: Settings it was trained with.
+        config: Settings the model was trained with.
         noise_std: Standard deviation of Gaussian noise added to each action, for exploration.
-        noise_correlation: Of that noise between one decision and the next, in [0, 1).
-        seed: Of the agent's own random stream.
+        noise_correlation: Correlation of that noise between one decision and the next, in [0, 1).
+        seed: Seed of the agent's own random stream.
     """
 
     last_source: str | list[str] = "actor"
@@ -58,17 +81,20 @@ class ModelAgent:
         self.state: State | None = None
         self._action: Tensor | None = None
         self._forget: Tensor | None = None
-        self._weights = reflex.lay_out(model)
         self._turns = model.config.turns
         self.imagined: WorldModel | TurnedModel = model if self._turns == 1 else TurnedModel(model)
         self.seed(seed)
 
     def seed(self, seed: int) -> None:
-        """Restart the agent's random stream."""
+        """Restarts the agent's random stream."""
         self.generator.manual_seed(seed)
 
     def reset(self, mask: np.ndarray | None = None) -> None:
-        """Forget the past, everywhere or in the environments where mask (batch,) is true."""
+        """Forgets the past of all environments, or of those where mask (batch,) is true.
+
+        Raises:
+            ValueError: The mask has another length than the batch.
+        """
         if mask is None or self.state is None:
             self.state = self._action = self._forget = None
             self.noise.reset()
@@ -80,7 +106,13 @@ class ModelAgent:
 
     @torch.no_grad()
     def act(self, frame: np.ndarray) -> np.ndarray:
-        """The action in [-1, 1], float32 (action,) or (batch, action), for uint8 frame(s).
+        """The action for a new frame.
+
+        Args:
+            frame: uint8 (64, 64, 3), or (batch, 64, 64, 3) with one frame of each environment.
+
+        Returns:
+            The action in [-1, 1], float32 (action,) or (batch, action).
 
         Raises:
             ValueError: The frame has another shape or dtype, or the batch changed without a reset.
@@ -98,21 +130,21 @@ class ModelAgent:
 
     @torch.no_grad()
     def encode(self, frame: np.ndarray) -> np.ndarray:
-        """The latent of one frame seen without a past, float32 (32,), or (batch, 32) for several."""
+        """The latent of a frame without its past, float32 (32,), or (batch, 32) for several frames."""
         single = frame.ndim == 3
         latent = self._glance(self._check(frame[None] if single else frame)).cpu().numpy()
         return latent[0] if single else latent
 
     def imagine(self) -> np.ndarray | None:
-        """The picture an agent looks forward to, uint8 (32, 32, 3); None without a plan."""
+        """The decoded end of the first environment's plan, uint8 (32, 32, 3); None without a plan."""
         return None
 
     def _choose(self, state: State) -> Tensor:
-        raise AssertionError("an agent defines how it chooses")
+        raise AssertionError("a subclass of ModelAgent defines _choose")
 
     def _picture(self, state: State, actions: Tensor) -> np.ndarray:
         """The decoded end of a plan (batch, horizon, action), uint8 (32, 32, 3), of the first environment."""
-        first = State(*(part[:1] for part in unturned(state)))
+        first = State(*(part[:1] for part in first_turn(state)))
         self.steps_ahead = actions.shape[1]
         _, last = self.model.rollout(first, actions[:1].to(first.deter.dtype))
         return self.model.decoder.picture(last.features.float())[0].cpu().numpy()
@@ -134,24 +166,22 @@ class ModelAgent:
         return self._glance(turned(self._check(read_goal_image(path)[None]), self._turns))
 
     def _glance(self, frames: Tensor) -> Tensor:
-        """Latents (batch, latent) of frames seen without a past."""
+        """Latents (batch, latent) of frames without their past."""
         return self.model.see(self.model.dynamics.initial(len(frames)).deter, frames).stoch
 
     def _believe(self, frames: Tensor) -> State:
-        if self.state is None or self.model.device.type != "cpu":  # elsewhere the weights do not follow the model's
-            self._weights = reflex.lay_out(self.model)
         if self.state is not None and len(self.state.deter) != len(frames):
             raise ValueError(f"got {len(frames)} frames after {len(self.state.deter)}: call reset() between batches")
         frames, turns = turned(frames, self._turns), self._turns
         if self.state is None or self._action is None:
             return folded(self._see(self.model.dynamics.initial(len(frames)).deter, frames), turns)
-        deter = reflex.advance(self._weights, flat(self.state), per_turn(self._action, turns))
+        deter = self.model.backend.advance(self.model, flat(self.state), per_turn(self._action, turns))
         if self._forget is not None:
             deter = torch.where(per_turn(self._forget, turns)[:, None], 0.0, deter)
         return folded(self._see(deter, frames), turns)
 
     def _see(self, deter: Tensor, frames: Tensor) -> State:
-        return reflex.see(self._weights, deter, frames)
+        return self.model.backend.see(self.model, deter, frames)
 
     def _check(self, frames: np.ndarray) -> Tensor:
         if frames.dtype != np.uint8 or frames.shape[1:] != (64, 64, 3):

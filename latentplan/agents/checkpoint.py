@@ -1,4 +1,4 @@
-"""Checkpoints: a folder with weights, settings and metrics, checked when it is read."""
+"""Checkpoints: folders with the weights, settings and metrics of an agent, checked when they are read."""
 
 from __future__ import annotations
 
@@ -12,20 +12,15 @@ import torch
 from safetensors import SafetensorError
 from safetensors.torch import load_file, save
 
-from latentplan.agents.actor import ActorAgent
-from latentplan.agents.background import BackgroundAgent
-from latentplan.agents.gated import GatedAgent
-from latentplan.agents.planning import PlanningAgent
-from latentplan.agents.random import RandomAgent
+from latentplan.agents.base import Agent
+from latentplan.agents.modes import MODES, make_agent
 from latentplan.config import Config, PlannerConfig, UserError, from_dict, to_dict
 from latentplan.config.planner import override_planner
 from latentplan.models import WorldModel
+from latentplan.models.fast import accelerate
 
-Agent = PlanningAgent | ActorAgent | RandomAgent
 WEIGHTS = "weights.safetensors"
 INFO = "info.json"
-MODES = ("planner", "gated", "background", "actor", "random")
-OPTIONS = {"gated": ("planning_budget", "signal"), "background": ("worker", "max_age", "fresh_ticks", "make_executor")}
 KINDS = {
     "env_frames": int,
     "action_dim": int,
@@ -38,16 +33,16 @@ REQUIRED = ("domain", "task", "env_frames", "discount", "action_dim", "config", 
 
 
 def save_checkpoint(folder: Path, model: WorldModel, config: Config, info: dict[str, Any]) -> None:
-    """Write an agent: float16 weights and a description, each replaced whole.
+    """Writes a checkpoint: float16 weights and a description; each file is replaced whole.
 
     Args:
-        folder: Made when missing.
-        model: What to keep; optimizer state is not part of an agent.
+        folder: Folder of the checkpoint, made where it is missing.
+        model: The world model.
         config: Settings of the run.
-        info: Facts beside them: domain, task, discount, env_frames, metrics and the like.
+        info: Further facts for the description: domain, task, discount, env_frames, metrics and the like.
 
     Raises:
-        FloatingPointError: A weight is not finite, or beyond what float16 holds.
+        FloatingPointError: A weight is not finite in float16; the folder is left as it was.
     """
     folder.mkdir(parents=True, exist_ok=True)
     part = folder / f"{WEIGHTS}.part"
@@ -65,13 +60,13 @@ def save_checkpoint(folder: Path, model: WorldModel, config: Config, info: dict[
 
 
 def read_info(path: str | Path) -> dict[str, Any]:
-    """What a checkpoint says of itself: domain, task, env_frames, config, metrics and so on.
+    """The description of a checkpoint: domain, task, env_frames, config, metrics and so on.
 
     Args:
         path: A checkpoint, or a run folder (its best checkpoint, else its last).
 
     Raises:
-        UserError: There is no checkpoint at the path, or it is not one of this program's.
+        UserError: There is no checkpoint at the path, or another program wrote it.
     """
     folder = resolve_checkpoint(path)
     try:
@@ -88,10 +83,14 @@ def read_info(path: str | Path) -> dict[str, Any]:
 
 
 def load_model(path: str | Path, device: str = "cpu") -> tuple[WorldModel, Config, dict[str, Any]]:
-    """The world model of a checkpoint, its settings, and what it says of itself.
+    """The world model of a checkpoint, the settings of its run, and the description (see `read_info`).
+
+    Args:
+        path: A checkpoint, or a run folder.
+        device: `cpu` or `cuda`.
 
     Raises:
-        UserError: The checkpoint is missing, foreign or damaged, or the device cannot be used.
+        UserError: The checkpoint is missing or damaged, another program wrote it, or the device cannot be used.
     """
     info, folder = read_info(path), resolve_checkpoint(path)
     weights = folder / WEIGHTS
@@ -114,59 +113,59 @@ def load_model(path: str | Path, device: str = "cpu") -> tuple[WorldModel, Confi
     if broken := _not_finite(state):
         raise UserError(f"{weights} cannot be used: {broken} is not finite")
     try:
-        return model.to(device), config, info
+        return accelerate(model.to(device)), config, info
     except (AssertionError, RuntimeError) as error:
         raise UserError(f"device {device!r} cannot be used: {str(error).splitlines()[0]}") from None
 
 
-def load_agent(
-    path: str | Path, mode: str = "planner", device: str = "cpu", **settings: Any
-) -> Agent | BackgroundAgent:
+def load_agent(path: str | Path, mode: str = "planner", device: str = "cpu", **settings: Any) -> Agent:
     """A trained agent, ready to act.
 
     Args:
-        path: A checkpoint, or a run folder.
-        mode: `planner`, `actor`, `random`, `gated` (the actor, and the planner in doubt; see `GatedAgent`) or
-            `background` (acts at once and plans beside, see `BackgroundAgent`; close it in the end).
+        path: A checkpoint, or a run folder (its best checkpoint, else its last).
+        mode: `planner` (plans at every decision), `actor` (the learned policy alone), `gated` (the actor, and the
+            planner at doubtful decisions; see `GatedAgent`), `background` (acts at once and plans beside the control
+            loop; see `BackgroundAgent`, and close it in the end) or `random`; see `latentplan.agents.modes`.
         device: `cpu` or `cuda`.
-        **settings: Settings of the search that replace the trained ones, such as `horizon=10`; `planning_budget` and
-            `signal` of a gated agent; those of `BackgroundAgent` where it plans in the background.
+        **settings: For modes that plan, planner settings that replace the trained ones, such as `horizon=10`. Also the
+            mode's own options: `planning_budget` and `signal` of `gated`; `worker`, `max_age`, `fresh_ticks` and
+            `make_executor` of `background`.
+
+    Returns:
+        An `Agent`: `act(frame)` takes uint8 frames (64, 64, 3) or (batch, 64, 64, 3) and returns float32 actions in
+        [-1, 1], (action,) or (batch, action); call `reset()` before every episode.
 
     Raises:
         UserError: The checkpoint, the mode or a setting cannot be used.
     """
     if mode not in MODES:
         raise UserError(f"mode must be one of {', '.join(MODES)}, got {mode!r}")
-    if settings and mode in ("actor", "random"):
+    entry = MODES[mode]
+    options = {name: settings.pop(name) for name in entry.options if name in settings}
+    if settings and not entry.plans:
         raise UserError(f"{next(iter(settings))} has no effect in mode {mode}: it does not plan")
     model, config, info = load_model(path, device)
-    if mode == "random":
-        return RandomAgent(model.action_dim)
-    if mode == "actor":
-        return ActorAgent(model, config)
     known = to_dict(config.planner)
-    options = {name: settings.pop(name) for name in OPTIONS.get(mode, ()) if name in settings}
     for name in settings:
         if name not in known:
-            names = (*known, *OPTIONS.get(mode, ()))
+            names = (*known, *entry.options)
             raise UserError(f"unknown planner setting {name!r}{_suggestion(name, {key: key for key in names})}")
-    kind: Any = {"planner": PlanningAgent, "gated": GatedAgent, "background": BackgroundAgent}[mode]
     try:
-        agent: Agent | BackgroundAgent = kind(
-            model, config, info["discount"], planner=PlannerConfig(**override_planner(known, settings)), **options
-        )
+        planner = PlannerConfig(**override_planner(known, settings))
+        agent = make_agent(mode, model, config, info["discount"], planner=planner, **options)
     except (TypeError, ValueError) as error:
         raise UserError(f"planner settings: {error}") from None
-    if isinstance(agent, BackgroundAgent):
-        agent.wait_until_ready()  # so that the first episode is not one of the actor alone
+    wait_until_ready = getattr(agent, "wait_until_ready", None)
+    if wait_until_ready is not None:
+        wait_until_ready()  # else the actor alone would decide in the first episode
     return agent
 
 
 def resolve_checkpoint(path: str | Path) -> Path:
-    """The checkpoint folder that a path means: itself, or the best or last one of a run.
+    """The folder of the checkpoint at a path: the path itself, or the best or last checkpoint of a run folder.
 
     Raises:
-        UserError: There is none.
+        UserError: There is no checkpoint at the path.
     """
     root = Path(path)
     folder = _find(root)
@@ -179,12 +178,12 @@ def resolve_checkpoint(path: str | Path) -> Path:
 
 
 def _not_finite(state: dict[str, torch.Tensor]) -> str | None:
-    """The name of the first of these that holds NaN or infinity."""
+    """The name of the first tensor that holds NaN or infinity; None where all are finite."""
     return next((name for name, value in state.items() if not bool(torch.isfinite(value).all())), None)
 
 
 def _find(root: Path) -> Path | None:
-    """The root itself, or the best or last checkpoint of the run in it; None where there is none."""
+    """The root where it is a checkpoint, else the best or last checkpoint of the run in it; None without either."""
     for folder in (root, root / "checkpoints" / "best", root / "checkpoints" / "last"):
         if (folder / INFO).is_file() and (folder / WEIGHTS).is_file():
             return folder
@@ -192,7 +191,7 @@ def _find(root: Path) -> Path | None:
 
 
 def _suggestion(name: str, known: dict[str, str]) -> str:
-    """What to give in place of a name: the nearest of those known, else all of them."""
+    """The end of an error message about a name: the nearest known name, else all known names."""
     nearest = difflib.get_close_matches(name, known, n=1)
     if nearest:
         return f"; did you mean {known[nearest[0]]}?"

@@ -1,14 +1,14 @@
-"""The actor as a program of its own: a file that runs where torch does, without this package.
+"""The actor as a program of its own: a file that runs with torch alone, without this package.
 
-One call is one decision. Inputs and outputs are plain tensors, and everything the actor remembers passes through them:
+One call is one decision. Inputs and outputs are plain tensors, and the belief passes through them:
 
     action, deter, stoch = program(frame, deter, stoch, action, is_first)
 
-`frame` uint8 (batch, 64, 64, 3); `deter` float32 (batch, deter) and `stoch` float32 (batch, latent), the belief that
-the last call returned (that of all four quarter turns side by side, where the agent sees these); `action` float32
-(batch, action) in [-1, 1], what was executed since; `is_first` bool (batch,), true at the first frame of an episode,
-where the three before it are not read (zeros will do). The batch may have any size, and changes nothing about each
-row's result.
+`frame` is uint8 (batch, 64, 64, 3). `deter`, float32 (batch, deter), and `stoch`, float32 (batch, latent), are the
+belief that the last call returned; agents that see four quarter turns have the beliefs of all turns side by side.
+`action`, float32 (batch, action) in [-1, 1], is the action executed since. `is_first`, bool (batch,), is true at the
+first frame of an episode, where `deter`, `stoch` and `action` are not read and may be zeros. The batch may have any
+size, and the rows do not influence each other.
 """
 
 from __future__ import annotations
@@ -27,21 +27,21 @@ from torch.utils._pytree import tree_flatten, tree_unflatten
 from latentplan.agents.base import ModelAgent
 from latentplan.agents.checkpoint import load_model
 from latentplan.config import UserError, output_file
-from latentplan.models import State, WorldModel
-from latentplan.models.fast import reflex
+from latentplan.models import Rssm, State, WorldModel
+from latentplan.models.fast import one_frame
 from latentplan.models.symmetry import turned
 
 FORMATS = ("pt2", "onnx")
 SIZES = "actor.json"  # the part of a .pt2 file that names the sizes of its inputs
 INPUTS = ("frame", "deter", "stoch", "action", "is_first")
-OUTPUTS = ("new_action", "new_deter", "new_stoch")  # names that ONNX tells from the inputs'
+OUTPUTS = ("new_action", "new_deter", "new_stoch")  # ONNX needs names that differ from the inputs'
 EXAMPLE_ROWS = 2  # a batch of one would be built into the program
 
 
 class _Decision(nn.Module):
-    """Belief update and actor with weights of their own."""
+    """One decision: belief update and actor, with a copy of their weights."""
 
-    def __init__(self, weights: reflex.Reflex, turns: int) -> None:
+    def __init__(self, weights: one_frame.FrameWeights, turns: int) -> None:
         super().__init__()
         self._turns = turns
         tensors, self._layout = tree_flatten(weights)
@@ -56,21 +56,21 @@ class _Decision(nn.Module):
         turns, (rows, size) = self._turns, action.shape
         taken = action[:, None].expand(-1, turns, -1).reshape(rows * turns, size)
         last = State(*(part.reshape(rows * turns, part.shape[1] // turns) for part in (deter, stoch)))
-        advanced = reflex.advance(weights, last, taken).reshape(rows, deter.shape[1])
+        advanced = one_frame.advance(weights, last, taken).reshape(rows, deter.shape[1])
         begun = torch.where(is_first[:, None], 0.0, advanced).reshape(last.deter.shape)
-        state = reflex.see(weights, begun, turned(frame, turns))
-        modes, _ = reflex.act(weights, state)
+        state = one_frame.see(weights, begun, turned(frame, turns))
+        modes, _ = one_frame.act(weights, state)
         mean = modes.reshape(rows, turns, size).mean(1)
         deters, stochs = (part.reshape(rows, part.shape[1] * turns) for part in state)
         return mean, deters, stochs
 
 
 def export_actor(agent_or_checkpoint: ModelAgent | str | Path, path: str | Path, format: str = "pt2") -> Path:
-    """Write the actor as a program that needs neither this package nor a state beyond its inputs.
+    """Writes the actor as a program that needs neither this package nor memory beyond its inputs.
 
     Args:
         agent_or_checkpoint: An agent with a model, or the folder of a checkpoint or run.
-        path: The file to write; replaced whole.
+        path: The file to write; an existing file is replaced whole.
         format: `pt2` (`torch.export`) or `onnx`, which needs the packages onnx and onnxscript.
 
     Returns:
@@ -87,12 +87,16 @@ def export_actor(agent_or_checkpoint: ModelAgent | str | Path, path: str | Path,
     target = Path(path)
     other = next((name for name in FORMATS if name != format and target.suffix == f".{name}"), None)
     if other is not None:
-        raise UserError(f"{target} would hold a program in format {format}: give --format {other}, or another name")
+        raise UserError(f"{target} would hold a program in format {format}: give --format {other} or another file name")
     target = output_file(target, "the program's path")
     if isinstance(agent_or_checkpoint, ModelAgent):
         model = agent_or_checkpoint.model
     else:
         model, _, _ = load_model(agent_or_checkpoint)
+    if not isinstance(model.dynamics, Rssm):
+        raise UserError(
+            f"only agents with dynamics of the class Rssm can be exported, got {type(model.dynamics).__name__}"
+        )
     part = target.with_name(f".{target.name}.part")
     try:
         _write(_trace(model), model, part, format)
@@ -115,7 +119,7 @@ def sizes(model: WorldModel) -> dict[str, int]:
 
 
 def _trace(model: WorldModel) -> ExportedProgram:
-    decision = _Decision(reflex.lay_out(model), model.config.turns).eval()
+    decision = _Decision(one_frame.convert_weights(model), model.config.turns).eval()
     batch = Dim("batch", min=1)
     dynamic = {name: {0: batch} for name in INPUTS}
     with torch.no_grad():

@@ -1,4 +1,4 @@
-"""An agent that acts by its actor, and plans where that is unsure: the planner where it pays, within a budget."""
+"""The agent that acts by the actor, and plans at doubtful decisions within a budget."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ from latentplan.planning.conditioned import seen_for
 from latentplan.planning.objectives import Constraint, Term
 
 SIGNALS = ("mismatch", "value", "both", "random")
-GAP_STEPS = 2  # a step of imagination costs as much as seeing the frame
-GAIN = 0.1  # of the threshold per decision, in standard deviations of the signal
-HEAD_START = 1.0  # of the threshold over the normal quantile: ten plans are saved early for when many are due at once
+GAP_STEPS = 2  # one model step costs about as much as encoding the frame
+GAIN = 0.1  # change of the threshold per unit of excess planning, in standard deviations of the signal
+HEAD_START = 1.0  # initial threshold above the normal quantile: saves ten plans for times when many are due at once
 
 
 class GatedAgent(PlanningAgent):
@@ -30,48 +30,48 @@ class GatedAgent(PlanningAgent):
 
     The signals of a decision:
 
-        mismatch    KL(posterior || prior) of the latent at this frame: how far the world left the model's path;
-        value       |V(s) - (imagined return of two actor steps + discounted V)|: how far the critic contradicts what
-                    the model says of the actor;
-        both        the larger of the two;
-        random      standard normal noise: the baseline that plans as often, anywhere.
+        mismatch    KL(posterior || prior) of the latent at this frame: how far the frame is from the prediction;
+        value       |V(s) - (return of two imagined actor steps + discounted V)|: how far the value head contradicts
+                    the model's rollout of the actor;
+        both        the larger of mismatch and value;
+        random      standard normal noise: the baseline, which plans as often at random decisions.
 
-    Their logarithms, because both are skewed, are standardised by running mean and standard deviation. The threshold
-    follows the budget by `threshold += 0.1 * (planned - planning_budget)` after each decision, the first ones of
-    episodes included. After N decisions the share of planned ones therefore differs from the budget by exactly the way
-    of the threshold divided by 0.1 N, whatever the signal does (the argument of Gibbs and Candes 2021, "Adaptive
-    conformal inference", proposition 4.1). It starts one standard deviation above the normal quantile, so that the ten
-    plans which are made too few on its way down are there when many are due at once, and lives through resets:
-    calibration belongs to the agent, not to an episode.
+    Mismatch and value are skewed, so their logarithms are standardised by a running mean and standard deviation. After
+    each decision the threshold moves by `threshold += 0.1 * (planned - planning_budget)`; first decisions of episodes
+    count too. After N decisions the share of planned decisions therefore differs from the budget by exactly the total
+    change of the threshold divided by 0.1 N, whatever the signal does (Gibbs and Candes 2021, "Adaptive conformal
+    inference", proposition 4.1). The threshold starts one standard deviation above the normal quantile: while it falls
+    to the quantile ten plans are saved, which the agent spends when many are due at once. The threshold outlives
+    resets, because it is calibrated to the agent and not to an episode.
 
-    Doubt never takes the planned share of all decisions beyond the budget: where it would, the most doubtful
-    environments plan. What must be planned is planned all the same, and saved later: first decisions, what no plan is
-    left for, and where a signal is not a number.
+    Doubt never takes the planned share of all decisions beyond the budget: where it would, the environments with the
+    highest signal plan first. Three kinds of decisions are planned even beyond the budget, and later decisions save
+    them: first decisions, decisions without a plan left under another objective, and decisions whose signal is NaN.
 
-    While the actor acts the last plan ages: the next search starts from it shifted by the decisions in between, and
-    cold when it has run out. An actor knows nothing of an objective or a constraint that was set since: then the last
-    plan goes on where none is made, and where it has run out one is made. In doubt is then what the plan did not
-    foresee: the signal (but for `random`) is the sum of the mismatches since it was made, which grows until the next
-    search, the faster the less the world goes as imagined. A goal that the model has learned to pursue (`conditioned`)
-    has an actor and a value of its own, which then stand for those of the task. Environments of a batch are gated one
-    by one, and share the threshold.
+    While the actor acts the last plan ages: the next search starts from the plan shifted by the decisions in between,
+    and starts cold once the plan has run out. The actor was trained on the task's reward. Under another objective or a
+    constraint the agent therefore executes the rest of the last plan instead of the actor's action, and plans anew when
+    that has run out. The signal (but for `random`) is then the sum of the mismatches since the plan was made, which
+    grows until the next search, and faster where the world differs more from the rollout. A goal that the model
+    learned to pursue (`conditioned`) has an actor and a value head of its own; these replace the task's. Environments
+    of a batch are gated one by one, and share the threshold.
 
     Attributes:
-        last_source: "plan", "tail" (of an older plan) or "actor", of the most recent decision; a list of these for
-            several frames.
-        planned_fraction: Share of decisions so far at which a search was asked for, in time or not; 0 before the first.
+        last_source: Origin of the most recent action: "plan", "tail" (the rest of an older plan) or "actor"; a list of
+            these for a batch of frames.
+        planned_fraction: Share of decisions so far at which a search was requested; 0 before the first decision.
 
     Args:
         model: The world model.
-        config: Settings it was trained with.
-        discount: Per decision, as learned.
-        planning_budget: Share of decisions to plan, in [0, 1]; 1 plans always, 0 only where an episode begins.
+        config: Settings the model was trained with.
+        discount: Discount per decision, as learned.
+        planning_budget: Share of decisions to plan, in [0, 1]: 1 plans every decision, 0 only first decisions.
         signal: `mismatch`, `value`, `both` or `random`.
         planner: Settings of the search; None takes those of `config`.
-        seed: Of the agent's own random stream.
+        seed: Seed of the agent's own random stream.
 
     Raises:
-        ValueError: The budget or the signal is not one of those.
+        ValueError: The budget lies outside [0, 1], or the signal is unknown.
     """
 
     def __init__(
@@ -95,7 +95,7 @@ class GatedAgent(PlanningAgent):
         self.threshold = HEAD_START + _normal_threshold(planning_budget, len(self._names))
         self._scales = {name: RunningScale() for name in (*self._names, "drift")}
         self._num_planned = self._num_decisions = 0
-        self._acting: Any = self.imagined  # or, of a learned goal, what shows its actor and value
+        self._acting: Any = self.imagined  # for a learned goal, the model with the actor and value of that goal
         self._mismatch: Tensor | None = None
         self._drift: Tensor | None = None
         self._is_first: Tensor | None = None
@@ -109,12 +109,12 @@ class GatedAgent(PlanningAgent):
 
     @property
     def planned_fraction(self) -> float:
-        """Share of decisions so far at which a search was asked for, in time or not; 0 before the first."""
+        """Share of decisions so far at which a search was requested; 0 before the first decision."""
         return self._num_planned / self._num_decisions if self._num_decisions else 0.0
 
     @torch.no_grad()
     def imagine(self) -> np.ndarray | None:
-        """The picture that the present plan leads to, uint8 (32, 32, 3), of the first environment; None without one."""
+        """The decoded end of the first environment's new plan, uint8 (32, 32, 3); None where none was made."""
         source = self.last_source if isinstance(self.last_source, str) else self.last_source[0]
         return super().imagine() if source == "plan" else None
 
@@ -169,7 +169,7 @@ class GatedAgent(PlanningAgent):
 
     @property
     def _is_foreign(self) -> bool:
-        """Whether something is pursued that no actor knows of."""
+        """Whether an objective or a constraint is set that no actor was trained for."""
         is_unknown = self.controller.objective is not None and self._acting is self.imagined
         return is_unknown or bool(self.controller.constraints)
 
@@ -177,9 +177,9 @@ class GatedAgent(PlanningAgent):
         """Whether the signal exceeds the threshold and the budget allows for a plan, (batch,) bool on the CPU.
 
         Args:
-            state: Where each environment is.
-            action: What is done without a plan, (batch, action).
-            is_due: Where a plan is made anyway, (batch,) bool: nothing is learned of the signal there.
+            state: The belief about each environment.
+            action: The action that is executed without a new plan, (batch, action).
+            is_due: Environments that plan anyway, (batch,) bool: their signals do not enter the running statistics.
         """
         scores = [
             self._scales[name].standardise(values.cpu(), ~is_due)
@@ -205,7 +205,7 @@ class GatedAgent(PlanningAgent):
         return signals
 
     def _value_gap(self, state: State, action: Tensor) -> Tensor:
-        """What the critic says of a state, against what the model says of the actor's way from there: (batch,)."""
+        """Difference between a state's value and the return of the actor's imagined steps from it, (batch,)."""
         with self.model.trunk_precision():
             gap, weight = -self._acting.value(state), 1.0
             for step in range(GAP_STEPS):
@@ -227,22 +227,27 @@ class GatedAgent(PlanningAgent):
 
 
 class RunningScale:
-    """Mean and standard deviation of what was seen so far (Welford 1962), to standardise what comes next."""
+    """Standardises values by the running mean and standard deviation of earlier values (Welford 1962).
+
+    Attributes:
+        num: Number of values so far.
+        mean: Mean of the values so far.
+    """
 
     def __init__(self) -> None:
         self.num, self.mean, self._squares = 0, 0.0, 0.0
 
     @property
     def std(self) -> float:
-        """Standard deviation so far; 0 before there are two different values."""
+        """Standard deviation of the values so far; 0 before there are two different values."""
         return math.sqrt(self._squares / self.num) if self.num else 0.0
 
     def standardise(self, values: Tensor, counts: Tensor) -> Tensor:
-        """Values (batch,) in standard deviations from the mean, 0 while there is no deviation; then they are learned.
+        """Values (batch,) in standard deviations from the mean, 0 while the deviation is 0; then updates both.
 
         Args:
-            values: NaN and infinity stay what they are, and are not learned.
-            counts: Which of them are learned, (batch,) bool.
+            values: NaN and infinity come back as they are, and do not enter the statistics.
+            counts: Values that enter the statistics, (batch,) bool.
         """
         scores = values - self.mean if self.num else values * 0.0
         scores = scores / self.std if self.std > 0.0 else scores * 0.0
@@ -255,7 +260,7 @@ class RunningScale:
 
 
 def _normal_threshold(budget: float, num_signals: int) -> float:
-    """What the largest of so many independent standard normal numbers exceeds with the budget's probability."""
+    """The level that the largest of `num_signals` standard normal numbers exceeds with probability `budget`."""
     if budget in (0.0, 1.0):
         return math.inf if budget == 0.0 else -math.inf
     return NormalDist().inv_cdf((1.0 - budget) ** (1.0 / num_signals))

@@ -1,4 +1,4 @@
-"""Exploration noise that pushes for longer than one decision."""
+"""Exploration noise that is correlated in time."""
 
 from __future__ import annotations
 
@@ -7,12 +7,15 @@ from torch import Tensor
 
 
 class CorrelatedNoise:
-    """Standard normal noise, correlated with that of the decision before (an AR(1) process).
+    """Standard normal noise, correlated with the noise of the previous decision (an AR(1) process).
 
-    White noise hardly moves a heavy body: what it pushes now it takes back at the next decision.
+    White noise hardly moves a heavy body, because pushes of successive decisions cancel each other.
+
+    Attributes:
+        last: The latest noise, (batch, action); None before the first.
 
     Args:
-        correlation: Between one decision and the next, in [0, 1).
+        correlation: Correlation between one decision and the next, in [0, 1).
     """
 
     def __init__(self, correlation: float) -> None:
@@ -23,9 +26,10 @@ class CorrelatedNoise:
         """The next noise, of the shape of an action (batch, action).
 
         Args:
-            like: An action.
-            generator: Where it is drawn from.
-            is_new: Where an episode begins, so that nothing came before, (batch,) bool; None is nowhere.
+            like: An action, (batch, action), for shape and device.
+            generator: Random stream of the noise.
+            is_new: Environments whose episode begins, (batch,) bool: their noise is independent of the past. None
+                stands for no environment.
         """
         fresh, kept = torch.randn(like.shape, generator=generator, device=like.device), self.correlation
         noise = fresh
@@ -36,5 +40,5 @@ class CorrelatedNoise:
         return noise
 
     def reset(self) -> None:
-        """Nothing came before, anywhere."""
+        """Forgets the latest noise of all environments."""
         self.last = None

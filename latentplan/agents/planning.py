@@ -1,4 +1,4 @@
-"""An agent that decides by planning in the latent at every frame."""
+"""The agent that plans in the latent at every decision."""
 
 from __future__ import annotations
 
@@ -17,22 +17,22 @@ from latentplan.planning.objectives import Constraint, Term
 
 
 class PlanningAgent(ModelAgent):
-    """Decides by CEM-MPC in the latent, and executes only the first action of each plan.
+    """Plans by CEM-MPC in the latent at every decision, and executes only the first action of each plan.
 
-    With `planner.surprise_limit` the actor decides where the newest frame surprised the model: what it imagines from
-    there is to be trusted less than what it learned there.
+    With `planner.surprise_limit` the actor replaces the plan where the newest frame differs from the model's prediction
+    by more than the limit: rollouts from such a state are less reliable than the actor.
 
     Attributes:
-        was_surprised: Whether that is why the latest action was the actor's, in the first environment.
+        was_surprised: Whether the actor replaced the first environment's latest plan for that reason.
 
     Args:
         model: The world model.
-        config: Settings it was trained with.
-        discount: Per decision, as learned.
+        config: Settings the model was trained with.
+        discount: Discount per decision, as learned.
         planner: Settings of the search; None takes those of `config`.
-        noise_std: Of exploration noise.
-        noise_correlation: Of exploration noise, between decisions.
-        seed: Of the agent's own random stream.
+        noise_std: Standard deviation of exploration noise.
+        noise_correlation: Correlation of exploration noise between one decision and the next, in [0, 1).
+        seed: Seed of the agent's own random stream.
     """
 
     def __init__(
@@ -53,42 +53,33 @@ class PlanningAgent(ModelAgent):
         self.controller = ModelPredictiveController(search, self.imagined, generator=self.generator)
 
     def reset(self, mask: np.ndarray | None = None) -> None:
-        """Forget the past and the last plan, everywhere or where mask (batch,) is true."""
+        """Forgets the past and the last plan of all environments, or of those where mask (batch,) is true."""
         super().reset(mask)
         self.controller.reset(None if self.state is None else self._forget)
 
     def set_objective(
         self, objective: str | Expression | Term | None = None, constraints: str | Sequence[Constraint] = ()
     ) -> None:
-        """Changes what is planned for, from the next action on; the last plan stays where the search starts.
+        """Sets the objective and the constraints of all plans from the next decision on.
+
+        The next search still starts from the last plan.
 
         Args:
             objective: An expression such as `"speed -> 2.0 and height > 1.1"`, or a term of
-                `latentplan.planning.objectives`; None is what the agent was trained for.
+                `latentplan.planning.objectives`; None is the reward that the agent was trained on.
             constraints: Inequalities such as `"cart < 0.5"`, separated by `;`, or functions of imagined rollouts.
 
         Raises:
-            UserError: The text is no expression, or is about what this agent does not predict.
+            UserError: The text is no expression, or names a quantity that the agent does not predict.
         """
         self.controller.set_objective(*self._plan_goals(objective, constraints, self.controller.planner))
 
     @torch.no_grad()
     def imagine(self) -> np.ndarray | None:
-        """The decoded last state of the plan that is followed, uint8 (32, 32, 3), of the first environment."""
+        """The decoded end of the first environment's plan, uint8 (32, 32, 3); None where the actor acted."""
         if self.controller.plan is None or self.state is None or self.was_surprised:
             return None
         return self._picture(self.state, self.controller.plan.actions)
-
-    def planned_action(self) -> np.ndarray | None:
-        """Mean and std of the last plan's first action side by side, float32 (batch, 2 action); None without a plan.
-
-        Zeros where the search found nothing finite.
-        """
-        plan = self.controller.plan
-        if plan is None:
-            return None
-        planned = torch.cat(plan.action_distribution(self.controller.planner.min_std), -1)
-        return planned.masked_fill(plan.info["is_fallback"][:, None], 0.0).float().cpu().numpy()
 
     def _choose(self, state: State) -> Tensor:
         with self.model.trunk_precision():

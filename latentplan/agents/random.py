@@ -1,12 +1,23 @@
-"""An agent that acts by chance: what every other is compared with."""
+"""An agent that acts at random: the baseline for every other agent."""
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
+
+if TYPE_CHECKING:
+    from latentplan.config import Config
+    from latentplan.models import WorldModel
 
 
 class RandomAgent:
-    """Uniform actions in [-1, 1]."""
+    """Draws every action uniformly from [-1, 1].
+
+    Args:
+        num_actions: Size of an action.
+        seed: Seed of the agent's own random stream.
+    """
 
     last_source = "actor"
 
@@ -19,12 +30,17 @@ class RandomAgent:
         self._rng = np.random.default_rng(seed)
 
     def reset(self, mask: np.ndarray | None = None) -> None:
-        """Nothing to forget."""
+        """Does nothing: the agent has no memory."""
 
     def imagine(self) -> None:
-        """There is no plan to picture."""
+        """None: there is no plan to picture."""
 
     def act(self, frame: np.ndarray) -> np.ndarray:
         """A random action, float32 (action,), or (batch, action) for several frames."""
         shape = (self.num_actions,) if frame.ndim == 3 else (len(frame), self.num_actions)
         return self._rng.uniform(-1.0, 1.0, shape).astype(np.float32)
+
+
+def random_agent(model: WorldModel, config: Config) -> RandomAgent:
+    """A random agent for the bodies that a world model was trained on; see `AgentMode.maker`."""
+    return RandomAgent(model.action_dim)

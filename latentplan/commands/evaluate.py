@@ -25,11 +25,7 @@ if TYPE_CHECKING:
     from latentplan.envs.suite import SuiteEnv
     from latentplan.evaluation.clock import VirtualClock
     from latentplan.evaluation.goals import Goals, ScoredEnv
-    from latentplan.evaluation.timed import TimedEpisode
-
-PLANNING_MODES = ("planner", "gated", "background")  # modes that pursue an objective; the others are only scored on it
-MODES = (*PLANNING_MODES, "actor", "random")
-ON_ONE_THREAD = ("actor", "background")  # a single frame is too little work for several threads
+    from latentplan.evaluation.statistics import Episode
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -55,7 +51,7 @@ class Request(ComputeRequest):
 
     checkpoint: Path = option(metavar="DIR")
     episodes: int = 10
-    mode: str = option("planner", choices=lambda: MODES)
+    mode: str = option("planner", choices=lambda: list_modes())
     objective: str | None = None
     constraint: str | None = option(None, join="; ")
     planning_budget: float | None = None
@@ -69,9 +65,9 @@ class Request(ComputeRequest):
     def __post_init__(self) -> None:
         super().__post_init__()
         at_least(self, episodes=1, seed=0)
-        one_of(self, mode=MODES)
+        one_of(self, mode=list_modes())
         above_zero(self, "control_hz")
-        if self.planner and self.mode not in PLANNING_MODES:
+        if self.planner and self.mode not in planning_modes():
             raise UserError(
                 f"--planner.{next(iter(self.planner))} has no effect in mode {self.mode}; use --mode planner"
             )
@@ -85,6 +81,20 @@ class Request(ComputeRequest):
             from latentplan.reporting.video import check_video_path
 
             check_video_path(self.video)
+
+
+def list_modes() -> tuple[str, ...]:
+    """The names of the modes that an agent can act in."""
+    from latentplan.agents.modes import MODES
+
+    return tuple(MODES)
+
+
+def planning_modes() -> tuple[str, ...]:
+    """The names of the modes that pursue an objective; the other modes are only scored on it."""
+    from latentplan.agents.modes import planning_modes
+
+    return planning_modes()
 
 
 def resolve(request: Request) -> dict[str, Any]:
@@ -105,6 +115,7 @@ def run(request: Request) -> int:
 
     latency = read_latency(request.latency or MEASURED)
     from latentplan.agents.checkpoint import read_info
+    from latentplan.agents.modes import MODES
     from latentplan.evaluation.clock import VirtualClock
     from latentplan.evaluation.timed import load_timed_agent
 
@@ -114,7 +125,7 @@ def run(request: Request) -> int:
     changes = {name: getattr(planner, name) for name in request.planner}
     if request.planning_budget is not None:
         changes["planning_budget"] = request.planning_budget
-    device = request.use_device(threads=1 if request.mode in ON_ONE_THREAD else None)
+    device = request.use_device(threads=1 if MODES[request.mode].one_thread else None)
     from latentplan.envs import make_env
     from latentplan.evaluation.goals import goal_env, read_goals, score_env
 
@@ -129,7 +140,7 @@ def run(request: Request) -> int:
             f"{about['domain']}-{about['task']}, {request.mode} on {device}, pictures by {about['renderer']}",
             flush=True,
         )
-        played = env if goals is None else score_env(env, goals, agent if request.mode in PLANNING_MODES else None)
+        played = env if goals is None else score_env(env, goals, agent if request.mode in planning_modes() else None)
         try:
             return _play_and_report(request, played, agent, about, clock)
         except OSError as error:
@@ -152,14 +163,14 @@ def _play_and_report(
 
     scored = env if isinstance(env, ScoredEnv) else None
     seeds = [episode_seed(request.seed, index) for index in range(request.episodes)]
-    episodes: list[TimedEpisode] = []
+    episodes: list[Episode] = []
     interrupted = False
     with contextlib.ExitStack() as stack:
         on_step = None
         if request.video is not None:
             from latentplan.reporting.film import filming
 
-            planner = agent if request.mode in PLANNING_MODES else None
+            planner = agent if request.mode in planning_modes() else None
             on_step = stack.enter_context(filming(request.video, env, planner, goals=scored))
         try:
             for episode in iterate_timed_episodes(env, agent, seeds, clock, on_step=on_step):
@@ -194,7 +205,7 @@ def _describe(
         "floor": env.floor,
         "renderer": render_info()["renderer"],
     }
-    if request.mode not in PLANNING_MODES:
+    if request.mode not in planning_modes():
         return described
     is_own = goals is None or (any(phase.objective.is_return for phase in goals.phases) and not goals.constraints)
     if request.mode != "planner" or not is_own:

@@ -18,28 +18,27 @@ from latentplan.config.checks import UserError
 from latentplan.config.parsing import Setting, list_settings, raise_unknown, read_values
 from latentplan.config.removed import drop_removed
 from latentplan.config.settings import Config
+from latentplan.config.suites import DEFAULT_SUITE, SUITES, find_suite
 
 Layer = dict[str, dict[str, Any]]
 
 SECTIONS: dict[str, Any] = {field.name: field.default_factory for field in dataclasses.fields(Config)}
 Preset = Literal["auto", "cpu", "gpu"]
-DOMAINS = (
-    *("acrobot", "ball_in_cup", "cartpole", "cheetah", "dog", "finger", "fish", "hopper", "humanoid", "humanoid_CMU"),
-    *("lqr", "manipulator", "pendulum", "point_mass", "quadruped", "reacher", "stacker", "swimmer", "walker"),
-)
+DOMAINS = tuple(SUITES[DEFAULT_SUITE].tasks)
 
 
 def compose(config_file: Layer, flags: Layer, preset: str = "auto") -> Config:
     """Lay defaults, domain, task, preset, the user's file and the flags over one another.
 
     Raises:
-        UserError: The domain is unknown or a value is not allowed.
+        UserError: The suite or the domain is unknown or a value is not allowed.
     """
     default = read_layer(config_folder() / "default.yaml")
     chosen = _overlay(default, config_file, flags)
     domain = chosen["env"]["domain"]
-    if domain not in DOMAINS:
-        raise_unknown("domain", domain, DOMAINS)
+    domains = tuple(find_suite(str(chosen["env"].get("suite", DEFAULT_SUITE))).tasks)
+    if domain not in domains:
+        raise_unknown("domain", domain, domains)
     domain_layer = _read_optional(domain)
     task = chosen["env"].get("task") or domain_layer.get("env", {}).get("task")
     if preset == "auto":

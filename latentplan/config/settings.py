@@ -29,6 +29,7 @@ class EnvConfig:
     """The environment: the body, its task and its camera.
 
     Attributes:
+        suite: Suite that the domain belongs to, see `latentplan/config/suites.py`.
         domain: Domain of `dm_control.suite`.
         task: Task of the domain; None takes the usual task of the domain.
         action_repeat: Simulator control steps per decision.
@@ -40,6 +41,7 @@ class EnvConfig:
         num_envs: Environments that collect at the same time; if there are several, each runs in its own process.
         objective: Expression over the body's quantities that replaces the task's reward at every control step, such as
             `speed -> 2.0 and height > 1.1`; None keeps the task's reward.
+        suite: Suite that the domain belongs to, see `latentplan/config/suites.py`.
     """
 
     domain: str = "walker"
@@ -50,6 +52,7 @@ class EnvConfig:
     floor: Floor = "suite"
     num_envs: int = 1
     objective: str | None = None
+    suite: str = "dm_control"
 
     def __post_init__(self) -> None:
         at_least(self, action_repeat=1, num_envs=1, camera=-1)

@@ -1,7 +1,7 @@
-"""Which OpenGL renders: chosen before MuJoCo is imported, named once a context exists.
+"""The OpenGL backend that renders: chosen before MuJoCo is imported, and known by name once a context exists.
 
-MuJoCo and dm_control read `MUJOCO_GL` when they are imported, and without it they pick a windowed
-backend that dies at the first frame on a headless machine. So this module imports neither at the top.
+MuJoCo and dm_control read `MUJOCO_GL` when they are imported. Without the variable they choose a windowed backend,
+which fails at the first frame on a machine without a display. So this module does not import either at the top.
 """
 
 from __future__ import annotations
@@ -30,15 +30,15 @@ _PROBE = (
 
 
 def choose_backend() -> str | None:
-    """Set `MUJOCO_GL` for this process and its children, unless the user did; also how Mesa and dm_control thread.
+    """Sets `MUJOCO_GL` for this process and its children, unless it is set; also limits the renderers' threads.
 
-    Hardware EGL comes first, then OSMesa, then EGL in software. Nothing is probed when `MUJOCO_GL` is
-    set, so child processes inherit the choice for free.
+    Hardware EGL comes first, then OSMesa, then EGL in software. Nothing is probed when `MUJOCO_GL` is set, so child
+    processes inherit the choice at no cost.
 
     Returns:
         The backend that MuJoCo will use, or None where no OpenGL library was found.
     """
-    # dm_control's rendering thread prints errors at exit; one environment needs no thread of its own.
+    # dm_control's rendering thread prints errors at exit, and one environment gains nothing from it.
     os.environ.setdefault("DISABLE_RENDER_THREAD_OFFLOADING", "1")
     # Small frames gain nothing from Mesa's worker threads, and learning needs the cores.
     os.environ.setdefault("LP_NUM_THREADS", "0")
@@ -62,10 +62,10 @@ def require_backend() -> str:
 
 @contextmanager
 def explain_gl_errors() -> Iterator[None]:
-    """Turn what OpenGL libraries raise when a context cannot be made into one line with the remedy.
+    """Turns any error of an OpenGL library into a `UserError` of one line with the remedy.
 
     Raises:
-        UserError: The body raised while importing a backend or making a context.
+        UserError: The body of the `with` block raised while it imported a backend or made a context.
     """
     try:
         yield
@@ -79,11 +79,11 @@ def explain_gl_errors() -> Iterator[None]:
 
 @functools.cache
 def render_info() -> dict[str, str | bool]:
-    """What renders the frames.
+    """Facts about the renderer of the frames.
 
     Returns:
-        `backend` (MUJOCO_GL), `renderer` (OpenGL's own name for itself), `hardware` (whether that is a
-        graphics processor) and `mujoco` (its version: pictures differ between versions).
+        `backend` (the value of MUJOCO_GL), `renderer` (the name that OpenGL reports), `hardware` (whether the renderer
+        is a graphics processor) and `mujoco` (the version of MuJoCo: frames differ between versions).
 
     Raises:
         UserError: No OpenGL context can be made.
@@ -107,7 +107,7 @@ def render_info() -> dict[str, str | bool]:
 
 
 def is_hardware(renderer: str) -> bool:
-    """Whether an OpenGL renderer's name is that of a graphics processor."""
+    """Whether the name of an OpenGL renderer belongs to a graphics processor."""
     return bool(renderer) and not any(name in renderer.lower() for name in _SOFTWARE_RENDERERS)
 
 
@@ -127,7 +127,7 @@ def _has_graphics_device() -> bool:
 
 
 def _probe_egl() -> str:
-    """EGL's renderer as a child process sees it, empty where it fails: a bad driver may crash the prober."""
+    """The name of EGL's renderer, empty where EGL fails; asked in a child process, which a bad driver may crash."""
     environment = {**os.environ, "MUJOCO_GL": "egl", "PYOPENGL_PLATFORM": "egl"}
     try:
         probe = subprocess.run(

@@ -1,4 +1,4 @@
-"""Square frames of a simulated body, from one scene and one OpenGL context that are made once."""
+"""Square frames of a simulated body; scene and OpenGL context are made once and reused."""
 
 from __future__ import annotations
 
@@ -20,17 +20,17 @@ _QUALITY_SETTINGS: dict[str, dict[str, int]] = {
 
 
 class FrameRenderer:
-    """Renders the present state of a body, as `Physics.render` would but without its set-up per frame.
+    """Renders the present state of a body as `Physics.render` does, without its preparations for every frame.
 
-    Shadow map, anti-aliasing and buffer size are fixed when the context is made. The buffer is as small
-    as the frame: that leaves the picture as it is and saves clearing the rest.
+    Shadow map, anti-aliasing and buffer size are fixed when the context is made. The buffer is as small as the frame:
+    the picture is the same, and no larger buffer has to be cleared.
     """
 
     def __init__(self, physics: Physics, size: int, camera: int, quality: str) -> None:
-        """Make the OpenGL context and the scene.
+        """Makes the OpenGL context and the scene.
 
         Args:
-            physics: The body to look at.
+            physics: The body to render.
             size: Height and width of the frames, in pixels.
             camera: Camera id of the MuJoCo model; -1 is the free camera.
             quality: `exact`, `fast` or `fastest`.
@@ -62,7 +62,7 @@ class FrameRenderer:
             self._scene.flags[mujoco.mjtRndFlag.mjRND_REFLECTION] = False
 
     def render(self) -> np.ndarray:
-        """The present state, a fresh uint8 array (size, size, 3)."""
+        """A frame of the present state, a new uint8 array (size, size, 3)."""
         import mujoco
 
         model, data = self._physics.model.ptr, self._physics.data.ptr
@@ -73,7 +73,7 @@ class FrameRenderer:
         return self._pixels[::-1].copy()  # OpenGL's rows run upwards
 
     def refresh_terrain(self) -> None:
-        """Draw the ground as it is now; for tasks that change it between episodes."""
+        """Sends the present terrain to the renderer; for tasks that change the terrain between episodes."""
         import mujoco
 
         with self._gl.make_current() as gl:
@@ -81,7 +81,7 @@ class FrameRenderer:
                 gl.call(mujoco.mjr_uploadHField, self._physics.model.ptr, self._context.ptr, heightfield)
 
     def close(self) -> None:
-        """Free the context; call it before `Physics.free`."""
+        """Frees the context; has to be called before `Physics.free`."""
         self._context.free()
 
     def _draw(self) -> None:
@@ -92,10 +92,10 @@ class FrameRenderer:
 
 
 def draw_floor_behind(physics: Physics) -> None:
-    """Move every floor that begins just behind the start so far back that its middle lies where it began.
+    """Moves every floor that begins just behind the start back by half its length.
 
-    A plane's size is for drawing only: bodies meet it everywhere. Moved by half its length, its pattern and its light
-    fall on the same places as before; half of what was drawn ahead is left, 48 m and more.
+    The size of a plane is for drawing only: bodies touch it everywhere. After a move by half its length the pattern and
+    the light of the floor fall on the same places as before. Half of the floor ahead stays drawn, 48 m and more.
     """
     import mujoco
 
@@ -107,7 +107,7 @@ def draw_floor_behind(physics: Physics) -> None:
 
 
 def _make_context(physics: Physics, gl: object, size: int, quality: str) -> Any:
-    """MuJoCo's drawing context; it reads its settings from the model, which is left as it was."""
+    """MuJoCo's drawing context, which reads its settings from the model; the model is restored afterwards."""
     from dm_control.mujoco import wrapper
 
     visual = physics.model.vis

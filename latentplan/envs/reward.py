@@ -1,20 +1,21 @@
-"""Rewards that the user writes down, in place of a task's own."""
+"""Rewards that the user writes as an expression, in place of the task's reward."""
 
 from __future__ import annotations
 
 import numpy as np
 
-from latentplan.envs.true_quantities import clause_degree, scales
+from latentplan.config.quantities import scales
+from latentplan.envs.true_quantities import clause_degree
 from latentplan.objectives.expression import evaluate
 from latentplan.objectives.parser import parse_reward
 
 
 class ObjectiveReward:
-    """What an expression over a body's quantities pays in one control step.
+    """The reward of one control step by an expression over a body's quantities.
 
     Args:
-        text: In the language of test-time objectives, without `return`, goal images and changes of mind.
-        domain: Domain of `dm_control.suite`, whose quantities it names.
+        text: An expression in the language of test-time objectives, without `return`, goal images and later phases.
+        domain: Domain whose quantities the expression names.
 
     Raises:
         UserError: The text is no such expression.
@@ -25,6 +26,6 @@ class ObjectiveReward:
         self._names = tuple(scales(domain))
 
     def __call__(self, values: np.ndarray) -> float:
-        """The reward where the quantities have these true values, (quantity,)."""
+        """The reward for the true values of the domain's quantities, (quantity,)."""
         lookup = dict(zip(self._names, values, strict=True)).__getitem__
         return float(sum(weight * evaluate(term, lookup, clause_degree) for weight, term in self._expression.terms))

@@ -1,4 +1,4 @@
-"""Actions that change hands in the middle of a control step, at the resolution of the simulator's substeps."""
+"""Actions that change within a control step, at the resolution of the simulator's substeps."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ import numpy as np
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
-Schedule = list[tuple[np.ndarray, int]]  # what acts, (action,), and for how many substeps, in order
+Schedule = list[tuple[np.ndarray, int]]  # actions (action,) and their numbers of substeps, in order
 
 
 def split_schedule(schedule: Sequence[tuple[np.ndarray, int]], num_substeps: int) -> Iterator[Schedule]:
-    """Cuts a schedule into control steps of `num_substeps` each; what does not fill one is left out."""
+    """The parts of a schedule, one for each control step of `num_substeps`; an incomplete last part is left out."""
     part: Schedule = []
     room = num_substeps
     for control, remaining in schedule:
@@ -27,14 +27,14 @@ def split_schedule(schedule: Sequence[tuple[np.ndarray, int]], num_substeps: int
 
 
 def control_step(task_env: Any, schedule: Schedule) -> Any:
-    """One control step of a `dm_control` environment under several controls in turn.
+    """One control step of a `dm_control` environment during which several controls act in turn.
 
-    The task sees a single control step, which ends with the last control: it is rewarded and may end the episode
-    once. A schedule of one entry is exactly `task_env.step`.
+    The task sees a single control step with the last control: after that it gives one reward, and may end the episode.
+    A schedule of one entry gives exactly the result of `task_env.step`.
 
     Args:
         task_env: A `dm_control.rl.control.Environment`.
-        schedule: Controls in the actuators' range and their substeps, which together make up one control step.
+        schedule: Controls in the actuators' range and their substeps; the substeps add up to one control step.
 
     Returns:
         The `dm_env.TimeStep`.

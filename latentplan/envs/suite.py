@@ -1,8 +1,7 @@
-"""Any task of `dm_control.suite` as a gymnasium environment seen through a camera."""
+"""The suite `dm_control`: every task of `dm_control.suite` as a gymnasium environment of camera frames."""
 
 from __future__ import annotations
 
-import difflib
 import logging
 import math
 from contextlib import contextmanager
@@ -13,84 +12,55 @@ import numpy as np
 from gymnasium.error import ResetNeeded
 
 from latentplan.config import EnvConfig, UserError
+from latentplan.config.quantities import scales
 from latentplan.envs.gl import explain_gl_errors, require_backend
+from latentplan.envs.registry import default_task, unknown_name
 from latentplan.envs.render import FrameRenderer, draw_floor_behind
 from latentplan.envs.reward import ObjectiveReward
 from latentplan.envs.substeps import control_step, split_schedule
-from latentplan.envs.true_quantities import measure, scales, true_values
+from latentplan.envs.true_quantities import measure, true_values
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator, Sequence
+    from collections.abc import Iterator, Sequence
 
     from dm_control.mujoco import Physics
 
 FRAME_SIZE = 64
 _UNLIMITED_EPISODE_STEPS = 1000
-_DEFAULT_TASKS = {
-    "acrobot": "swingup",
-    "ball_in_cup": "catch",
-    "cartpole": "swingup",
-    "cheetah": "run",
-    "dog": "walk",
-    "finger": "spin",
-    "fish": "swim",
-    "hopper": "hop",
-    "humanoid": "walk",
-    "humanoid_CMU": "run",
-    "lqr": "lqr_2_1",
-    "manipulator": "bring_ball",
-    "pendulum": "swingup",
-    "point_mass": "easy",
-    "quadruped": "walk",
-    "reacher": "easy",
-    "stacker": "stack_2",
-    "swimmer": "swimmer6",
-    "walker": "walk",
-}
-
-
-def default_task(domain: str) -> str:
-    """The task a domain is usually benchmarked with.
-
-    Raises:
-        UserError: The domain is unknown.
-    """
-    if domain not in _DEFAULT_TASKS:
-        raise UserError(_unknown("domain", domain, _DEFAULT_TASKS))
-    return _DEFAULT_TASKS[domain]
 
 
 class SuiteEnv(gymnasium.Env[np.ndarray, np.ndarray]):
-    """A `dm_control.suite` task: frames in, bounded actions out, action repeat within.
+    """A task of `dm_control.suite` with frames as observations, bounded actions and action repeat.
 
-    An observation is a uint8 frame (64, 64, 3), always a fresh array. An action is float32 (action,) in
-    [-1, 1], scaled to the actuators' range. `reset(seed=s)` depends on s alone; `reset()` continues the
-    random stream. The time limit truncates; only the task itself terminates. `info["env_frames"]` counts
-    the control steps that a step took, which is fewer than the action repeat where an episode ends early;
-    `info["labels"]` holds the true quantities at the frame, float32 (label,).
+    An observation is a uint8 frame (64, 64, 3), always a new array. An action is float32 (action,) in [-1, 1], scaled
+    to the actuators' range. `reset(seed=s)` depends on s alone; `reset()` continues the random stream. The time limit
+    truncates an episode; only the task terminates it. `info["env_frames"]` is the number of control steps that a step
+    took, which is smaller than the action repeat where an episode ends early. `info["labels"]` holds the true
+    quantities at the frame, float32 (label,).
 
     Attributes:
         action_repeat: Control steps per decision; rewards are summed over them.
         decisions_per_episode: Decisions until the time limit.
         domain: Domain of the suite.
-        record_quantities: Whether `info` of a step tells what was true after each of its control steps: `quantities`,
-            float64 (control step, quantity) in the order of `quantity_names`, and `rewards`, float64 (control step,).
-        labels: Names of the quantities in `info["labels"]`, and the typical size of each.
-        substeps_per_decision: Steps of the simulator itself per decision, the finest time at which actions change.
+        record_quantities: Whether the `info` of a step holds the true values after each of its control steps:
+            `quantities`, float64 (control step, quantity) in the order of `scales(domain)`, and `rewards`, float64
+            (control step,).
+        labels: Names of the quantities in `info["labels"]`, each with its scale.
+        substeps_per_decision: Steps of the simulator per decision: the finest resolution at which actions change.
     """
 
     metadata = {"render_modes": ["rgb_array"]}
     render_mode = "rgb_array"
 
     def __init__(self, config: EnvConfig, seed: int | None = None) -> None:
-        """Load the task; the OpenGL context is made by the first frame.
+        """Loads the task; the OpenGL context is made with the first frame.
 
         Args:
-            config: What to load and how to look at it.
+            config: Domain, task, action repeat, camera and render quality.
             seed: Start of the random stream; None draws one from the system.
 
         Raises:
-            UserError: Domain, task or camera do not exist, nothing can render, or the objective cannot be read.
+            UserError: Domain, task or camera do not exist, nothing can render, or the objective is no expression.
         """
         self._objective = None if config.objective is None else ObjectiveReward(config.objective, config.domain)
         task = default_task(config.domain) if config.task is None else config.task
@@ -123,7 +93,7 @@ class SuiteEnv(gymnasium.Env[np.ndarray, np.ndarray]):
 
     @property
     def physics(self) -> Physics:
-        """The simulated body, for reading the true state."""
+        """The simulated body, to read the true state from."""
         return self._task_env.physics
 
     def true_state(self) -> np.ndarray:
@@ -133,14 +103,14 @@ class SuiteEnv(gymnasium.Env[np.ndarray, np.ndarray]):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[np.ndarray, dict[str, Any]]:
-        """Begin an episode.
+        """Begins an episode.
 
         Args:
-            seed: Where to restart the random stream; None continues it.
+            seed: Seed that restarts the random stream; None continues the stream.
             options: Not used.
 
         Returns:
-            The first frame (64, 64, 3), and an info with no `env_frames` taken and the first labels.
+            The first frame (64, 64, 3), and an info with `env_frames` 0 and the first labels.
         """
         super().reset(seed=seed)
         if seed is not None:
@@ -153,10 +123,10 @@ class SuiteEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         return self.render(), self._info(0)
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
-        """Hold an action for `action_repeat` control steps.
+        """Holds an action for `action_repeat` control steps.
 
         Args:
-            action: (action,), clipped to [-1, 1].
+            action: The action, (action,), clipped to [-1, 1].
 
         Returns:
             Frame (64, 64, 3), summed reward, terminated, truncated, info.
@@ -170,14 +140,14 @@ class SuiteEnv(gymnasium.Env[np.ndarray, np.ndarray]):
     def step_schedule(
         self, schedule: Sequence[tuple[np.ndarray, int]]
     ) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
-        """One decision during which the action changes: each acts for as many of the simulator's substeps.
+        """One decision during which the action changes at given substeps of the simulator.
 
         Args:
-            schedule: Actions (action,), clipped to [-1, 1], and their substeps, which add up to
+            schedule: Actions (action,), clipped to [-1, 1], and their numbers of substeps, which add up to
                 `substeps_per_decision`.
 
         Returns:
-            As `step`, whose schedule is a single action.
+            As `step`: frame, summed reward, terminated, truncated, info.
 
         Raises:
             ResetNeeded: The episode is over.
@@ -195,7 +165,7 @@ class SuiteEnv(gymnasium.Env[np.ndarray, np.ndarray]):
             reward += self._rewarded(float(outcome.reward))
             env_frames += 1
             self._steps_left -= 1
-            # The suite marks an end of its own with discount 0, and the time limit with discount 1.
+            # dm_control marks the end by the task with discount 0, and the time limit with discount 1.
             terminated = outcome.last() and outcome.discount == 0.0
             self._needs_reset = outcome.last() or self._steps_left <= 0
             if self._needs_reset:
@@ -203,17 +173,17 @@ class SuiteEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         return self.render(), reward, terminated, self._needs_reset and not terminated, self._info(env_frames)
 
     def render(self) -> np.ndarray:  # type: ignore[override]
-        """The present state as the agent sees it, a fresh uint8 array (64, 64, 3)."""
+        """The frame of the present state as the agent sees it, a new uint8 array (64, 64, 3)."""
         return self.render_large(FRAME_SIZE)
 
     def render_large(self, size: int) -> np.ndarray:
-        """The present state through the same camera at another resolution, a fresh uint8 array (size, size, 3)."""
+        """The present state through the same camera at another resolution, a new uint8 array (size, size, 3)."""
         if size not in self._renderers:
             self._renderers[size] = FrameRenderer(self.physics, size, self._camera, self._quality)
         return self._renderers[size].render()
 
     def close(self) -> None:
-        """Free OpenGL contexts and simulator; the environment cannot be used afterwards."""
+        """Frees OpenGL contexts and simulator; the environment cannot be used afterwards."""
         for renderer in self._renderers.values():
             renderer.close()
         self._renderers.clear()
@@ -229,7 +199,7 @@ class SuiteEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         return info
 
     def _rewarded(self, reward: float) -> float:
-        """What this control step pays where the task's own reward is this; recorded where that was asked for."""
+        """The reward of this control step, given the task's own; records it where `record_quantities` is set."""
         if self._objective is None and not self.record_quantities:
             return reward
         values = true_values(self.domain, self.physics)
@@ -256,17 +226,17 @@ def _load(domain: str, task: str) -> Any:
     with explain_gl_errors():
         from dm_control import suite
     if domain not in suite.TASKS_BY_DOMAIN:
-        raise UserError(_unknown("domain", domain, suite.TASKS_BY_DOMAIN))
+        raise UserError(unknown_name("domain", domain, suite.TASKS_BY_DOMAIN))
     if task not in suite.TASKS_BY_DOMAIN[domain]:
-        raise UserError(_unknown(f"task of {domain}", task, suite.TASKS_BY_DOMAIN[domain]))
+        raise UserError(unknown_name(f"task of {domain}", task, suite.TASKS_BY_DOMAIN[domain]))
     with _quiet_model_compiler():
-        # A few tasks draw their model when they are built: a fixed seed makes that the same body every time.
+        # A few tasks draw their body at random when they are built: a fixed seed gives the same body every time.
         return suite.load(domain, task, task_kwargs={"random": 0})
 
 
 @contextmanager
 def _quiet_model_compiler() -> Iterator[None]:
-    """Drop warnings about the suite's model files, which users cannot act on."""
+    """Hides warnings about the suite's model files, which users cannot change."""
     logger = logging.getLogger("absl")
     before = logger.level
     logger.setLevel(logging.ERROR)
@@ -280,9 +250,3 @@ def _checked_camera(physics: Physics, config: EnvConfig) -> int:
     if config.camera >= physics.model.ncam:
         raise UserError(f"camera {config.camera} does not exist; {config.domain} has {physics.model.ncam} cameras")
     return config.camera
-
-
-def _unknown(what: str, name: str, available: Iterable[str]) -> str:
-    choices = sorted(available)
-    nearest = difflib.get_close_matches(name, choices, n=1, cutoff=0.0)[0]
-    return f"unknown {what} {name!r}; available: {', '.join(choices)}. Did you mean {nearest!r}?"

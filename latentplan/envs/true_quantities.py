@@ -1,7 +1,7 @@
 """True values of a body's named quantities, read from the simulator.
 
-What the names mean stands in `latentplan.config.quantities`. The rewards of sibling tasks are computed from the same
-physics by the suite's own formulas, so that one simulation tells what each of a domain's tasks would have paid.
+`latentplan.config.quantities` defines the names. The rewards of all tasks of a domain are computed from the same
+physics by the suite's own formulas, so that one simulation gives the reward of each task.
 """
 
 from __future__ import annotations
@@ -10,14 +10,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from latentplan.config.quantities import scales
-
 if TYPE_CHECKING:
     from collections.abc import Callable
 
     from dm_control.mujoco import Physics
-
-__all__ = ["clause_degree", "measure", "quantity_names", "scales", "true_values"]
 
 _WALKER_STAND_HEIGHT = 1.2
 _WALKER_SPEEDS = (1.0, 8.0, -1.0)  # walk, run, backward
@@ -28,34 +24,24 @@ _FINGER_SPIN_SPEED = 15.0
 _PENDULUM_COSINE = np.cos(np.deg2rad(8))
 
 
-def quantity_names(domain: str, task: str) -> tuple[str, ...]:
-    """The named quantities of a domain, then the rewards of its tasks as `task.NAME`; empty where none are named.
-
-    Args:
-        domain: Domain of `dm_control.suite`.
-        task: Task of the domain; every task has the same quantities, because the body is the same.
-    """
-    return tuple(scales(domain))
-
-
 def measure(domain: str, physics: Physics) -> np.ndarray:
-    """The true values at this moment in the order of `quantity_names`, float32 (quantity,)."""
+    """The true values of the present state in the order of `scales(domain)`, float32 (quantity,)."""
     return true_values(domain, physics).astype(np.float32)
 
 
 def true_values(domain: str, physics: Physics) -> np.ndarray:
-    """What `measure` returns, in the simulator's own precision: float64 (quantity,)."""
+    """The true values as from `measure`, in the precision of the simulator, float64 (quantity,)."""
     return np.array(_MEASURES[domain](physics) if domain in _MEASURES else (), dtype=np.float64)
 
 
 def clause_degree(shortfall: np.ndarray) -> np.ndarray:
-    """How far a clause is met, in [0, 1]: `dm_control.utils.rewards.tolerance` with its Gaussian sigmoid.
+    """The degree to which a clause is met, in [0, 1]: `dm_control.utils.rewards.tolerance` with a Gaussian sigmoid.
 
     Args:
-        shortfall: How much is missing in units of the clause's margin, any shape; 0 and below is met.
+        shortfall: Distance from meeting the clause in units of its margin, any shape; the clause is met at 0 and below.
 
     Returns:
-        1 where the clause is met, 0.1 where one margin is missing, NaN where the shortfall is NaN.
+        1 where the clause is met, 0.1 at a shortfall of 1, NaN where the shortfall is NaN; the shape of `shortfall`.
     """
     return np.asarray(_tolerance(np.asarray(shortfall), (-np.inf, 0.0), margin=1.0, sigmoid="gaussian"))
 
@@ -75,7 +61,7 @@ def _walker(physics: Any) -> tuple[float, ...]:
 
 
 def _reached(speed: float, goal: float, margin: float, value_at_margin: float) -> float:
-    """The suite's reward for moving at a goal speed or faster, in the direction of the goal's sign."""
+    """The suite's reward for a speed of at least `goal`, in the direction of the goal's sign."""
     bounds = (abs(goal), np.inf)
     along = float(np.sign(goal) * speed)
     return float(_tolerance(along, bounds, margin=margin, value_at_margin=value_at_margin, sigmoid="linear"))

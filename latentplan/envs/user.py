@@ -1,4 +1,4 @@
-"""A user's own environment, brought to the frames and actions that the agent works with."""
+"""A user's own environment, adapted to the frames and actions of an agent."""
 
 from __future__ import annotations
 
@@ -17,13 +17,16 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
 
-LONGEST = 1000  # decisions of an episode without a time limit, as many as the suite's longest
+LONGEST = 1000  # decisions of an episode without a time limit, as in the longest episodes of dm_control
 
 
 def make_from(
     factory: Callable[[], gymnasium.Env[Any, Any]],
 ) -> Callable[[EnvConfig, int | None], PixelEnv]:
-    """A builder with the signature of `make_env` around a user's factory.
+    """A function with the signature of `make_env` that builds a user's environments.
+
+    The function reads `action_repeat` of the settings, and raises `UserError` where the factory returns no
+    `gymnasium.Env` or an environment that `wrap_user_env` refuses.
 
     Args:
         factory: Returns a new environment with image observations and a bounded Box of actions.
@@ -39,33 +42,47 @@ def make_from(
 
 
 def wrap_user_env(env: gymnasium.Env[Any, Any], action_repeat: int = 1, seed: int | None = None) -> PixelEnv:
-    """A user's environment as the agent sees it.
+    """A user's environment as an agent sees it: frames of 64 x 64, actions in [-1, 1], action repeat.
 
     Args:
-        env: Observations are uint8 images (height, width, 3); actions a bounded Box (action,).
-        action_repeat: Steps of `env` per decision.
-        seed: Seed of the first reset that is given none.
+        env: A gymnasium environment. `env.observation_space` is a Box of uint8 images (height, width, 3), RGB, of any
+            size; larger images are averaged down, smaller images are interpolated. `env.action_space` is a bounded Box
+            of floats (action,).
+        action_repeat: Steps of `env` per decision, at least 1; a step of the result holds the action for so many steps
+            of `env`, or until the episode ends, and sums their rewards.
+        seed: Seed of the first reset that is called without one; None draws a seed from the system.
+
+    Returns:
+        An environment with these properties:
+
+        - Observations are uint8 (64, 64, 3), each a new array.
+        - Actions are float32 (action,) in [-1, 1]. The interval is mapped linearly to the bounds of
+          `env.action_space`; values outside are clipped.
+        - `info["env_frames"]` of a step is the number of steps of `env` that it took; `info` of `env` is kept.
+        - An environment without a time limit is truncated after 1000 decisions.
+        - `step` raises `ResetNeeded` after the end of an episode, and `ValueError` for an action of another shape or
+          with numbers that are not finite.
 
     Raises:
-        UserError: A space does not fit; the message names what is wrong with it.
+        UserError: `action_repeat` is below 1, or a space is not as described; the message says which and why.
     """
     return PixelEnv(env, action_repeat, seed)
 
 
 class PixelEnv(gymnasium.Env[np.ndarray, np.ndarray]):
-    """Frames of 64 x 64, actions in [-1, 1] and action repeat around any image environment.
+    """An image environment with frames of 64 x 64, actions in [-1, 1] and action repeat; see `wrap_user_env`.
 
     Attributes:
         action_repeat: Steps of the inner environment per decision; rewards are summed over them.
-        decisions_per_episode: Decisions until the time limit of the environment's spec or `TimeLimit`; None without
-            one: then an episode that does not end by itself is cut after `LONGEST` decisions.
+        decisions_per_episode: Decisions until the time limit of the environment's spec or of a `TimeLimit` wrapper.
+            None without a time limit; then an episode is truncated after `LONGEST` decisions.
     """
 
     metadata = {"render_modes": ["rgb_array"]}
     render_mode = "rgb_array"
 
     def __init__(self, env: gymnasium.Env[Any, Any], action_repeat: int, seed: int | None = None) -> None:
-        """Check the spaces; see `wrap_user_env`."""
+        """Checks the spaces; see `wrap_user_env`."""
         if action_repeat < 1:
             raise UserError(f"action_repeat must be at least 1, got {action_repeat}")
         _check_observations(env.observation_space)
@@ -77,7 +94,7 @@ class PixelEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         self._decisions = 0
         self.action_repeat = action_repeat
         limit = env.spec.max_episode_steps if env.spec is not None else None
-        if limit is None and env.has_wrapper_attr("_max_episode_steps"):  # of a `TimeLimit` around what has no spec
+        if limit is None and env.has_wrapper_attr("_max_episode_steps"):  # a `TimeLimit`, but no spec
             limit = env.get_wrapper_attr("_max_episode_steps")
         if rate := env.metadata.get("render_fps"):
             self.metadata = {**PixelEnv.metadata, "render_fps": rate / action_repeat}
@@ -88,7 +105,7 @@ class PixelEnv(gymnasium.Env[np.ndarray, np.ndarray]):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[np.ndarray, dict[str, Any]]:
-        """Begin an episode: the first frame (64, 64, 3) and the inner environment's info."""
+        """Begins an episode; returns the first frame (64, 64, 3) and the inner environment's info."""
         seed, self._first_seed = self._first_seed if seed is None else seed, None
         super().reset(seed=seed)
         picture, info = self._env.reset(seed=seed, options=options)
@@ -96,11 +113,14 @@ class PixelEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         return self._frame(picture), {**info, "env_frames": 0}
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
-        """Hold an action (action,) in [-1, 1] for `action_repeat` steps: frame, summed reward, ends, info.
+        """Holds an action (action,) in [-1, 1] for `action_repeat` steps of the inner environment.
+
+        Returns:
+            Frame (64, 64, 3), summed reward, terminated, truncated, info.
 
         Raises:
             ResetNeeded: The episode is over.
-            ValueError: The action has another shape, or is not finite.
+            ValueError: The action has another shape or is not finite.
         """
         if self._needs_reset:
             raise ResetNeeded("the episode is over; call reset() first")
@@ -120,16 +140,16 @@ class PixelEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         return self._frame(picture), total, bool(terminated), bool(truncated), {**info, "env_frames": env_frames}
 
     def render(self) -> np.ndarray:  # type: ignore[override]
-        """The last frame, a fresh uint8 array (64, 64, 3)."""
+        """The last frame, a new uint8 array (64, 64, 3)."""
         return _resized(self._picture, FRAME_SIZE)
 
     def render_large(self, size: int) -> np.ndarray:
-        """The inner environment's own rendering if it has one, else its last observation, (size, size, 3)."""
+        """The inner environment's rendering where it has one, else its last observation, uint8 (size, size, 3)."""
         rendered = self._env.render() if self._env.render_mode == "rgb_array" else None
         return _resized(self._picture if rendered is None else np.asarray(rendered), size)
 
     def close(self) -> None:
-        """Close the inner environment."""
+        """Closes the inner environment."""
         self._env.close()
 
     def _frame(self, picture: np.ndarray) -> np.ndarray:
@@ -163,7 +183,7 @@ def _checked_actions(space: gymnasium.Space[Any]) -> gymnasium.spaces.Box:
 
 
 def _resized(picture: np.ndarray, size: int) -> np.ndarray:
-    """A fresh uint8 array (size, size, 3)."""
+    """The picture at another size, a new uint8 array (size, size, 3)."""
     if picture.shape[:2] == (size, size):
         return picture.copy()
     shrinks = picture.shape[0] >= size and picture.shape[1] >= size

@@ -1,4 +1,4 @@
-"""One environment or several at once, all from the same settings."""
+"""Several environments behind one `step`, all from the same settings."""
 
 from __future__ import annotations
 
@@ -14,32 +14,14 @@ import numpy as np
 from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv, VectorEnv
 from gymnasium.wrappers import TimeLimit
 
-from latentplan.config import USER_DOMAIN, EnvConfig, UserError
-from latentplan.envs.suite import SuiteEnv
+from latentplan.config import EnvConfig
+from latentplan.envs.registry import make_env
 from latentplan.envs.user import make_from
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
 _THREAD_SETTINGS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
-
-
-def make_env(config: EnvConfig, seed: int | None = None) -> SuiteEnv:
-    """The environment that the settings name.
-
-    Args:
-        config: Domain, task, action repeat, camera and render quality.
-        seed: Start of its random stream; None draws one from the system.
-
-    Raises:
-        UserError: Domain, task or camera do not exist, or nothing can render.
-    """
-    if config.domain == USER_DOMAIN:
-        raise UserError(
-            "this agent learned in an environment of your own, which a command cannot make: play it from Python, "
-            "agent = load_agent(DIR)"
-        )
-    return SuiteEnv(config, seed)
 
 
 def make_vector_env(
@@ -51,20 +33,20 @@ def make_vector_env(
 ) -> VectorEnv[np.ndarray, np.ndarray, Any]:
     """Several environments behind one `step`, each in a process of its own if there is more than one.
 
-    Episodes are not restarted by themselves, so `step` always returns what its own action led to. Restart
-    those that ended with `vector_env.reset(options={"reset_mask": ended})`, where `ended` is a bool array
-    (env,); the others' observations come back as they were. Processes are spawned, because a forked child
-    hangs once an OpenGL context exists.
+    Finished episodes do not restart by themselves, so `step` always returns the result of its own action. Restart
+    finished environments with `vector_env.reset(options={"reset_mask": ended})`, where `ended` is a bool array
+    (env,); the observations of the other environments come back unchanged. Processes are spawned, because a forked
+    child hangs once an OpenGL context exists.
 
     Args:
-        config: What to build.
-        num_envs: How many.
-        seed: Each environment's random stream derives from this and its index; None draws from the system.
-        make_env: A user's factory, called in each process in place of the suite; it must be picklable.
-        episode_decisions: After how many an episode is truncated; None leaves its length to the task.
+        config: Settings of every environment.
+        num_envs: Number of environments.
+        seed: Each environment's random stream is derived from this seed and its index; None draws from the system.
+        make_env: A user's factory, called in each process instead of the suite's; it must be picklable.
+        episode_decisions: Decisions after which an episode is truncated; None leaves the length to the task.
 
     Returns:
-        Observations uint8 (env, 64, 64, 3), rewards (env,), terminated and truncated (env,).
+        A gymnasium vector environment: observations uint8 (env, 64, 64, 3); rewards, terminated and truncated (env,).
 
     Raises:
         UserError: The environment cannot be built.
@@ -78,7 +60,7 @@ def make_vector_env(
 
 @dataclass(frozen=True)
 class _Builder:
-    """Builds one environment wherever it is called; picklable where the user's factory is."""
+    """Builds one environment in the process that calls it; picklable where the user's factory is."""
 
     config: EnvConfig
     seed: int | None
@@ -95,7 +77,7 @@ class _Builder:
 
 
 class _WithoutInfo(gymnasium.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarray]):
-    """A user's environment without what else it tells: not everything can be put into one array for all."""
+    """A user's environment with `env_frames` as its only info: other entries may not fit into one array for all."""
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         frame, info = self.env.reset(seed=seed, options=options)
@@ -112,7 +94,7 @@ def _derived_seed(seed: int | None, index: int) -> int | None:
 
 @contextmanager
 def single_threaded_children() -> Iterator[None]:
-    """Thread limits in the environment while processes start: their libraries read them at import."""
+    """Sets thread limits as environment variables while processes start: numerical libraries read them at import."""
     before = {name: os.environ.get(name) for name in _THREAD_SETTINGS}
     os.environ.update(dict.fromkeys(_THREAD_SETTINGS, "1"))
     try:

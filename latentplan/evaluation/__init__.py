@@ -1,4 +1,4 @@
-"""What an agent earns in closed loop, in a world that waits or does not, and on goals named at test time."""
+"""Evaluation of agents in closed loop: returns, real time by a virtual clock, and goals named at test time."""
 
 from latentplan.evaluation.episodes import evaluate_agent
 

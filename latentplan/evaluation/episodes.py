@@ -1,4 +1,4 @@
-"""Closed-loop episodes of an agent, whose starts depend on nothing but a seed and their index."""
+"""Closed-loop episodes of an agent; the start of each depends only on a seed and the index of the episode."""
 
 from __future__ import annotations
 
@@ -11,70 +11,83 @@ from typing import TYPE_CHECKING, Any, Protocol, SupportsFloat
 import numpy as np
 from numpy.typing import NDArray
 
+from latentplan.agents.base import Agent
 from latentplan.config import UserError, derive_seed
-from latentplan.evaluation.statistics import SOURCES, Episode, summarize
+from latentplan.evaluation.statistics import Episode, EpisodeRecord, summarize
 
 if TYPE_CHECKING:
     import gymnasium
 
-
-class Agent(Protocol):
-    """Whatever turns frames into actions.
-
-    Its attribute `last_source`, where it has one, says what the most recent action came from: "plan", "tail" (of an
-    older plan) or "actor". An agent that does not say so does not plan.
-    """
-
-    def act(self, frame: NDArray[np.uint8]) -> NDArray[np.float32]:
-        """The action, (action,), for a frame, (height, width, channel)."""
-        ...
-
-    def reset(self) -> None:
-        """Forgets the past before a new episode."""
-        ...
-
-    def seed(self, seed: int) -> None:
-        """Restarts the agent's own random stream."""
-        ...
+Frame = NDArray[np.uint8]
+Action = NDArray[np.float32]
+Outcome = tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]  # what `step` of a gymnasium environment returns
 
 
 @dataclass(frozen=True)
 class Step:
-    """One moment of an episode, seen after the agent chose and before the simulator moves.
+    """One moment of an episode, after the agent chose an action and before the simulator moves.
 
     Attributes:
         episode: Index of the episode.
         decision: Decisions executed before this one.
         total_return: Reward earned before this decision.
-        frame: What the agent sees, uint8 (height, width, channel).
-        action: What it chose, (action,); None at the end of the episode, where nothing is chosen.
+        frame: The frame that the agent sees, uint8 (height, width, channel).
+        action: The chosen action, (action,); None at the end of the episode, where no action is chosen.
     """
 
     episode: int
     decision: int
     total_return: float
-    frame: NDArray[np.uint8]
-    action: NDArray[np.float32] | None
+    frame: Frame
+    action: Action | None
 
 
 OnStep = Callable[[Step], None]
 
 
 def episode_seed(seed: int, index: int) -> int:
-    """The seed of episode `index`: depends on nothing else, so that agents meet the same starts."""
+    """The seed of episode `index`, in [0, 2**32): it depends on nothing else, so that all agents meet the same starts.
+
+    Args:
+        seed: Seed of the evaluation, at least 0.
+        index: Index of the episode, from 0.
+    """
     return int(np.random.SeedSequence((seed, index)).generate_state(1)[0])
 
 
 def evaluate_agent(
     agent: Agent, env: gymnasium.Env[Any, Any], seed: int, episodes: int, *, on_step: OnStep | None = None
 ) -> dict[str, Any]:
-    """Plays episodes whose starts depend only on `seed` and their index.
+    """Returns and decision times of an agent over whole episodes, as plain values for JSON.
+
+    Episode i starts from a state that depends only on `seed` and i, so that two agents meet the same starts. The agent
+    is reset, and its random stream restarted, before every episode.
+
+    Args:
+        agent: Any object with `act(frame)`, `reset()` and `seed(seed)`, such as the result of `latentplan.load_agent`.
+        env: One environment with the gymnasium API whose observations are the agent's frames and whose actions are the
+            agent's: for a trained agent, uint8 (64, 64, 3) and (action,) in [-1, 1], as `latentplan.envs.make_env` and
+            `latentplan.envs.wrap_user_env` give. The environment stays open.
+        seed: Seed of the evaluation, at least 0.
+        episodes: Number of episodes, at least 1. An episode lasts until the environment terminates or truncates it.
+        on_step: Called with a `Step` at every decision, and once more when an episode has ended; the time that the
+            call takes does not count as the agent's.
 
     Returns:
-        `seed`, and what `summarize` gives.
+        A dictionary with:
+            `seed`: As given.
+            `episodes`: Number of episodes.
+            `returns`: Sum of the rewards of each episode, in order.
+            `mean_return`: Their mean.
+            `ci95`: Lower and upper end of the 95 % interval of the mean (Student's t); two None for one episode.
+            `decision_ms`: Milliseconds per decision: `p50`, `p95` and `p99`.
+            `action_source`: Number of decisions whose action came from a `plan`, the `tail` of an older plan, or the
+                `actor`.
+            `planned_fraction`: Share of `plan` and `tail` among all decisions, in [0, 1].
 
     Raises:
-        ValueError: `episodes` is below 1.
+        ValueError: `episodes` is below 1, `seed` is below 0, or the agent refuses the environment's frames.
+        UserError: The environment gave a reward that is not finite.
     """
     seeds = [episode_seed(seed, index) for index in range(episodes)]
     return {"seed": seed, **summarize(run_episodes(env, agent, seeds, on_step=on_step))}
@@ -93,20 +106,11 @@ def run_episodes(
 
     Returns:
         The episodes in the order of the seeds.
-    """
-    return list(iterate_episodes(env, agent, seeds, on_step=on_step))
-
-
-def finite(reward: SupportsFloat) -> float:
-    """The reward as a number.
 
     Raises:
-        UserError: It is none: a mean over episodes would hide where it came from.
+        UserError: The environment gave a reward that is not finite.
     """
-    value = float(reward)
-    if not math.isfinite(value):
-        raise UserError(f"the environment gave a reward that is not finite: {value}")
-    return value
+    return list(iterate_episodes(env, agent, seeds, on_step=on_step))
 
 
 def iterate_episodes(
@@ -114,28 +118,91 @@ def iterate_episodes(
 ) -> Iterator[Episode]:
     """The episodes of `run_episodes`, each as soon as it has ended."""
     for index, seed in enumerate(seeds):
-        yield _run_episode(env, agent, index, seed, on_step)
+        yield play_episode(env, agent, index, seed, WaitingWorld(env), on_step)
 
 
-def _run_episode(env: gymnasium.Env[Any, Any], agent: Agent, index: int, seed: int, on_step: OnStep | None) -> Episode:
+class World(Protocol):
+    """How an environment and an agent take turns during one episode.
+
+    Attributes:
+        record: Counts what happens in the episode.
+    """
+
+    record: EpisodeRecord
+
+    def begin(self, seed: int) -> None:
+        """Prepares an episode; called after the reset of environment and agent."""
+        ...
+
+    def decide(self, agent: Agent, frame: Frame) -> Action:
+        """The agent's latest action, (action,), after it had the chance to decide on a frame."""
+        ...
+
+    def step(self) -> Outcome:
+        """Moves the environment for one decision."""
+        ...
+
+
+class WaitingWorld:
+    """A world that stands still while the agent decides.
+
+    Args:
+        env: The environment.
+    """
+
+    def __init__(self, env: gymnasium.Env[Any, Any]) -> None:
+        self.env, self.record = env, EpisodeRecord()
+
+    def begin(self, seed: int) -> None:
+        """Does nothing: no time passes in this world."""
+
+    def decide(self, agent: Agent, frame: Frame) -> Action:
+        """The action that the agent chooses for a frame; its decision time is recorded."""
+        started = time.perf_counter()
+        self._action = agent.act(frame)
+        self.record.add_decision(agent, 1000.0 * (time.perf_counter() - started))
+        return self._action
+
+    def step(self) -> Outcome:
+        """Executes the action."""
+        return self.env.step(self._action)
+
+
+def play_episode(env: Any, agent: Agent, index: int, seed: int, world: World, on_step: OnStep | None) -> Episode:
+    """One episode, from the reset of environment and agent to its end.
+
+    Args:
+        env: Environment of uint8 frames (height, width, channel).
+        agent: The agent.
+        index: Index of the episode, for `on_step`.
+        seed: Seed of the episode's start, see `episode_seed`.
+        world: How environment and agent take turns; made for this episode.
+        on_step: See `run_episodes`.
+
+    Raises:
+        UserError: The environment gave a reward that is not finite.
+    """
     frame, _ = env.reset(seed=seed)
     agent.reset()
-    agent.seed(derive_seed(seed, "agent"))  # a stream of its own: the start must not correlate with the actions
-    total_return, env_frames, over = 0.0, 0, False
-    decision_ms: list[float] = []
-    action_source, surprised = dict.fromkeys(SOURCES, 0), 0
+    agent.seed(derive_seed(seed, "agent"))  # a stream of its own: actions must not correlate with the start
+    world.begin(seed)
+    record, decision, over = world.record, 0, False
     while not over:
-        started = time.perf_counter()
-        action = agent.act(frame)
-        decision_ms.append(1000.0 * (time.perf_counter() - started))
-        action_source[getattr(agent, "last_source", "actor")] += 1
-        surprised += getattr(agent, "was_surprised", False)
+        action = world.decide(agent, frame)
         if on_step is not None:
-            on_step(Step(index, len(decision_ms) - 1, total_return, frame, action))
-        frame, reward, terminated, truncated, info = env.step(action)
-        total_return += finite(reward)
-        env_frames += int(info.get("env_frames", 1))
+            on_step(Step(index, decision, record.total_return, frame, action))
+        frame, reward, terminated, truncated, info = world.step()
+        record.add_step(_finite(reward), int(info.get("env_frames", 1)))
+        decision += 1
         over = terminated or truncated
     if on_step is not None:
-        on_step(Step(index, len(decision_ms), total_return, frame, None))
-    return Episode(total_return, len(decision_ms), env_frames, np.asarray(decision_ms), action_source, surprised)
+        on_step(Step(index, decision, record.total_return, frame, None))
+    return record.episode()
+
+
+def _finite(reward: SupportsFloat) -> float:
+    """The reward as a finite number: else a mean over episodes would hide where the NaN came from."""
+    value = float(reward)
+    if not math.isfinite(value):
+        raise UserError(f"the environment gave a reward that is not finite: {value}")
+    return value

@@ -1,7 +1,7 @@
-"""What an episode is worth under goals named after training, by what was true in the simulator.
+"""Scores of episodes on goals named after training, computed from the true state of the simulator.
 
-A score never sees a prediction: it comes from the quantities that the environment tells after every control step, and
-for a goal image from the camera's own pictures. It is the same whoever acts.
+A score uses no prediction of a model: it is computed from the quantities that the environment reports after every
+control step, and for a goal image from the camera's frames. The score therefore does not depend on the agent.
 """
 
 from __future__ import annotations
@@ -14,9 +14,9 @@ import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
-from latentplan.config import EnvConfig
+from latentplan.config import EnvConfig, UserError
 from latentplan.config.quantities import scales
-from latentplan.envs.true_quantities import clause_degree, quantity_names
+from latentplan.envs.true_quantities import clause_degree
 from latentplan.objectives.expression import (
     Clause,
     Expression,
@@ -39,13 +39,13 @@ PIXEL_MARGIN = 0.1  # root mean square difference to a goal image that counts as
 
 @dataclass(frozen=True)
 class Goals:
-    """What the command line asks for.
+    """Objectives and constraints of an evaluation.
 
     Attributes:
-        phases: Objectives in the order of their start; empty keeps that of the training.
-        constraints: What must hold at every moment.
-        objective_text: As it was written, or None.
-        constraint_text: As it was written, or None.
+        phases: Objectives in the order of their start; without any the objective is that of the training.
+        constraints: Clauses that must hold at every control step.
+        objective_text: The objectives as text, or None.
+        constraint_text: The constraints as text, or None.
     """
 
     phases: tuple[Phase, ...]
@@ -56,11 +56,11 @@ class Goals:
 
 @dataclass(frozen=True)
 class Score:
-    """What one episode came to.
+    """The score of one episode.
 
     Attributes:
-        objective_return: Worth of the objective summed over env frames; 0 without one.
-        violation_rate: Share of the env frames at which a constraint was broken; 0 without one.
+        objective_return: Sum of the objective over env frames; 0 without an objective.
+        violation_rate: Share of env frames at which a constraint was broken, in [0, 1]; 0 without constraints.
         quantities: Mean of every true quantity over the env frames.
     """
 
@@ -70,18 +70,19 @@ class Score:
 
 
 def goal_env(config: EnvConfig) -> EnvConfig:
-    """Where goals are pursued: the world of the training, the floor drawn behind the start as well.
+    """The settings of the training's environment, with the floor drawn behind the start as well.
 
-    What moves away from its start backwards would soon see nothing pass by, and could not tell its own speed.
+    Without a floor behind the start a body that moves backwards would not see the floor pass by, and could not tell its
+    own speed.
     """
     return replace(config, floor="endless")
 
 
 def read_goals(objective: str | None, constraint: str | None, domain: str) -> Goals | None:
-    """The goals in these texts; None where both are None.
+    """The goals that the texts of `--objective` and `--constraint` describe; None where both are None.
 
     Raises:
-        UserError: A text is no expression over the quantities of the domain, or a goal image cannot be read.
+        UserError: A text is no expression over the domain's quantities, or a goal image cannot be read.
     """
     if objective is None and constraint is None:
         return None
@@ -94,24 +95,29 @@ def read_goals(objective: str | None, constraint: str | None, domain: str) -> Go
 
 
 class ScoredEnv(gymnasium.Wrapper[Any, Any, Any, Any]):
-    """An environment that keeps the score of every episode, and tells who acts when the objective changes.
+    """An environment that scores every episode, and reports each change of the objective.
 
     Attributes:
-        scores: Of the episodes that ended, in order.
-        worth: Worth of the objective at each env frame of the present episode.
+        scores: Scores of the finished episodes, in order.
+        worth: Value of the objective at each env frame of the present episode.
         substeps_per_decision: Steps of the simulator per decision.
-        clauses: The text of every clause of the present objective, then of every constraint, each with whether it was
-            met at the last env frame; empty before the first.
+        clauses: Pairs of a text and a bool: each clause of the present objective, then each constraint, and whether it
+            was met at the last env frame. Empty before the first env frame.
     """
 
     def __init__(self, env: SuiteEnv, goals: Goals, on_objective: Callable[[Expression], None] | None = None) -> None:
         """Wraps an environment.
 
         Args:
-            env: What is played.
-            goals: What is scored.
-            on_objective: Called with the objective when an episode begins and when another takes its place.
+            env: The environment; it has to report true quantities.
+            goals: The goals to score.
+            on_objective: Called with the present objective when an episode begins and when the objective changes.
+
+        Raises:
+            UserError: The environment does not report true quantities.
         """
+        if not hasattr(env, "record_quantities"):
+            raise UserError("goals are scored by true quantities, which this environment does not report")
         super().__init__(env)
         self._suite_env, self.substeps_per_decision = env, env.substeps_per_decision
         env.record_quantities = True
@@ -119,7 +125,7 @@ class ScoredEnv(gymnasium.Wrapper[Any, Any, Any, Any]):
         self.worth: list[float] = []
         self.clauses: list[tuple[str, bool]] = []
         self._on_objective = on_objective
-        self._names = quantity_names(env.domain, "")
+        self._names = tuple(scales(env.domain))
         self._pictures = {
             path: read_goal_image(path) for phase in goals.phases for path in _goal_paths(phase.objective)
         }
@@ -128,7 +134,7 @@ class ScoredEnv(gymnasium.Wrapper[Any, Any, Any, Any]):
         self._totals = np.zeros(len(self._names))
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
-        """Begins an episode and a score."""
+        """Begins an episode, and its score."""
         self._num_frames = self._num_violated = 0
         self._totals = np.zeros(len(self._names))
         self.worth, self.clauses, self._present = [], [], None
@@ -197,7 +203,7 @@ class ScoredEnv(gymnasium.Wrapper[Any, Any, Any, Any]):
         return float(evaluate(term, values.__getitem__, clause_degree))
 
     def _phase(self) -> Phase | None:
-        """The objective of the env frame that comes next."""
+        """The objective of the next env frame; None where the objective is that of the training."""
         return next((phase for phase in reversed(self.goals.phases) if phase.start <= self._num_frames), None)
 
     def _announce(self) -> None:
@@ -212,15 +218,15 @@ class ScoredEnv(gymnasium.Wrapper[Any, Any, Any, Any]):
 
 
 def score_env(env: SuiteEnv, goals: Goals, planner: Any | None) -> ScoredEnv:
-    """The environment with scores, and the goals given to the agent that plans in it.
+    """The environment with scores; also passes the goals to the agent that plans in it.
 
     Args:
-        env: What is played.
-        goals: What is scored.
-        planner: A planning agent, which then pursues the goals; None where whoever acts does not know them.
+        env: The environment; it has to report true quantities.
+        goals: The goals to score.
+        planner: A planning agent, which then pursues the goals; None for an agent that does not plan.
 
     Raises:
-        UserError: The agent does not predict what a goal is about.
+        UserError: The environment does not report true quantities, or the agent does not predict one that a goal names.
     """
     if planner is None:
         return ScoredEnv(env, goals)
@@ -230,7 +236,7 @@ def score_env(env: SuiteEnv, goals: Goals, planner: Any | None) -> ScoredEnv:
         planner.set_objective(objective, constraints)
 
     for objective in [None, *(phase.objective for phase in goals.phases)]:
-        change(objective)  # what cannot be planned for is refused before anything is played
+        change(objective)  # an objective that cannot be planned for is refused before anything is played
     return ScoredEnv(env, goals, change)
 
 

@@ -1,4 +1,4 @@
-"""How long thoughts take: as measured here, or drawn from a distribution that was given."""
+"""The durations of decisions and plans: measured on this machine, or drawn from a given distribution."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _FORMATS = 'a JSON list of milliseconds, {"decision_ms": [...]}, or one number p
 _LONGEST_MS = 1e9  # eleven days
 
 Milliseconds = NDArray[np.float64]
-Charge = Callable[[float], float]  # what a thought that took so many milliseconds is charged
+Charge = Callable[[float], float]  # from measured milliseconds to charged milliseconds
 
 
 @dataclass(frozen=True)
@@ -28,9 +28,10 @@ class Latency:
 
     Attributes:
         name: `measured`, or the file that the durations came from.
-        decision_ms: Of decisions, (duration,); None charges what was measured.
-        plan_ms: Of plans that are made beside the decisions, (duration,), each counted from the frame it begins with
-            (measured ones from when the decision asks for them); None charges what was measured.
+        decision_ms: Durations of decisions, (duration,); None charges the measured durations.
+        plan_ms: Durations of plans that are computed beside the decisions, (duration,). Given durations count from the
+            frame that the plan begins with, measured durations from the request of the plan. None charges the measured
+            durations.
     """
 
     name: str = MEASURED
@@ -39,23 +40,23 @@ class Latency:
 
     @property
     def is_replayed(self) -> bool:
-        """Whether durations are drawn, so that results repeat exactly."""
+        """Whether durations are drawn from a distribution, so that results repeat exactly."""
         return self.decision_ms is not None
 
     def charges(self, seed: int) -> tuple[Charge, Charge]:
-        """What decisions and plans are charged in an episode: two streams that depend on its seed alone."""
+        """The charges of decisions and of plans in an episode: two streams that depend on its seed alone."""
         return _charge(self.decision_ms, derive_seed(seed, "decision_ms")), _charge(
             self.plan_ms, derive_seed(seed, "plan_ms")
         )
 
 
 def read_latency(text: str) -> Latency:
-    """The durations that `--latency` names: `measured`, or a file of milliseconds.
+    """The latency that `--latency` names: `measured`, or a file of milliseconds.
 
-    A file without `plan_ms` gives its `decision_ms` to the plans too.
+    The `decision_ms` of a file without `plan_ms` hold for plans too.
 
     Raises:
-        UserError: The file cannot be read, or holds no durations.
+        UserError: The file cannot be read, or does not hold durations.
     """
     if text == MEASURED:
         return Latency()
@@ -82,7 +83,7 @@ def _charge(durations: Milliseconds | None, seed: int) -> Charge:
 
 
 def _parsed(text: str) -> Any:
-    """JSON, else one number per line."""
+    """The content of a file of durations: JSON, else one number per line."""
     try:
         content = json.loads(text)
     except json.JSONDecodeError:

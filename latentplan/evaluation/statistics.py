@@ -1,4 +1,4 @@
-"""What a few episodes say of an agent: returns, how sure their mean is, and decision latency."""
+"""Statistics of a few episodes: returns, the confidence interval of their mean, and decision times."""
 
 from __future__ import annotations
 
@@ -17,15 +17,19 @@ SOURCES = ("plan", "tail", "actor")  # where an action can come from
 
 @dataclass(frozen=True)
 class Episode:
-    """What one episode came to.
+    """The result of one episode.
 
     Attributes:
         total_return: Sum of the rewards.
-        num_decisions: Actions chosen.
+        num_decisions: Number of actions that the agent chose.
         env_frames: Simulator control steps, counted before action repeat.
-        decision_ms: Milliseconds from a frame in memory to an action, (decision,).
-        action_source: Decisions by what their action came from: "plan", "tail" or "actor".
-        surprised: Those of "actor" where there was a plan that a surprising frame discredited.
+        decision_ms: Milliseconds from a frame in memory to an action, (decision,); on a virtual clock the milliseconds
+            that the clock charged.
+        action_source: Number of decisions by the origin of their action: "plan", "tail" or "actor".
+        surprised: Number of decisions at which the actor replaced a plan because the frame surprised the model.
+        deadline_misses: On a virtual clock, the boundaries between periods at which the agent was still deciding.
+        plan_age_ms: On a virtual clock, for each action from a plan the milliseconds from the frame that the plan began
+            with until the action takes effect, (action,).
     """
 
     total_return: float
@@ -34,18 +38,62 @@ class Episode:
     decision_ms: Floats
     action_source: dict[str, int] = field(default_factory=dict)
     surprised: int = 0
+    deadline_misses: int = 0
+    plan_age_ms: Floats = field(default_factory=lambda: np.zeros(0))
+
+
+class EpisodeRecord:
+    """Counts what happens in an episode while it is played.
+
+    Attributes:
+        total_return: Sum of the rewards so far.
+        deadline_misses: See `Episode`.
+        plan_age_ms: See `Episode`; a list.
+    """
+
+    def __init__(self) -> None:
+        self.total_return = 0.0
+        self.deadline_misses = 0
+        self.plan_age_ms: list[float] = []
+        self._env_frames = self._surprised = 0
+        self._decision_ms: list[float] = []
+        self._sources = dict.fromkeys(SOURCES, 0)
+
+    def add_decision(self, agent: Any, decision_ms: float) -> None:
+        """Counts a decision that the agent has just made, and the origin that the agent gives for its action."""
+        self._decision_ms.append(decision_ms)
+        self._sources[getattr(agent, "last_source", "actor")] += 1
+        self._surprised += getattr(agent, "was_surprised", False)
+
+    def add_step(self, reward: float, env_frames: int) -> None:
+        """Counts a step of the environment."""
+        self.total_return += reward
+        self._env_frames += env_frames
+
+    def episode(self) -> Episode:
+        """The episode so far."""
+        return Episode(
+            self.total_return,
+            len(self._decision_ms),
+            self._env_frames,
+            np.asarray(self._decision_ms),
+            self._sources,
+            self._surprised,
+            self.deadline_misses,
+            np.asarray(self.plan_age_ms),
+        )
 
 
 def summarize(episodes: Sequence[Episode]) -> dict[str, Any]:
-    """Returns, their mean and interval, and decision latency, as plain values for JSON.
+    """Returns, their mean and interval, and decision times, as plain values for JSON.
 
     Returns:
-        `episodes`, `returns`, `mean_return`, `ci95` (a pair; of None where one episode gives no interval),
-        `decision_ms` with `p50`, `p95` and `p99`, `action_source` (decisions by `plan`, `tail` and `actor`) and
-        `planned_fraction` (the share of `plan` and `tail` among them).
+        `episodes`, `returns`, `mean_return`, `ci95` (lower and upper end; two None for one episode), `decision_ms` with
+        `p50`, `p95` and `p99`, `action_source` (number of decisions by `plan`, `tail` and `actor`) and
+        `planned_fraction` (the share of `plan` and `tail` among all decisions).
 
     Raises:
-        ValueError: There is no episode.
+        ValueError: `episodes` is empty.
     """
     returns = [episode.total_return for episode in episodes]
     low, high = confidence_interval(returns)
@@ -62,10 +110,10 @@ def summarize(episodes: Sequence[Episode]) -> dict[str, Any]:
 
 
 def confidence_interval(returns: Sequence[float]) -> tuple[float, float]:
-    """The 95 % interval (Student's t) of the mean of independent returns; NaN for a single one.
+    """Ends of the 95 % interval (Student's t) of the mean of independent returns; two NaN for a single return.
 
     Raises:
-        ValueError: There is no return.
+        ValueError: `returns` is empty.
     """
     if len(returns) == 0:
         raise ValueError("an interval needs at least one return, got none")

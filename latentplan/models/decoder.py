@@ -1,4 +1,4 @@
-"""Latent states back to frames: for learning, and for looking."""
+"""The decoder: features of latent states to pictures, for the reconstruction loss and for display."""
 
 from __future__ import annotations
 
@@ -8,17 +8,17 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 FRAME_SIZE = 64
-SIZE = 32  # of the picture painted: each pixel is the mean of SHRINK x SHRINK of the frame's
+SIZE = 32  # side of the decoded picture: each pixel is the mean of SHRINK x SHRINK pixels of the frame
 SHRINK = FRAME_SIZE // SIZE
 GRID = 8
 PATCH = SIZE // GRID
 
 
 class Decoder(nn.Module):
-    """A grid of 8 x 8 tokens, mixed by one 3 x 3 convolution, each painting a patch of 4 x 4 pixels.
+    """A grid of 8 x 8 tokens, one 3 x 3 convolution over it, and a patch of 4 x 4 pixels from each token.
 
-    The picture has half the frame's resolution, which shows a body as well and costs a quarter. Transposed
-    convolutions have no fast bfloat16 gradient on the CPU; patches do, and cost a fifth.
+    The picture has half the frame's resolution, which still shows a body and costs a quarter. Patches are used instead
+    of transposed convolutions because the bfloat16 gradient of those is five times as slow on a CPU.
     """
 
     pool: Tensor
@@ -42,14 +42,14 @@ class Decoder(nn.Module):
         """Squared error summed over each picture, pixels in units of the full range, (rows,) in float32.
 
         Args:
-            patches: What `forward` returned, (rows, 8, 8, 48).
+            patches: Decoded patches as `forward` returns them, (rows, 8, 8, 48).
             frames: The true pictures, uint8 (rows, 64, 64, 3).
         """
         side = PATCH * SHRINK
         pixels = rearrange(
             frames, "rows (height y) (width x) channel -> rows height width (y x channel)", y=side, x=side
         )
-        target = pixels.to(patches.dtype) @ self.pool.to(patches.dtype)  # a product: the fastest way to take means
+        target = pixels.to(patches.dtype) @ self.pool.to(patches.dtype)  # means as a matrix product, the fastest way
         error = patches.float() - target.float().mul_(1.0 / 255.0).sub_(0.5)
         return error.square().sum((1, 2, 3))
 
@@ -65,6 +65,6 @@ class Decoder(nn.Module):
 
 
 def _pooling() -> Tensor:
-    """What turns the (y x channel) of a frame's patch into the means over SHRINK x SHRINK pixels, (192, 48)."""
+    """The matrix from a frame's patch (y x channel) to its means over SHRINK x SHRINK pixels, (192, 48)."""
     side = torch.eye(PATCH).repeat_interleave(SHRINK, 0) / SHRINK
     return torch.kron(torch.kron(side, side), torch.eye(3))

@@ -1,4 +1,4 @@
-"""Frames to embeddings."""
+"""The encoder: frames to embeddings."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ PATCH = 4
 class Encoder(nn.Module):
     """Patches of 4 x 4 pixels through one matrix product, strided convolutions, and one linear layer.
 
-    The patches are a stride-4 convolution written as a product, which is what the CPU is fast at; the whole
-    64 x 64 picture is read.
+    The patches are a convolution with stride 4, written as a matrix product because CPUs compute products faster. The
+    encoder reads all 64 x 64 pixels.
     """
 
     def __init__(self, channels: tuple[int, ...], embedding_dim: int) -> None:
@@ -41,7 +41,7 @@ class Encoder(nn.Module):
         return self.linear(rearrange(features, "rows channel height width -> rows (height width channel)")).float()
 
     def _project(self, patches: Tensor) -> Tensor:
-        """The first layer on pixels / 255 - 0.5, with that change of scale moved into its weights.
+        """The first layer on pixels / 255 - 0.5; the scale and the shift are applied to the weights instead.
 
         Whole numbers up to 255 are exact in bfloat16, so the pixels need one conversion and no arithmetic.
         """

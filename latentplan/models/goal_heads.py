@@ -1,4 +1,4 @@
-"""An actor and a value for goals that are named later: boxes in the space of the quantities."""
+"""An actor and a value that take a goal as input: a box in the space of the quantities."""
 
 from __future__ import annotations
 
@@ -7,15 +7,15 @@ from torch import Tensor, nn
 
 from latentplan.models.heads import Actor, ScalarHead, action_distribution
 
-ENDS = 2  # of an interval, each told by whether it is there, and where
+ENDS = 2  # of an interval; two numbers each: whether the end exists, and its position
 CODE_SIZE = 2 * ENDS  # numbers per quantity
 
 
 class GoalHeads(nn.Module):
-    """What a goal makes of a latent: what to do, and what that is worth (Schaul et al. 2015).
+    """Actor and value conditioned on a goal (universal value functions, Schaul et al. 2015).
 
     Args:
-        in_features: Size of the features of a state.
+        in_features: Size of a state's features.
         hidden_dim: Width of the hidden layers.
         action_dim: Size of the action.
         num_bins: Bins of the distribution of values.
@@ -31,7 +31,7 @@ class GoalHeads(nn.Module):
         self.value_head = ScalarHead(in_features + CODE_SIZE * len(scales), hidden_dim, num_bins)
 
     def encode(self, low: Tensor, high: Tensor) -> Tensor:
-        """Boxes as the heads read them, (..., 4 quantity), for ends (..., quantity) that are infinite where open."""
+        """The code of boxes, (..., 4 quantity), for their lower and upper ends (..., quantity), infinite where open."""
         there = [torch.isfinite(end).float() for end in (low, high)]
         where = [torch.where(torch.isfinite(end), end / self.scales, 0.0) for end in (low, high)]
         return torch.cat([there[0], where[0], there[1], where[1]], -1)
@@ -39,24 +39,24 @@ class GoalHeads(nn.Module):
     def act(self, features: Tensor, code: Tensor, own: Tensor) -> tuple[Tensor, Tensor]:
         """Mean in [-1, 1] and std of the action.
 
-        What is learned is what a goal changes in what the agent would do for its task (residual policy learning,
-        Silver et al. 2018): a body that can swing up its pole need not learn it again.
+        The goal's actor adds to the output of the task's actor (residual policy learning, Silver et al. 2018), so that
+        skills learned for the task need not be learned again.
 
         Args:
-            features: Of states, (..., feature).
-            code: Of goals, broadcasts with them.
-            own: What the task's actor puts out there, (..., 2 action).
+            features: Features of states, (..., feature).
+            code: Codes of goals from `encode`, broadcast to the states.
+            own: Raw output of the task's actor at these states, (..., 2 action).
         """
         return action_distribution(own + self.actor.mlp(self._beside(features, code)))
 
-    def judge(self, features: Tensor, code: Tensor) -> Tensor:
-        """Logits of the discounted worth from there on, (..., bin)."""
+    def value_logits(self, features: Tensor, code: Tensor) -> Tensor:
+        """Logits of the expected discounted worth from a state on, (..., bin)."""
         logits: Tensor = self.value_head(self._beside(features, code))
         return logits
 
     def value(self, features: Tensor, code: Tensor) -> Tensor:
-        """Expected discounted worth from there on, (...)."""
-        return self.value_head.mean(self.judge(features, code))
+        """The expected discounted worth from a state on, (...)."""
+        return self.value_head.mean(self.value_logits(features, code))
 
     @staticmethod
     def _beside(features: Tensor, code: Tensor) -> Tensor:

@@ -1,7 +1,7 @@
 """Heads on the latent state: distributional scalars, a continue logit, and the actor.
 
-Trunks may run in bfloat16 under autocast; every head leaves it before its last layer, because at a
-value of 500 one bfloat16 step is larger than the differences a planner has to tell apart.
+Trunks may run in bfloat16 under autocast. Every head computes its last layer in float32, because at a value of 500 one
+bfloat16 step is larger than the differences that a planner has to distinguish.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from torch.nn import functional
 MIN_ACTION_STD = 0.1
 MAX_ACTION_STD = 1.0
 SYMLOG_LIMIT = 9.0
-LARGEST_SCALAR = math.exp(SYMLOG_LIMIT) - 1.0  # about 8,100; what is beyond saturates
+LARGEST_SCALAR = math.exp(SYMLOG_LIMIT) - 1.0  # about 8,100; larger targets saturate
 
 
 class NormedLinear(nn.Module):
@@ -70,7 +70,7 @@ class ScalarHead(nn.Module):
         return (logits.softmax(-1) * self.values).sum(-1)
 
     def loss(self, logits: Tensor, target: Tensor) -> Tensor:
-        """Cross-entropy (...) to the two bins that enclose each target (...), weighted so that their mean is it."""
+        """Cross-entropy (...) to the two bins around each target (...), weighted so that their mean is the target."""
         position = torch.searchsorted(self.values, target.contiguous()).clamp(1, len(self.values) - 1)
         below, above = self.values[position - 1], self.values[position]
         weight_above = ((target - below) / (above - below)).clamp(0.0, 1.0)

@@ -2,37 +2,38 @@
 
 from __future__ import annotations
 
-from collections.abc import Hashable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import AbstractContextManager
-from typing import Any
 
 import torch
 from torch import Tensor, nn
 
 from latentplan.config import ModelConfig
 from latentplan.config.quantities import TASK_PREFIX
+from latentplan.models.backend import Backend
 from latentplan.models.decoder import Decoder
 from latentplan.models.dynamics import Rssm, State
 from latentplan.models.encoder import Encoder
-from latentplan.models.fast import compiled as fused
-from latentplan.models.fast.rollout import Weights, follow_actor, imagine, lay_out
 from latentplan.models.goal_heads import GoalHeads
 from latentplan.models.heads import Actor, Mlp, ScalarHead, sample_action
 
-PROBE_SHARE = 3  # quantities lie near the surface of the latent: a narrow head reads them
+PROBE_SHARE = 3  # the probe has a third of the other heads' width: quantities are easy to predict from the latent
 
 
 class WorldModel(nn.Module):
-    """Everything an agent needs to see, imagine, judge and act.
+    """Encoder, latent dynamics, decoder and heads.
+
+    The methods `step`, `fast_step`, `rollout`, `propose`, `value`, `policy` and `continues` are the planner's protocol.
+    They continue from the mean of the prior, so that a plan's return depends on its actions alone.
 
     Args:
-        config: Sizes.
+        config: Sizes of the networks.
         action_dim: Size of the action, taken from the environment.
-        labels: Quantities to read off the latent, and the typical size of each.
-        goal_dim: Width of the heads for goals (`GoalHeads`), which learn when all else has; 0 for none.
+        labels: Names and typical sizes of the quantities that `probe` predicts from the latent.
+        goal_dim: Width of the heads for goals (`GoalHeads`), which are trained after everything else; 0 for none.
 
-    The methods `step`, `rollout`, `value`, `policy` and `continues` are the planner's protocol. They follow the
-    mean of the prior, so that a plan's return is a function of its actions alone.
+    Attributes:
+        backend: Computes steps, rollouts and beliefs; the reference, or a faster one that `accelerate` chose.
     """
 
     label_scales: Tensor
@@ -50,11 +51,7 @@ class WorldModel(nn.Module):
         self.continue_head = Mlp(features, config.hidden_dim, 1)
         self.value_head = ScalarHead(features, config.hidden_dim, config.num_bins)
         self.actor = Actor(features, config.hidden_dim, action_dim)
-        self._kept: tuple[Hashable, Weights] | None = None
-        parts = (self.dynamics, self.reward_head, self.value_head, self.actor)
-        self._places = [
-            (module._parameters, name) for part in parts for module in part.modules() for name in module._parameters
-        ]  # of the parameters that imagination reads: walking through the modules takes longer than a step
+        self.backend = Backend()
         self.register_buffer("label_scales", torch.tensor(list(self.labels.values())), persistent=False)
         if self.labels:
             self.probe_head = Mlp(features, max(1, config.hidden_dim // PROBE_SHARE), len(self.labels))
@@ -63,33 +60,33 @@ class WorldModel(nn.Module):
             self.add_goal_heads(goal_dim)
 
     def trunk_precision(self, *, cache: bool = True) -> AbstractContextManager[None]:
-        """Autocast to `trunk_dtype` for the products in the trunk; heads leave it by themselves.
+        """A context in which matrix products use `trunk_dtype`; the last layers of heads stay in float32.
 
         Args:
-            cache: Whether converted weights are kept while it lasts. All threads share one store, which each empties
-                when it leaves: what learns in two threads must not use it, or rounding would depend on timing.
+            cache: Whether autocast keeps converted weights until the context ends. All threads share this cache and
+                empty it on exit, so two learning threads must not use it: rounding would depend on timing.
         """
         dtype = self.trunk_dtype
         return torch.autocast(self.device.type, dtype, enabled=dtype != torch.float32, cache_enabled=cache)
 
     @property
     def trunk_dtype(self) -> torch.dtype:
-        """bfloat16 on a CPU; float32 on a GPU, where converting operands takes longer than such small products save."""
-        return torch.bfloat16 if self.device.type == "cpu" else torch.float32
+        """Precision of the matrix products outside the last layers of heads, as the backend asks for it."""
+        return self.backend.trunk_dtype
 
     @property
     def device(self) -> torch.device:
-        """Where the parameters live."""
+        """The device of the parameters."""
         return self.dynamics.prior_output.weight.device
 
     @property
     def label_names(self) -> tuple[str, ...]:
-        """What `probe` reads, in order; empty where the environment told no quantities."""
+        """The quantities that `probe` predicts, in order; empty for an environment without quantities."""
         return tuple(self.labels)
 
     @property
     def goal_names(self) -> tuple[str, ...]:
-        """The quantities that goals can name, in the order of `goal_quantities`: all but the tasks' rewards."""
+        """The quantities that goals can name, in the order of `goal_quantities`: all labels but rewards of tasks."""
         return tuple(name for name in self.labels if not name.startswith(TASK_PREFIX))
 
     @property
@@ -98,7 +95,7 @@ class WorldModel(nn.Module):
         return self.label_scales[: len(self.goal_names)]
 
     def add_goal_heads(self, goal_dim: int) -> None:
-        """Put fresh heads for goals beside what is there.
+        """Add untrained heads for goals to the model.
 
         Raises:
             ValueError: The model was trained without labels.
@@ -110,63 +107,58 @@ class WorldModel(nn.Module):
         self.goal_dim, self.goal_heads = goal_dim, heads.to(self.device)
 
     def goal_action(self, features: Tensor, code: Tensor) -> tuple[Tensor, Tensor]:
-        """Mean and std of the action, (..., action) each, for the goals of a code; see `GoalHeads.act`."""
+        """Mean and std of the action, (..., action) each, for goals given by their code; see `GoalHeads.act`."""
         mean, std = self.goal_heads.act(features, code, self.actor.mlp(features))
         return mean, std
 
     def goal_quantities(self, features: Tensor) -> Tensor:
-        """The quantities `goal_names` at states with features (..., feature), float32 (..., quantity)."""
+        """Predictions of the quantities `goal_names` for features (..., feature), float32 (..., quantity)."""
         return self.probe(features)[..., : len(self.goal_names)].float()
 
     def probe(self, features: Tensor) -> Tensor:
-        """The quantities `label_names` at states with features (..., feature), in their own units, (..., label).
+        """Predictions of the quantities `label_names` for features (..., feature), in their own units, (..., label).
 
         Raises:
             ValueError: The model was trained without labels.
         """
         if not self.labels:
-            raise ValueError("this model was trained without labels, so no quantity can be read off its latent")
+            raise ValueError("this model was trained without labels, so it predicts no quantities")
         return self.probe_head(features) * self.label_scales
 
     def infer(self, state: State, action: Tensor, frames: Tensor) -> State:
-        """The belief after acting and seeing: posterior mean after `action` (rows, action) led to `frames`.
+        """The belief with the posterior's mean, after `action` and the `frames` that followed.
 
         Args:
-            state: Belief before the action.
-            action: In [-1, 1], (rows, action).
-            frames: uint8 (rows, 64, 64, 3).
+            state: The belief before the action.
+            action: Actions in [-1, 1], (rows, action).
+            frames: Frames after the actions, uint8 (rows, 64, 64, 3).
         """
         return self.see(self.dynamics.advance(state, action), frames)
 
     def see(self, deter: Tensor, frames: Tensor) -> State:
-        """The belief with posterior mean for deter (rows, deter) and uint8 frames (rows, 64, 64, 3)."""
+        """The belief with the posterior's mean for deter (rows, deter) and uint8 frames (rows, 64, 64, 3)."""
         return State(deter, self.dynamics.posterior(deter, self.encoder(frames)).mean)
 
     def step(self, state: State, action: Tensor) -> tuple[State, Tensor]:
-        """Imagine one decision: the next state, and the reward (rows,) that arrives with it."""
-        with self.trunk_precision():
-            following = self._advance_mean(state, action)
-            return following, self.reward_head.mean(self.reward_head(following.features))
+        """The state after action (rows, action), by the mean of the prior, and the reward (rows,) it brings."""
+        return self.backend.step(self, state, action)
 
     def fast_step(self, state: State, action: Tensor) -> tuple[State, Tensor]:
-        """`step`, compiled where that can be, for rows in dim 0 and without gradients."""
-        if self._packed() is None:
-            return self.step(state, action)
-        rewards, following = self.rollout(state, action.unsqueeze(1))
-        return following, rewards.squeeze(1)
+        """The same as `step` up to rounding, faster, for rows in dim 0 and without gradients."""
+        return self.backend.fast_step(self, state, action)
 
     def rollout(self, state: State, actions: Tensor) -> tuple[Tensor, State]:
-        """Imagine action sequences (rows, horizon, action): rewards (rows, horizon) and the last state."""
-        return imagine(self._weights(), state, actions)
+        """Rewards (rows, horizon) along action sequences (rows, horizon, action), and the last state."""
+        return self.backend.rollout(self, state, actions)
 
     def propose(self, state: State, num: int, horizon: int, generators: Sequence[torch.Generator]) -> Tensor:
-        """What the actor does from each state, its mode first and then samples, (batch num, horizon, action).
+        """Action sequences of the actor from each state, its mode first, then samples, (batch num, horizon, action).
 
         Args:
-            state: Rows (batch,).
-            num: Sequences from each.
+            state: The start of the sequences, (batch, ...).
+            num: Sequences per state.
             horizon: Model steps.
-            generators: One stream per row, so that samples do not depend on who shares the call.
+            generators: One random stream per state, so that samples do not depend on the other states of the call.
         """
         draws = [
             torch.randn(num, horizon, self.action_dim, generator=generator, device=self.device)
@@ -175,15 +167,11 @@ class WorldModel(nn.Module):
         noise = torch.stack(draws)
         noise[:, 0] = 0.0
         repeated = State(*(part.repeat_interleave(num, 0) for part in state))
-        return follow_actor(self._weights(), repeated, noise.flatten(0, 1))
+        return self.backend.propose(self, repeated, noise.flatten(0, 1))
 
     def value(self, state: State) -> Tensor:
-        """Expected discounted return from a state on, (rows,)."""
-        packed = self._packed() if state.deter.ndim == 2 else None
-        if packed is not None:
-            return fused.judge(packed, *state)
-        with self.trunk_precision():
-            return self.value_head.mean(self.value_head(state.features))
+        """The expected discounted return from a state on, (rows,)."""
+        return self.backend.value(self, state)
 
     def policy(self, state: State, generator: torch.Generator | None = None) -> Tensor:
         """The actor's action (rows, action): a sample when a generator is given, else its mode."""
@@ -194,44 +182,14 @@ class WorldModel(nn.Module):
         return sample_action(mean, std, torch.randn(mean.shape, generator=generator, device=mean.device))
 
     def continues(self, state: State) -> Tensor:
-        """Probability (rows,) that the episode goes on at a state."""
+        """The probability (rows,) that the episode continues at a state."""
         with self.trunk_precision():
             return torch.sigmoid(self.continue_head(state.features)).squeeze(-1)
 
-    def __getstate__(self) -> dict[str, Any]:
-        return {**self.__dict__, "_kept": None}  # it points into memory
-
-    def _packed(self) -> fused.Packed | None:
-        """What compiled steps and values read; None where torch has to do it, or gradients could be asked for."""
-        return None if torch.is_grad_enabled() else self._weights().packed
-
-    def _weights(self) -> Weights:
-        """Weights laid out for imagination; gradients do not pass through them.
-
-        They are laid out anew when one was written to in place or replaced. Writing through `parameter.data`, and
-        replacing whole modules, goes unseen.
-        """
-        kind, kept = self.device.type, self._kept
-        with self.trunk_precision():
-            dtype = torch.get_autocast_dtype(kind) if torch.is_autocast_enabled(kind) else torch.float32
-        parameters = [place[name] for place, name in self._places]
-        read = [parameter for parameter in parameters if parameter is not None]
-        if read[0].is_inference():  # torch does not count what changes these
-            return lay_out(self.dynamics, self.reward_head, self.value_head, self.actor, dtype)
-        key = (dtype, *((parameter.data_ptr(), parameter._version) for parameter in read))
-        if kept is None or kept[0] != key:
-            kept = (key, lay_out(self.dynamics, self.reward_head, self.value_head, self.actor, dtype))
-            self._kept = kept
-        return kept[1]
-
     def surprise(self, state: State) -> Tensor:
-        """How far the latents of beliefs lie from what was predicted of them, in nats, (rows,).
+        """How far the latents of beliefs lie from the prior, in nats, (rows,).
 
-        Half the squared distance from the prior's mean, in its standard deviations: what a frame told against it.
+        Half the squared distance between the latent and the prior's mean, in standard deviations of the prior.
         """
         prior = self.dynamics.prior(state.deter)
         return 0.5 * ((state.stoch - prior.mean) / prior.std).square().sum(-1)
-
-    def _advance_mean(self, state: State, action: Tensor) -> State:
-        deter = self.dynamics.advance(state, action)
-        return State(deter, self.dynamics.prior(deter).mean)

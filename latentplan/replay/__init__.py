@@ -1,1 +1,1 @@
-"""Experience: a ring of frames and what came with them."""
+"""Replay: a ring buffer of frames, actions and rewards, and an estimate of its memory."""

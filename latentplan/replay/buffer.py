@@ -1,8 +1,8 @@
 """Replay: episodes in, sequence batches out.
 
-Each environment writes its own lane, one row per frame. A row holds the frame, the belief's deterministic state
-at that frame, the action taken there, and the reward and continuation that arrived with the next frame; the last
-row of an episode has no action. Alignment is drawn at the top of a batch: observations are one longer than actions.
+Each environment writes its own lane, one row per frame. A row holds the frame, the deterministic state of the belief at
+that frame, the action taken there, and the reward and continuation that arrived with the next frame. The last row of an
+episode has no action. Of a sequence in a batch, observations are one longer than actions; see `Batch`.
 """
 
 from __future__ import annotations
@@ -23,24 +23,22 @@ from latentplan.replay.memory import check_memory
 FRAME_SHAPE = (64, 64, 3)
 FRAME_BYTES = 64 * 64 * 3
 SAMPLING_ROUNDS = 1000
-COLUMNS = ("deter", "actions", "rewards", "continues", "labels", "plan")
+COLUMNS = ("deter", "actions", "rewards", "continues", "labels")
 LOADED_AT_ONCE = 1024
 
 
 @dataclass
 class Rows:
-    """Consecutive rows of one lane, as collected: arrays of length n, or (n, ...).
+    """Consecutive rows of one lane, as collected: arrays (n, ...).
 
     Attributes:
         frames: uint8 (n, 64, 64, 3).
-        deter: Belief at each frame, float (n, deter).
+        deter: Deterministic state of the belief at each frame, float (n, deter).
         actions: Executed actions in [-1, 1], float32 (n, action); zeros on an episode's last row.
-        rewards: Arriving with the next frame, float32 (n,).
+        rewards: Rewards that arrived with the next frame, float32 (n,).
         continues: 1 unless the episode ended in a terminal state with the next frame, float32 (n,).
         is_first: Whether an episode starts at this row, bool (n,).
         labels: True quantities at each frame, float32 (n, label); none of them without a simulator that tells.
-        plan: Mean and std of the planner's first action there, float32 (n, 2 action); zeros where it did not act.
-            None stands for zeros everywhere.
     """
 
     frames: np.ndarray
@@ -50,25 +48,19 @@ class Rows:
     continues: np.ndarray
     is_first: np.ndarray
     labels: np.ndarray
-    plan: np.ndarray | None = None
-
-    def __post_init__(self) -> None:
-        if self.plan is None:
-            self.plan = np.zeros((len(self.frames), 2 * self.actions.shape[-1]), np.float32)
 
 
 class Batch(NamedTuple):
-    """Sequences of `time` decisions and `time + 1` frames; what follows a terminal state is of another episode.
+    """Sequences of `time` decisions and `time + 1` frames; frames after a terminal state belong to another episode.
 
     Attributes:
         frames: uint8 (batch, time + 1, 64, 64, 3).
-        deter: Belief at the first frame, float32 (batch, deter).
+        deter: Deterministic state of the belief at the first frame, float32 (batch, deter).
         actions: actions[t] was taken at frames[t], (batch, time, action).
         rewards: rewards[t] arrived with frames[t + 1], (batch, time).
-        continues: Whether the episode went on at frames[t + 1], (batch, time).
+        continues: 1 where the episode went on at frames[t + 1], 0 where that is a terminal state, (batch, time).
         labels: True quantities at each frame, (batch, time + 1, label).
         rows: Where each frame lives in replay, (batch, time + 1), for `Replay.refresh`.
-        plan: Mean and std of the planner's action at frames[t], (batch, time, 2 action); zeros where it did not act.
     """
 
     frames: Tensor
@@ -78,28 +70,27 @@ class Batch(NamedTuple):
     continues: Tensor
     labels: Tensor
     rows: Tensor
-    plan: Tensor
 
     @property
     def within(self) -> Tensor:
-        """1 for each transition of the episode that its sequence begins in, 0 beyond its end, (batch, time)."""
+        """1 for transitions of the episode that the sequence begins in, 0 after its terminal state, (batch, time)."""
         before = torch.cat([torch.ones_like(self.continues[:, :1]), self.continues[:, :-1]], 1)
         return before.cumprod(1)
 
 
 class Replay:
-    """A preallocated ring of rows per environment.
+    """A ring buffer of rows for each environment, allocated once.
 
     Args:
-        capacity: Rows in all, split evenly over lanes.
+        capacity: Total number of rows, split evenly over lanes.
         action_dim: Size of the action.
         deter_dim: Size of the stored belief.
-        num_lanes: Environments that write.
-        device: Where the rows live and batches are gathered.
-        num_labels: Quantities that the simulator tells with each frame.
+        num_lanes: Number of environments, each with a lane of its own.
+        device: Device of the rows and of the batches.
+        num_labels: Number of quantities that the simulator reports with each frame.
 
     Raises:
-        UserError: The rows do not fit into nine tenths of the memory that is free.
+        UserError: The rows do not fit into nine tenths of the free memory.
     """
 
     def __init__(
@@ -122,18 +113,17 @@ class Replay:
         self.rewards = torch.zeros(total, device=device)
         self.continues = torch.ones(total, device=device)
         self.labels = torch.zeros(total, num_labels, device=device)
-        self.plan = torch.zeros(total, 2 * action_dim, device=device)
         self.episode = np.full((num_lanes, self.lane_size), -1, dtype=np.int64)
-        self.is_end = np.zeros((num_lanes, self.lane_size), dtype=bool)  # whose action led to a terminal state
+        self.is_end = np.zeros((num_lanes, self.lane_size), dtype=bool)  # rows whose action led to a terminal state
         self.written = np.zeros(num_lanes, dtype=np.int64)
         self._saved = np.zeros(num_lanes, dtype=np.int64)
 
     def __len__(self) -> int:
-        """Rows held."""
+        """Number of rows held."""
         return int(np.minimum(self.written, self.lane_size).sum())
 
     def add(self, lane: int, rows: Rows) -> None:
-        """Append consecutive rows to a lane, overwriting its oldest when it is full."""
+        """Appends consecutive rows to a lane; a full lane overwrites its oldest rows."""
         count = len(rows.frames)
         newest = np.arange(count)[-self.lane_size :]
         positions = (self.written[lane] + newest) % self.lane_size
@@ -147,10 +137,15 @@ class Replay:
         self.written[lane] += count
 
     def draw(self, batch_size: int, sequence_length: int, rng: np.random.Generator) -> Tensor:
-        """Where uniformly drawn sequences live: rows (batch, time + 1).
+        """Rows of uniformly drawn sequences, (batch, time + 1).
 
-        Each lies within one episode, or reaches beyond its end if that is a terminal state: else the ends, which are
-        all that there is to learn of ending, would be drawn once for the `sequence_length` times of other rows.
+        A sequence lies within one episode, or reaches beyond its terminal state. Without the second case a single start
+        would reach the transition to a terminal state, while `sequence_length` starts reach any other transition.
+
+        Args:
+            batch_size: Number of sequences.
+            sequence_length: Decisions in each sequence; a sequence has one row more.
+            rng: Random stream of the draw.
 
         Raises:
             UserError: No episode is long enough.
@@ -161,7 +156,7 @@ class Replay:
         return torch.as_tensor(positions, device=self.device)
 
     def gather(self, rows: Tensor) -> Batch:
-        """The sequences that live at rows (batch, time + 1); reads nothing back from the device."""
+        """The sequences at rows (batch, time + 1); nothing is read back from the device."""
         acted = rows[:, :-1]
         return Batch(
             frames=self.frames[rows],
@@ -171,13 +166,15 @@ class Replay:
             continues=self.continues[acted],
             labels=self.labels[rows],
             rows=rows,
-            plan=self.plan[acted],
         )
 
     def refresh(self, rows: Tensor, deter: Tensor, chosen: Tensor) -> None:
-        """Replace the stored beliefs at rows (batch, time) with newer ones (batch, time, deter).
+        """Replaces the stored beliefs of some rows by newer beliefs.
 
-        Only those `chosen`, bool (batch, time), are read. Where a row occurs more than once, the last one counts.
+        Args:
+            rows: Indices in the replay, (batch, time). Of a row that occurs twice the last chosen belief counts.
+            deter: The newer beliefs, (batch, time, deter).
+            chosen: The beliefs to store, bool (batch, time).
         """
         index = rows.flatten().to(self.device)
         is_chosen = chosen.to(self.device).flatten()
@@ -188,10 +185,13 @@ class Replay:
         self.deter[index] = torch.where(is_chosen[last, None], newer, self.deter[index])
 
     def save(self, folder: Path) -> None:
-        """Write what is new since the last save; `load` restores exactly what the last whole save held.
+        """Writes the rows that are new since the last save; `load` restores the last save that was completed.
 
-        Unless the capacity has been exceeded: then a save that is cut off leaves new frames beside the older rows (the
-        first save after a capacity was changed writes all of them).
+        Once the ring has overwritten rows, an interrupted save leaves new frames beside older rows. The first save
+        after a change of the capacity writes all rows.
+
+        Args:
+            folder: Folder of the replay, made where it is missing.
         """
         folder.mkdir(parents=True, exist_ok=True)
         for lane in range(self.num_lanes):
@@ -210,10 +210,10 @@ class Replay:
         self._saved = self.written.copy()
 
     def load(self, folder: Path) -> None:
-        """Restore what `save` wrote; where the capacity is smaller now, the newest rows of it.
+        """Restores the rows that `save` wrote; where the capacity is smaller now, the newest of them.
 
         Raises:
-            UserError: The folder holds no whole replay, or not one of the same lanes, actions and beliefs.
+            UserError: The folder holds no complete replay, or its lanes, actions, beliefs or labels have other sizes.
         """
         if not (folder / "rows.pt").exists():
             raise UserError(f"no replay found in {folder}")
@@ -239,7 +239,7 @@ class Replay:
             self._load_frames(folder / f"frames_{lane}.u8", min(written, saved_size), old, index)
 
     def _load_frames(self, path: Path, count: int, slots: np.ndarray, index: Tensor) -> None:
-        """Copy frames from slots of a file that holds `count` of them to rows of this replay."""
+        """Copies the frames at `slots` of a file of `count` frames to the rows `index` of this replay."""
         if count == 0:
             return
         if not path.exists() or path.stat().st_size < count * FRAME_BYTES:
@@ -276,15 +276,15 @@ class Replay:
 
 
 def read_saved(path: Path, device: torch.device | str = "cpu", keys: Sequence[str] = ()) -> Any:
-    """What `torch.save` wrote.
+    """The object that `torch.save` wrote to a file.
 
     Args:
         path: The file.
-        device: Where its tensors go.
-        keys: Of a dictionary, what it must hold.
+        device: Device of the tensors.
+        keys: Keys that the object, then a dictionary, must have.
 
     Raises:
-        UserError: The file is damaged, or holds something else.
+        UserError: The file is damaged, or lacks one of the keys.
     """
     try:
         saved = torch.load(path, map_location=device, weights_only=True)
@@ -297,4 +297,4 @@ def read_saved(path: Path, device: torch.device | str = "cpu", keys: Sequence[st
 
 def replay_bytes(num_rows: int, action_dim: int, deter_dim: int, num_labels: int = 0) -> int:
     """Memory that a replay of `num_rows` rows takes, in bytes."""
-    return num_rows * (FRAME_BYTES + 2 * deter_dim + 4 * (3 * action_dim + num_labels) + 4 + 4 + 8 + 1)
+    return num_rows * (FRAME_BYTES + 2 * deter_dim + 4 * (action_dim + num_labels) + 4 + 4 + 8 + 1)

@@ -1,4 +1,4 @@
-"""How much memory there is for a replay."""
+"""The memory that is free for a replay."""
 
 from __future__ import annotations
 
@@ -18,10 +18,14 @@ LIMIT_FACTS = Path("/sys/fs/cgroup")
 
 
 def check_memory(num_bytes: int, device: torch.device) -> None:
-    """That a replay of so many bytes fits into nine tenths of what the device has free.
+    """Checks that a replay fits into nine tenths of the device's free memory.
+
+    Args:
+        num_bytes: Size of the replay.
+        device: Device of the replay.
 
     Raises:
-        UserError: It does not.
+        UserError: The replay does not fit.
     """
     if device.type == "cuda":
         import torch
@@ -37,12 +41,12 @@ def check_memory(num_bytes: int, device: torch.device) -> None:
 
 
 def free_memory() -> int:
-    """Bytes of main memory that can be had, within a container's limit; `sys.maxsize` where nothing is known."""
+    """Bytes of free main memory within a container's limit; `sys.maxsize` where the system does not say."""
     return min(_machine_memory(), _left_of_limit())
 
 
 def _machine_memory() -> int:
-    """What the machine has available; without /proc all that it has."""
+    """Bytes of available memory of the machine; without /proc its total memory."""
     if MEMORY_FACTS.exists():
         for line in MEMORY_FACTS.read_text().splitlines():
             if line.startswith("MemAvailable:"):
@@ -53,7 +57,7 @@ def _machine_memory() -> int:
 
 
 def _left_of_limit() -> int:
-    """What the control group (version 2) of a container leaves, counting file pages that can be dropped as free."""
+    """Bytes left by the control group (version 2) of a container; inactive file pages count as free."""
     try:
         limit = (LIMIT_FACTS / "memory.max").read_text().strip()
         used = int((LIMIT_FACTS / "memory.current").read_text())

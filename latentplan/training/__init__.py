@@ -1,4 +1,4 @@
-"""Learning: losses, the Lightning module, collection, the run itself, distillation and goals."""
+"""Training runs, distillation of the planner into the actor, and goal conditioning."""
 
 from latentplan.training.distillation.run import distill, resume_distillation
 from latentplan.training.goal_conditioning.run import learn_goals, resume_goals

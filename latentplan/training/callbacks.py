@@ -1,10 +1,12 @@
-"""When things happen in a run: collecting, evaluating, saving, stopping."""
+"""The callbacks of a training run: collect, evaluate, write metrics, save, restore and stop."""
 
 from __future__ import annotations
 
 import copy
+import csv
 import signal
 import sys
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -18,20 +20,34 @@ from latentplan.models import WorldModel
 from latentplan.replay.buffer import Replay
 from latentplan.training.collection.collector import Collected
 from latentplan.training.collection.process import Worker
-from latentplan.training.learner.optimization import take_up
+from latentplan.training.learner.optimization import load_optimizer_state
 from latentplan.training.state import INTERRUPTED, RunState, save_state
 
 if TYPE_CHECKING:
+    from latentplan.training.console import Progress
     from latentplan.training.learner.module import Learner
 
 SAVE_MINUTES = 5.0
+CLOCKS = ("env_frames", "decisions", "updates", "minutes")
+COLUMNS = (*CLOCKS, "episode_return", "planner_return", "actor_return", "planner_minus_actor")  # losses follow these
 
 
 class Experience(lightning.Callback):
-    """Collects one round per epoch, and evaluates when it is due.
+    """Collects one round of experience per epoch, and evaluates the agent when an evaluation is due.
 
-    A round is asked for when an epoch starts and taken when the next one does, so a worker in another process acts,
-    with the averaged weights of its start, while the learner learns.
+    This callback asks the worker for a round when an epoch starts, and takes the result when the next epoch starts. A
+    worker in another process therefore acts while the learner learns, with the averaged weights of the epoch's start.
+
+    Args:
+        config: Settings of the run.
+        replay: Where collected rows go.
+        state: Clocks of the run, which this callback advances.
+        worker: Collects and evaluates.
+        videos: Folder for the films of evaluations.
+
+    Attributes:
+        episode_returns: Returns of the episodes that ended since the last row of metrics.
+        evaluated_weights: Weights that the latest evaluation measured.
     """
 
     def __init__(self, config: Config, replay: Replay, state: RunState, worker: Worker, videos: Path) -> None:
@@ -42,7 +58,7 @@ class Experience(lightning.Callback):
         self._asked_round = False
 
     def on_train_epoch_start(self, trainer: lightning.Trainer, learner: Learner) -> None:  # type: ignore[override]
-        """Take what was asked for an epoch ago, and ask for what comes next."""
+        """Take the results asked for one epoch ago, and ask for the next round and evaluation."""
         settings, state = self.config.collection, self.state
         while (missing := min(settings.prefill_decisions - state.decisions, self._decisions_left())) > 0:
             self.worker.submit("collect", None, "random", missing, state.rounds)
@@ -52,7 +68,7 @@ class Experience(lightning.Callback):
                 trainer.should_stop = True
                 return
         weights = weights_of(learner.averaged)
-        if not self._asked_round and state.rounds == state.learned_rounds:  # a run that goes on has nothing to learn
+        if not self._asked_round and state.rounds == state.learned_rounds:  # a resumed run has no new experience yet
             self._ask_round(weights)
         self.take()
         if state.interrupted:
@@ -62,15 +78,16 @@ class Experience(lightning.Callback):
             self._ask_evaluation(learner.updates, weights)
 
     def on_train_epoch_end(self, trainer: lightning.Trainer, learner: Learner) -> None:  # type: ignore[override]
-        """Bring the behaviour up to date before anything else looks at the learner."""
+        """Finish the behaviour update that still runs, before other callbacks read the learner."""
         learner.catch_up()
         if not self.state.interrupted:
             self.state.learned_rounds = self.state.rounds
 
     def take(self) -> None:
-        """Wait for what was asked for, if anything was.
+        """Wait for the round and the evaluation that were asked for, and store their results.
 
-        A signal to the whole group of processes ends the one that was asked: what it owed is due again after a resume.
+        A signal to the whole process group also ends the worker. An interrupted run therefore drops the requests that
+        the worker cannot answer; the resumed run makes them again.
         """
         try:
             self._take()
@@ -88,18 +105,18 @@ class Experience(lightning.Callback):
             clocks, self.evaluated_weights = self._asked_evaluation
             entry = clocks | {mode: float(np.mean(values)) for mode, values in returns.items()}
             self.state.evaluations.append(entry)
-            # Only now: an evaluation that an interruption cuts off is due again.
+            # The date moves on only now, so that an evaluation cut off by an interruption is due again.
             every = self.config.evaluation.every_frames
             self.state.next_evaluation = (entry["env_frames"] // every + 1) * every
             self._asked_evaluation = None
 
     def _ask_round(self, weights: dict[str, np.ndarray]) -> None:
-        """Ask for the next round, if the budget has one."""
+        """Ask for the next round, if the budget has frames left."""
         settings, state = self.config.collection, self.state
         decisions = min(settings.round_decisions, self._decisions_left())
         if decisions > 0:
-            behaviour, noisy, goal = turn(settings, state.rounds, state.env_frames)
-            self.worker.submit("collect", weights, behaviour, decisions, state.rounds, noisy, goal)
+            behaviour, goal = choose_behaviour(settings, state.rounds, state.env_frames)
+            self.worker.submit("collect", weights, behaviour, decisions, state.rounds, goal)
             self._asked_round = True
 
     def _decisions_left(self) -> int:
@@ -126,29 +143,148 @@ class Experience(lightning.Callback):
 
 
 def weights_of(model: WorldModel) -> dict[str, np.ndarray]:
-    """A copy of a model's state, as workers take it."""
+    """A copy of a model's state as NumPy arrays, which workers in other processes accept."""
     return {name: value.detach().cpu().numpy().copy() for name, value in model.state_dict().items()}
 
 
-def turn(settings: CollectionConfig, rounds: int, env_frames: int) -> tuple[str, bool, str | None]:
-    """Who collects after so many rounds and simulator frames, whether with noise, and for which goal if for one.
+def choose_behaviour(settings: CollectionConfig, rounds: int, env_frames: int) -> tuple[str, str | None]:
+    """Chooses the behaviour of the next collection round, and its goal.
 
-    Planner and actor take turns in the rounds without a goal; all three share the noise evenly.
+    With `behaviour` "both", planner and actor alternate in the rounds without a goal.
+
+    Args:
+        settings: Settings of collection.
+        rounds: Rounds collected before.
+        env_frames: Simulator frames collected before.
+
+    Returns:
+        "planner" or "actor", and the expression that the planner pursues instead of the reward, or None.
     """
-    goals, share = 0, settings.goal_share
+    num_goals, share = 0, settings.goal_share
     if share > 0.0 and env_frames >= settings.goals_after:
-        goals = int(rounds * share)
-        if int((rounds + 1) * share) > goals:
-            return "planner", True, settings.goals[goals % len(settings.goals)]
-    own, behaviour = rounds - goals, settings.behaviour
-    if behaviour == "both":
-        own, who = divmod(own, 2)
-        behaviour = ("planner", "actor")[who]
-    return behaviour, True, None
+        num_goals = int(rounds * share)
+        if int((rounds + 1) * share) > num_goals:
+            return "planner", settings.goals[num_goals % len(settings.goals)]
+    if settings.behaviour == "both":
+        return ("planner", "actor")[(rounds - num_goals) % 2], None
+    return settings.behaviour, None
+
+
+class MetricsFile:
+    """A CSV file whose header grows with the names of its rows.
+
+    The header begins with `columns`; every other name follows in the order in which it was first appended. A row with a
+    new name rewrites the file under the longer header: earlier rows keep their figures and stay empty in new columns.
+
+    Args:
+        path: The file; it need not exist.
+        columns: Names that begin the header of a new file.
+    """
+
+    def __init__(self, path: Path, columns: Sequence[str]) -> None:
+        self.path, self.columns = path, tuple(columns)
+
+    def append(self, row: Mapping[str, float]) -> None:
+        """Add one row; a name of the header that the row lacks stays empty."""
+        header = self._read_header()
+        columns = list(dict.fromkeys([*(header or self.columns), *row]))
+        if columns != header:
+            self._write(columns, self._read_rows())
+        with self.path.open("a", newline="") as file:
+            csv.DictWriter(file, columns).writerow(row)
+
+    def drop_rows(self, is_dropped: Callable[[dict[str, str]], bool]) -> None:
+        """Rewrite the file without some rows, and without a last row that was written only in part."""
+        if self.path.exists():
+            kept = [row for row in self._read_rows() if not is_dropped(row)]
+            self._write(self._read_header() or self.columns, kept)
+
+    def _read_header(self) -> list[str]:
+        if not self.path.exists():
+            return []
+        with self.path.open(newline="") as file:
+            return next(csv.reader(file), [])
+
+    def _read_rows(self) -> list[dict[str, str]]:
+        if not self.path.exists():
+            return []
+        with self.path.open(newline="") as file:
+            return [row for row in csv.DictReader(file) if None not in row.values()]
+
+    def _write(self, columns: Sequence[str], rows: Iterable[Mapping[str, str]]) -> None:
+        part = self.path.with_name(f"{self.path.name}.part")
+        with part.open("w", newline="") as file:
+            writer = csv.DictWriter(file, columns)
+            writer.writeheader()
+            writer.writerows(rows)
+        part.replace(self.path)
+
+
+class Record(lightning.Callback):
+    """Writes metrics.csv and TensorBoard events once per epoch, and moves the progress display.
+
+    Every entry of `Learner.metrics` becomes a column and a TensorBoard scalar of the same name.
+
+    Args:
+        path: Path of metrics.csv.
+        state: Clocks and evaluations of the run.
+        experience: Source of the returns of collected episodes.
+        progress: Display of the run.
+    """
+
+    def __init__(self, path: Path, state: RunState, experience: Experience, progress: Progress) -> None:
+        self.file, self.state, self.experience, self.progress = MetricsFile(path, COLUMNS), state, experience, progress
+        self._num_written_evaluations = len(state.evaluations)
+
+    def on_fit_start(self, trainer: lightning.Trainer, learner: Learner) -> None:  # type: ignore[override]
+        """Drop the rows that a killed run wrote after its last save, because the resumed run writes them again."""
+        clocks = {"env_frames": self.state.env_frames, "updates": learner.updates}
+        self.file.drop_rows(lambda row: any(int(row[name]) > now for name, now in clocks.items()))
+
+    def on_train_batch_end(self, trainer: lightning.Trainer, learner: Learner, *_: Any) -> None:  # type: ignore[override]
+        """Update the progress display."""
+        self.progress.update(self.state, learner.updates)
+
+    def on_train_epoch_end(self, trainer: lightning.Trainer, learner: Learner) -> None:  # type: ignore[override]
+        """Append one row for the epoch, after the rows of finished evaluations."""
+        self.write_evaluations(trainer)
+        state = self.state
+        clocks = {"env_frames": state.env_frames, "decisions": state.decisions, "updates": learner.updates}
+        row: dict[str, float] = clocks | {"minutes": round(state.minutes, 3)}
+        if self.experience.episode_returns:
+            row["episode_return"] = float(np.mean(self.experience.episode_returns))
+            self.progress.episode_return = row["episode_return"]
+            self.experience.episode_returns.clear()
+        for name in sorted(learner.metrics, key=lambda name: name.endswith("_grad_norm")):  # losses, then the norms
+            row[name] = float(learner.metrics[name])
+        self._append(trainer, row)
+
+    def write_evaluations(self, trainer: lightning.Trainer) -> None:
+        """Append one row per new evaluation, with the clocks of the weights that were evaluated."""
+        for entry in self.state.evaluations[self._num_written_evaluations :]:
+            returns = {"planner_return": entry["planner"], "actor_return": entry["actor"]}
+            difference = {"planner_minus_actor": entry["planner"] - entry["actor"]}
+            self._append(trainer, {name: entry[name] for name in CLOCKS} | returns | difference)
+            self.progress.show_evaluation(entry)
+        self._num_written_evaluations = len(self.state.evaluations)
+
+    def _append(self, trainer: lightning.Trainer, row: dict[str, float]) -> None:
+        if trainer.logger is not None:
+            trainer.logger.log_metrics(row, step=int(row["env_frames"]))
+        self.file.append(row)
 
 
 class Save(lightning.Callback):
-    """Keeps the last agent, the best one, and what it takes to resume."""
+    """Saves the last agent, the best agent, and the state from which a run resumes.
+
+    Args:
+        folder: Folder of the run.
+        config: Settings of the run.
+        experience: Source of the evaluated weights and of the replay.
+        state: Clocks and evaluations of the run.
+        facts: Facts of the run that every saved agent carries.
+        optimizers: States that the optimizers were loaded with; saved again if the run ends before it learns.
+    """
 
     def __init__(
         self,
@@ -161,7 +297,7 @@ class Save(lightning.Callback):
     ) -> None:
         self.folder, self.config, self.experience, self.state, self.facts = folder, config, experience, state, facts
         self._loaded_optimizers = optimizers
-        self._kept_evaluations = len(state.evaluations)
+        self._num_seen_evaluations = len(state.evaluations)
         self._saved_minutes = state.minutes
 
     def on_train_epoch_end(self, trainer: lightning.Trainer, learner: Learner) -> None:  # type: ignore[override]
@@ -170,16 +306,20 @@ class Save(lightning.Callback):
             self.save(trainer, learner)
 
     def keep_best(self, learner: Learner) -> bool:
-        """Keep the agent of an evaluation that has come in, if it is the best; whether one has come in."""
-        if len(self.state.evaluations) == self._kept_evaluations:
+        """Save the latest evaluated agent if its planner is the best so far.
+
+        Returns:
+            Whether an evaluation finished since the last call.
+        """
+        if len(self.state.evaluations) == self._num_seen_evaluations:
             return False
-        self._kept_evaluations = len(self.state.evaluations)
+        self._num_seen_evaluations = len(self.state.evaluations)
         if (latest := self.state.evaluations[-1])["planner"] > self.state.best_return:
             self.state.best_return = latest["planner"]
-            judged = copy.deepcopy(learner.averaged)
+            evaluated = copy.deepcopy(learner.averaged)
             weights = self.experience.evaluated_weights
-            judged.load_state_dict({name: torch.from_numpy(value) for name, value in weights.items()})
-            self.save_agent("best", judged, {name: latest[name] for name in ("env_frames", "updates", "minutes")})
+            evaluated.load_state_dict({name: torch.from_numpy(value) for name, value in weights.items()})
+            self.save_agent("best", evaluated, {name: latest[name] for name in ("env_frames", "updates", "minutes")})
         return True
 
     def save(self, trainer: lightning.Trainer, learner: Learner) -> None:
@@ -189,57 +329,66 @@ class Save(lightning.Callback):
         self._saved_minutes = self.state.minutes
 
     def save_run(self, trainer: lightning.Trainer, learner: Learner) -> None:
-        """Save what it takes to resume."""
+        """Save the state from which the run resumes."""
         optimizers = [optimizer.state_dict() for optimizer in trainer.optimizers] or self._loaded_optimizers
         saved = {"weights": learner.state_dict(), "updates": learner.updates}
         save_state(self.folder / "resume", self.state, saved, optimizers, self.experience.replay)
 
     def save_agent(self, name: str, model: WorldModel, info: dict[str, Any]) -> None:
-        """Save an agent under a name, with facts of its own beside those of the run."""
+        """Save an agent in `checkpoints/<name>`, with its own facts beside the facts of the run."""
         facts = self.facts | info | {"metrics": self.state.evaluations}
         save_checkpoint(self.folder / "checkpoints" / name, model, self.config, facts)
 
     def clocks(self, learner: Learner) -> dict[str, Any]:
-        """Where the present agent stands."""
+        """The frames, updates and minutes of the present agent."""
         return {"env_frames": self.state.env_frames, "updates": learner.updates, "minutes": self.state.minutes}
 
 
 class Restore(lightning.Callback):
-    """Gives the optimizers the state they were saved with, if they were."""
+    """Loads saved states into the optimizers of a resumed run.
+
+    Args:
+        optimizers: One saved state per optimizer; empty for a new run.
+    """
 
     def __init__(self, optimizers: list[Any]) -> None:
         self.optimizers = optimizers
 
     def on_fit_start(self, trainer: lightning.Trainer, learner: lightning.LightningModule) -> None:
-        """Take up what was saved."""
+        """Load the saved states, after Lightning has made the optimizers."""
         for optimizer, saved in zip(trainer.optimizers, self.optimizers, strict=True) if self.optimizers else ():
-            take_up(optimizer, saved)
+            load_optimizer_state(optimizer, saved)
 
 
 class Stop(lightning.Callback):
-    """Ends the run at its budget, or when the user interrupts; a second Ctrl-C ends it at once."""
+    """Ends the run at its budget, or when the user interrupts; a second Ctrl-C ends the process at once.
+
+    Args:
+        config: Settings of the run, with its budget.
+        state: Clocks of the run, and whether the user interrupted it.
+    """
 
     def __init__(self, config: Config, state: RunState) -> None:
         self.run, self.state = config.run, state
         self._previous: dict[int, Any] = {}
 
     def on_train_start(self, trainer: lightning.Trainer, learner: lightning.LightningModule) -> None:
-        """Take over the signals."""
+        """Install the signal handlers."""
         for number in (signal.SIGINT, signal.SIGTERM):
             self._previous[number] = signal.signal(number, self._interrupt)
 
     def on_train_batch_end(self, trainer: lightning.Trainer, *_: Any) -> None:  # type: ignore[override]
-        """Stop between two updates when time is up or the user asks."""
+        """Stop between two updates when the minutes are spent or the user interrupted."""
         if self.state.interrupted or self._is_late():
             trainer.should_stop = True
 
     def on_train_epoch_end(self, trainer: lightning.Trainer, learner: lightning.LightningModule) -> None:
-        """Stop when the last round has been learned from."""
+        """Stop when the learner has learned from the last round."""
         if self.is_spent():
             trainer.should_stop = True
 
     def on_train_end(self, trainer: lightning.Trainer, learner: lightning.LightningModule) -> None:
-        """Give the signals back."""
+        """Restore the previous signal handlers."""
         for number, handler in self._previous.items():
             signal.signal(number, handler)
 

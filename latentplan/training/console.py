@@ -1,4 +1,4 @@
-"""What a run shows while it lasts."""
+"""Progress of a run on the terminal or in a log."""
 
 from __future__ import annotations
 
@@ -15,7 +15,15 @@ SECONDS_IN_A_LOG = 30.0
 
 
 class Progress:
-    """One live line on a terminal, one line every half minute in a log, and one line per evaluation."""
+    """Shows one live line on a terminal or one line every 30 seconds in a log, and one line per evaluation.
+
+    Args:
+        run: Budget of the run, from which the remaining time is estimated.
+
+    Attributes:
+        console: For lines that stay.
+        episode_return: Mean return of the latest collected episodes, or None.
+    """
 
     def __init__(self, run: RunConfig) -> None:
         self.run, self.console = run, Console(highlight=False)
@@ -26,18 +34,18 @@ class Progress:
         self._live = self.console.status("starting") if self.console.is_terminal else None
 
     def start(self, updates: int) -> None:
-        """Begin to show; `updates` were done before."""
+        """Start the display of a run that has made `updates` updates before."""
         self._last_time, self._last_updates = time.monotonic(), updates
         if self._live is not None:
             self._live.start()
 
     def stop(self) -> None:
-        """Leave the terminal as it was."""
+        """End the live line."""
         if self._live is not None:
             self._live.stop()
 
     def update(self, state: RunState, updates: int) -> None:
-        """Show where the run stands, if it is time to."""
+        """Show clocks and speed, unless the last line is too recent."""
         now = time.monotonic()
         pause = SECONDS_IN_A_LOG if self._live is None else SECONDS_ON_A_TERMINAL
         if now - self._last_time < pause:
@@ -51,7 +59,7 @@ class Progress:
             self._live.update(line)
 
     def show_evaluation(self, entry: dict[str, Any]) -> None:
-        """One lasting line for an evaluation."""
+        """Print one line for an evaluation, an entry of `RunState.evaluations`."""
         planner, actor = entry["planner"], entry["actor"]
         self._evaluation = f"planner {planner:.0f}, actor {actor:.0f}"
         self.console.print(
@@ -75,7 +83,7 @@ class Progress:
 
 
 class StatusLine:
-    """One live line on a terminal, one line every half minute in a log, and lasting lines between them."""
+    """Shows one live line on a terminal or one line every 30 seconds in a log, between lines that stay."""
 
     def __init__(self) -> None:
         self.console = Console(highlight=False)
@@ -92,7 +100,7 @@ class StatusLine:
             self._live.stop()
 
     def update(self, line: str) -> None:
-        """Show what is being done, if it is time to."""
+        """Show the present activity, unless the last line in the log is too recent."""
         if self._live is not None:
             self._live.update(line)
         elif time.monotonic() - self._last_time >= SECONDS_IN_A_LOG:
@@ -100,5 +108,5 @@ class StatusLine:
             self.console.print(line, soft_wrap=True)
 
     def print(self, line: str) -> None:
-        """Show a line that stays."""
+        """Print a line that stays."""
         self.console.print(line, soft_wrap=True)

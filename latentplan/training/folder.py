@@ -1,4 +1,4 @@
-"""One learning in one folder at a time: two that save to the same files would ruin both."""
+"""The folder of a run: refuse folders in use, and lock a folder while a process learns in it."""
 
 from __future__ import annotations
 
@@ -10,42 +10,44 @@ from pathlib import Path
 
 from latentplan.agents.checkpoint import INFO
 from latentplan.config import UserError, make_folder
-from latentplan.training.distillation.standing import STATE_FILE
 
-LOCK = ".lock"
+LOCK_FILE = ".lock"
+RUN_FILE = "config.yaml"
 GOALS_FILE = "goals.pt"
-MARKS = {"config.yaml": "a run", INFO: "an agent", GOALS_FILE: "an agent", str(STATE_FILE): "an agent"}
+DISTILLATION_FILE = Path("resume") / "distill.pt"
+CONTENTS = {RUN_FILE: "a run", INFO: "an agent", GOALS_FILE: "an agent", str(DISTILLATION_FILE): "an agent"}
 
 
-def refuse_used(folder: Path, own: str, flag: str) -> None:
-    """Refuses a folder in which something has been learned: its agent would be mistaken for the new one.
+def refuse_used(folder: Path, own_file: str, flag: str) -> None:
+    """Refuses a folder that already holds a run or an agent.
 
     Args:
-        folder: Where something new is to go.
-        own: The one of `MARKS` from which the same kind of learning can go on.
-        flag: What names another folder.
+        folder: Where a new run or agent is about to be written.
+        own_file: The file in `CONTENTS` from which the caller could resume; the message then names `--resume`.
+        flag: The flag that chooses another folder.
 
     Raises:
-        UserError: There is something.
+        UserError: The folder holds one of the files in `CONTENTS`.
     """
-    for name, what in MARKS.items():
+    for name, content in CONTENTS.items():
         if (folder / name).exists():
-            go_on = f"go on with --resume {folder} (or resume from Python), or " if (folder / own).exists() else ""
-            raise UserError(f"{folder} already holds {what}: {go_on}choose another {flag}")
+            can_resume = (folder / own_file).exists()
+            advice = f"go on with --resume {folder} (or resume from Python), or " if can_resume else ""
+            raise UserError(f"{folder} already holds {content}: {advice}choose another {flag}")
 
 
 @contextlib.contextmanager
-def claim(folder: Path) -> Iterator[None]:
-    """Make a folder where needed and hold it against every other claim; let go at the end, however the process ends.
+def lock_folder(folder: Path) -> Iterator[None]:
+    """Makes a folder if needed, and locks it until the context or the process ends.
 
-    A file system that knows no locks is trusted.
+    On a file system without locks the folder stays unlocked.
 
     Raises:
-        UserError: Another process learns there, or the folder cannot be made.
+        UserError: Another process holds the lock, or the folder cannot be made.
     """
     make_folder(folder)
     try:
-        lock = os.open(folder / LOCK, os.O_RDWR | os.O_CREAT, 0o666)
+        lock = os.open(folder / LOCK_FILE, os.O_RDWR | os.O_CREAT, 0o666)
     except OSError as error:
         raise UserError(f"cannot write to {folder}: {error.strerror}; choose another") from None
     try:

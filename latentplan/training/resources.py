@@ -1,4 +1,4 @@
-"""What a run takes of its machine: device, threads, replay."""
+"""Resources of a run: device, threads and the size of the replay."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ from latentplan.config import Config, RunConfig, UserError
 from latentplan.replay.buffer import FRAME_BYTES
 
 UNKNOWN_LENGTH_CAPACITY = 200_000
-COLLECTOR_THREADS = 4  # at most: runs often share a machine
+COLLECTOR_THREADS = 4  # an upper limit, because runs often share a machine
 
 
 def choose_device(run: RunConfig) -> torch.device:
-    """The device a run learns on.
+    """The device on which a run learns; "auto" takes CUDA if there is one.
 
     Raises:
-        UserError: CUDA was asked for, and there is none.
+        UserError: The settings ask for CUDA, but torch finds no CUDA device.
     """
     if run.device == "cuda" and not torch.cuda.is_available():
         raise UserError("device cuda was asked for, but torch finds no CUDA device: use --device cpu")
@@ -28,32 +28,32 @@ def choose_device(run: RunConfig) -> torch.device:
 
 
 def choose_threads(overlap: bool) -> int:
-    """Threads of each half of an update.
+    """Threads of each half of an update, so that no two busy threads share a core.
 
-    Model and behaviour each take this many, and one core is left to the process that collects, if there is one: threads
-    that wait for each other on a shared core crawl.
+    The world model and the behaviour learn side by side with this many threads each. With `overlap` one core is left to
+    the collection process.
     """
     return max(1, (_count_cores() - overlap) // 2)
 
 
 def collector_threads(device: torch.device) -> int:
-    """Threads of a process that collects beside a learner on a device: one where the learner wants the cores itself."""
+    """Threads of the collection process beside a learner: one beside a CPU learner, up to 4 beside a GPU learner."""
     return 1 if device.type == "cpu" else min(max(1, _count_cores() // 4), COLLECTOR_THREADS)
 
 
 def set_up_torch(threads: int, device: torch.device) -> None:
-    """Have torch compute with so many threads and, on a GPU, on its tensor cores."""
+    """Sets torch's number of CPU threads and, on a GPU, lets matrix products use tensor cores."""
     torch.set_num_threads(threads)
     if device.type == "cuda":
         torch.set_float32_matmul_precision("high")  # TF32, which has three more bits than bfloat16
 
 
 def replay_capacity(config: Config, saved: Path) -> int:
-    """Rows that hold everything a run collects, unless the settings say how many.
+    """Rows of the replay: `replay.capacity`, or else enough for everything that the run collects.
 
     Args:
         config: Settings of the run.
-        saved: Where its replay is saved, if it is: what lies there stays, whatever the budget is now.
+        saved: Folder of the saved replay, if there is one: the capacity never drops below the saved rows.
     """
     if config.replay.capacity is not None:
         return config.replay.capacity
@@ -61,7 +61,7 @@ def replay_capacity(config: Config, saved: Path) -> int:
     held = len(lanes) * max(lanes, default=0)
     if config.run.frames is None:
         return max(UNKNOWN_LENGTH_CAPACITY, held)
-    # Two rounds may run past the budget, and every episode ends with one frame without an action.
+    # Up to two rounds exceed the budget, and every episode ends with one frame without an action.
     decisions = config.run.frames / config.env.action_repeat
     per_episode = min(config.collection.episode_decisions or 20, 20)
     collected = 2 * config.collection.round_decisions + config.collection.prefill_decisions

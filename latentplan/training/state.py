@@ -1,4 +1,4 @@
-"""Where a run stands, and how it is written down and picked up again."""
+"""The state of a run (clocks, evaluations, weights, optimizers), saved and loaded."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import torch
 
-from latentplan.config import UserError
+from latentplan.config import UserError, make_folder
 from latentplan.replay.buffer import Replay, read_saved
 
 if TYPE_CHECKING:
@@ -21,19 +21,20 @@ INTERRUPTED = 130  # exit code of a run that the user ended
 
 @dataclass
 class RunState:
-    """The clocks of a run and what its evaluations found.
+    """The clocks of a run and the results of its evaluations.
 
     Attributes:
         env_frames: Simulator control steps so far.
         decisions: Decisions so far.
-        rounds: Collections so far.
-        learned_rounds: How many of them there were when an epoch last ended; -1 before the first.
-        earlier_minutes: Wall clock spent before this process took over.
+        rounds: Collection rounds so far.
+        learned_rounds: Value of `rounds` when the last epoch ended; -1 before the first epoch.
+        earlier_minutes: Wall-clock minutes of the run before `started`.
         next_evaluation: Value of `env_frames` at which the next evaluation is due.
-        best_return: Best mean return of the planner so far.
-        evaluations: One entry per evaluation: env_frames, updates, minutes, planner, actor.
-        curriculum_over: Whether the values of the curriculum's task have been forgotten.
+        best_return: Best mean return of the planner in an evaluation so far.
+        evaluations: One entry per evaluation: env_frames, decisions, updates, minutes, planner, actor.
+        curriculum_over: Whether the value head was reset after the curriculum's task.
         interrupted: Whether the user asked to stop.
+        started: Time at which this process took over, in seconds of the monotonic clock.
     """
 
     env_frames: int = 0
@@ -50,29 +51,43 @@ class RunState:
 
     @property
     def minutes(self) -> float:
-        """Wall clock of the run, over all its processes."""
+        """Wall-clock minutes of the run, over all its processes."""
         return self.earlier_minutes + (time.monotonic() - self.started) / 60.0
 
-    def stand(self, minutes: float) -> None:
-        """Set the wall clock: what was done since is not part of the run."""
+    def set_minutes(self, minutes: float) -> None:
+        """Set the wall clock back to `minutes`, so that the time since then does not count."""
         self.earlier_minutes, self.started = minutes, time.monotonic()
 
     def to_dict(self) -> dict[str, Any]:
-        """What is saved: everything but this process's own clock and interruption."""
+        """The fields that are saved: all but `started` and `interrupted`, which belong to this process."""
         values = asdict(self) | {"earlier_minutes": self.minutes}
         return {name: value for name, value in values.items() if name not in ("interrupted", "started")}
 
 
 def save_state(folder: Path, state: RunState, learner: dict[str, Any], optimizers: list[Any], replay: Replay) -> None:
-    """Write everything that `load_state` needs to go on; the state file is replaced whole, after the replay."""
+    """Saves a run so that `load_state` can resume it; replaces the state file in one step, after the replay.
+
+    Args:
+        folder: Folder of the saved state.
+        state: Clocks and evaluations.
+        learner: The learner's `weights` and number of `updates`.
+        optimizers: One state per optimizer.
+        replay: The replay; its new rows are appended to the saved ones.
+    """
     replay.save(folder / "replay")
-    part = folder / f"{STATE_FILE}.part"
-    torch.save({"run": state.to_dict(), "learner": learner, "optimizers": optimizers}, part)
-    part.replace(folder / STATE_FILE)
+    save_whole({"run": state.to_dict(), "learner": learner, "optimizers": optimizers}, folder / STATE_FILE)
+
+
+def save_whole(saved: dict[str, Any], path: Path) -> None:
+    """Writes a file with `torch.save` and replaces an earlier one in one step, so that no crash leaves half a file."""
+    make_folder(path.parent)
+    part = path.with_name(f"{path.name}.part")
+    torch.save(saved, part)
+    part.replace(path)
 
 
 def load_state(folder: Path, device: torch.device) -> tuple[RunState, dict[str, Any], list[Any]]:
-    """The clocks, the learner's state and the optimizers' states that `save_state` wrote.
+    """Loads the clocks, the learner's state and the optimizers' states that `save_state` wrote.
 
     Raises:
         UserError: The folder holds no saved run, or a damaged one.
@@ -87,10 +102,17 @@ def load_state(folder: Path, device: torch.device) -> tuple[RunState, dict[str, 
 
 
 def restore(learner: Learner, saved: dict[str, Any], folder: Path) -> None:
-    """Put a learner where `save_state` found it; one saved before weights were averaged begins its average there.
+    """Loads a saved state into a learner.
+
+    A run saved before averaged weights existed starts its average from the saved weights.
+
+    Args:
+        learner: The learner to load into.
+        saved: Its `weights` and number of `updates`.
+        folder: Folder of the run, for the error message.
 
     Raises:
-        UserError: The weights are not those of this model.
+        UserError: The saved weights have other names or shapes than this model.
     """
     weights = saved["weights"]
     averaged = {f"averaged.{name[6:]}": value for name, value in weights.items() if name.startswith("model.")}
@@ -98,5 +120,5 @@ def restore(learner: Learner, saved: dict[str, Any], folder: Path) -> None:
         learner.load_state_dict({"averaged_updates": learner.averaged_updates, **averaged, **weights})
     except RuntimeError as error:
         reason = str(error).splitlines()[-1].strip()
-        raise UserError(f"what {folder} holds does not fit the settings in its config.yaml: {reason}") from None
+        raise UserError(f"the saved weights in {folder} do not fit the settings in its config.yaml: {reason}") from None
     learner.updates = saved["updates"]

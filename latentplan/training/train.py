@@ -1,4 +1,4 @@
-"""A training run from its settings to its final evaluation."""
+"""A training run, from its settings to its final evaluation."""
 
 from __future__ import annotations
 
@@ -20,16 +20,16 @@ from latentplan.config import USER_DOMAIN, Config, Device, UserError, derive_see
 from latentplan.config.files import dump_config, read_config
 from latentplan.envs import default_task
 from latentplan.models import WorldModel
+from latentplan.models.fast import accelerate
 from latentplan.replay.buffer import Replay
-from latentplan.training.callbacks import Experience, Restore, Save, Stop, weights_of
+from latentplan.training.callbacks import Experience, Record, Restore, Save, Stop, weights_of
 from latentplan.training.collection.collector import Description, EnvFactory
 from latentplan.training.collection.process import Worker, make_worker
 from latentplan.training.console import Progress
-from latentplan.training.folder import claim, refuse_used
+from latentplan.training.folder import lock_folder, refuse_used
 from latentplan.training.learner.batches import ReplayBatches, ReplayData
 from latentplan.training.learner.curriculum import Curriculum
 from latentplan.training.learner.graphed import make_learner
-from latentplan.training.record import Record
 from latentplan.training.resources import choose_device, choose_threads, replay_capacity, set_up_torch
 from latentplan.training.state import INTERRUPTED, RunState, load_state, restore
 
@@ -39,12 +39,12 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Result:
-    """How a run ended.
+    """The folder, exit code and summary of a run that ended.
 
     Attributes:
-        run_dir: Its folder.
-        exit_code: 0, or 130 when the user interrupted it.
-        summary: Mean returns of the final evaluation by mode; empty when interrupted.
+        run_dir: Folder of the run.
+        exit_code: 0, or 130 when the user interrupted the run.
+        summary: Mean return of the final evaluation per mode; empty when interrupted.
     """
 
     run_dir: Path
@@ -53,27 +53,31 @@ class Result:
 
 
 def train(config: Config, make_env: EnvFactory | None = None) -> Result:
-    """Learn to control a body from pixels.
+    """Trains an agent to control a body from pixels.
 
     Args:
         config: Settings of the run.
-        make_env: Makes the user's own `gymnasium.Env` with image observations and a bounded Box of actions;
-            None takes the suite's task that `config.env` names.
+        make_env: Makes the user's own `gymnasium.Env` with image observations and a bounded Box of actions; None makes
+            the suite's task that `config.env` names.
 
     Returns:
-        Where the run lies and how it ended.
+        The folder, exit code and summary of the run.
 
     Raises:
-        UserError: Settings, environment or machine cannot carry the run.
+        UserError: The settings, the environment or the machine do not allow the run.
     """
     if config.run.frames is None and config.run.minutes is None:
         raise UserError("a run needs an end: give --frames or --minutes")
     domain, task = config.env.domain, config.env.task
     if make_env is not None:
         if config.env.objective is not None:
-            raise UserError("env.objective needs a domain of the suite; an environment of your own pays its own reward")
+            raise UserError(
+                "env.objective needs a domain of the suite; an environment of your own returns its own reward"
+            )
         domain, task = USER_DOMAIN, getattr(make_env, "__name__", type(make_env).__name__)
-    config = replace(config, env=replace(config.env, domain=domain, task=task or default_task(domain)))
+    config = replace(
+        config, env=replace(config.env, domain=domain, task=task or default_task(domain, config.env.suite))
+    )
     if config.run.run_dir is None:
         stamp = datetime.now().strftime("%Y%m%d-%H%M%S")
         name = f"{config.env.domain}-{config.env.task}-seed{config.run.seed}-{stamp}"
@@ -93,15 +97,19 @@ def resume(
     device: Device | None = None,
     make_env: EnvFactory | None = None,
 ) -> Result:
-    """Continue a run where it was last saved: weights, optimizers, replay, clocks and random streams.
+    """Continues a run from its last save: weights, optimizers, replay, clocks and random streams.
+
+    A new budget or device is written to the run's settings, so later resumptions keep it.
 
     Args:
         run_dir: Folder of the run.
-        frames: New budget of frames in all; with None for both, the old budget stays. A new one is the run's from now
-            on, so that it goes on to it after an interruption too.
-        minutes: New budget of minutes in all.
-        device: New device, from now on; None keeps the old one.
-        make_env: As given to `train`.
+        frames: New total budget of frames. If `frames` and `minutes` are both None, the old budget stays.
+        minutes: New total budget of minutes.
+        device: New device; None keeps the old device.
+        make_env: Makes the user's environment, as for `train`.
+
+    Returns:
+        The folder, exit code and summary of the run.
 
     Raises:
         UserError: The folder holds no run that can be resumed.
@@ -110,10 +118,10 @@ def resume(
     if not (folder / "config.yaml").exists():
         raise UserError(f"nothing to resume in {folder}: config.yaml is missing")
     config = read_config(folder / "config.yaml")
-    if config.env.task is None:  # a run has written down which
+    if config.env.task is None:  # `train` always writes the task
         raise UserError(f"{folder / 'config.yaml'} is damaged: it does not say what the task is")
     if config.env.domain == USER_DOMAIN and make_env is None:
-        raise UserError("this run learns in an environment of your own: resume it from Python, with make_env")
+        raise UserError("this run learns in your own environment: resume it from Python, with make_env")
     run = config.run
     if frames is not None or minutes is not None:
         run = replace(run, frames=frames, minutes=minutes)
@@ -123,14 +131,14 @@ def resume(
 
 
 def _start(config: Config, folder: Path, make_env: EnvFactory | None, *, resume: bool) -> Result:
-    with claim(folder):
+    with lock_folder(folder):
         run = _Run(config, folder, make_env, resume=resume)
         dump_config(config, folder / "config.yaml")
         return run.execute()
 
 
 class _Run:
-    """Everything a run is made of, put together once."""
+    """The parts of a run: worker, replay, learner, curriculum and display."""
 
     def __init__(self, config: Config, folder: Path, make_env: EnvFactory | None, *, resume: bool) -> None:
         self.config, self.folder = config, folder
@@ -151,22 +159,24 @@ class _Run:
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(derive_seed(config.run.seed, "weights"))
             model = WorldModel(config.model, self.description.action_dim, self.description.labels).to(self.device)
+        accelerate(model)
         on = self.device if config.replay.on_device else torch.device("cpu")
-        kept = self.folder / "resume" / "replay"
-        capacity, num_labels = replay_capacity(config, kept), len(model.labels)
-        self.replay = Replay(capacity, model.action_dim, config.model.deter_dim, config.env.num_envs, on, num_labels)
+        saved_replay = self.folder / "resume" / "replay"
+        capacity, num_labels = replay_capacity(config, saved_replay), len(model.labels)
+        sizes = (capacity, model.action_dim, config.model.deter_dim, config.env.num_envs)
+        self.replay = Replay(*sizes, on, num_labels)
         self.state, saved = RunState(), None
         self._saved_optimizers: list[Any] = []
         if resume:
             self.state, saved, self._saved_optimizers = load_state(self.folder / "resume", self.device)
-            self.replay.load(kept)
+            self.replay.load(saved_replay)
         self.curriculum = Curriculum(config, model.labels, self.state)
         self.learner = make_learner(model, config, self.description.discount, self.replay, self.curriculum)
         if saved is not None:
             restore(self.learner, saved, self.folder)
 
     def execute(self) -> Result:
-        """Learn until the budget is spent, then evaluate."""
+        """Learn until the budget is spent or the user interrupts, then evaluate."""
         try:
             return self._execute()
         finally:
@@ -184,7 +194,7 @@ class _Run:
         trainer = self._trainer([experience, self.curriculum, record, save, stop])
         batches = ReplayBatches(self.replay, config, self.curriculum, self.learner)
         if not self._saved_optimizers:
-            save.save_run(trainer, self.learner)  # so that what ends before the first save can be resumed too
+            save.save_run(trainer, self.learner)  # makes a run that ends before its first save resumable
         if not stop.is_spent():
             self.console.start(self.learner.updates)
             try:
@@ -223,7 +233,7 @@ class _Run:
         clocks = save.clocks(self.learner)
         episodes = self.config.evaluation.final_episodes
         self.console.console.print(f"final evaluation: {episodes} episodes each of planner and actor")
-        returns = self._judge(self.learner.averaged, film if self.config.evaluation.video else None)
+        returns = self._evaluate(self.learner.averaged, film if self.config.evaluation.video else None)
         summary = {mode: float(np.mean(values)) for mode, values in returns.items()}
         info = clocks | {"final_evaluation": returns}
         (self.folder / "final.json").write_text(json.dumps(info | summary, indent=1))
@@ -234,23 +244,23 @@ class _Run:
         )
         best = self.state.best_return
         if summary["planner"] < best:
-            best = self._judge_best()
+            best = self._evaluate_best()
         if summary["planner"] >= best:
             save.save_agent("best", self.learner.averaged, info)
         self.state.best_return = max(best, summary["planner"])
-        self.state.stand(clocks["minutes"])
+        self.state.set_minutes(clocks["minutes"])
         save.save_run(trainer, self.learner)
         self.console.console.print(f"run folder: {self.folder}")
         return summary
 
-    def _judge(self, model: WorldModel, film: Path | None = None, actor: bool = True) -> dict[str, list[float]]:
+    def _evaluate(self, model: WorldModel, film: Path | None = None, actor: bool = True) -> dict[str, list[float]]:
         self.worker.submit("evaluate", self.config.evaluation.final_episodes, film, weights_of(model), actor)
         return self.worker.result()  # type: ignore[no-any-return]
 
-    def _judge_best(self) -> float:
-        """What the planner of the best agent kept earns on the starts that judged the last one; -inf without one.
+    def _evaluate_best(self) -> float:
+        """Mean return of the saved best agent's planner on the final starts; -inf if no best agent can be read.
 
-        The best mean of many evaluations of few episodes is high by chance too.
+        The best of many short evaluations is also high by chance, so the final starts decide between best and last.
         """
         folder = self.folder / "checkpoints" / "best"
         if not (folder / "info.json").exists():
@@ -258,10 +268,12 @@ class _Run:
         try:
             model, _, info = load_model(folder, str(self.device))
         except UserError as error:
-            self.console.console.print(f"warning: the best agent so far is lost: {error}", soft_wrap=True)
+            self.console.console.print(f"warning: the best agent so far cannot be read: {error}", soft_wrap=True)
             return float("-inf")
-        self.console.console.print(f"the same starts for the best agent so far, of {info['env_frames']:,} frames")
-        earned = float(np.mean(self._judge(model, actor=False)["planner"]))
+        self.console.console.print(
+            f"evaluating the best agent so far, of {info['env_frames']:,} frames, on the same starts"
+        )
+        earned = float(np.mean(self._evaluate(model, actor=False)["planner"]))
         self.console.console.print(f"its planner earned {earned:.1f}; checkpoints/best is the better of the two")
         return earned
 

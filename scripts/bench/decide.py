@@ -24,7 +24,7 @@ from latentplan.config.parsing import option
 if TYPE_CHECKING:
     import torch
 
-    from latentplan.agents.checkpoint import Agent
+    from latentplan.agents.base import Agent
     from latentplan.models import WorldModel
 
 WARM_UP_DECISIONS = 3
@@ -107,7 +107,7 @@ def measure_decisions(agent: Agent, batch: int, decisions: int) -> dict[str, Any
         agent.act(frames)
         if index >= WARM_UP_DECISIONS:
             milliseconds.append(1000.0 * (time.perf_counter() - started))
-    with counted_model_steps(agent.model) as counts:  # type: ignore[union-attr]
+    with counted_model_steps(agent.model) as counts:  # type: ignore[attr-defined]
         agent.act(frames)
     return {"decision_ms": latency_percentiles(np.asarray(milliseconds)), "model_steps": counts["rows"] // batch}
 
@@ -124,7 +124,7 @@ def counted_model_steps(model: WorldModel) -> Iterator[dict[str, int]]:
 
         return call
 
-    names = ("step", "rollout")
+    names = ("step", "fast_step", "rollout")
     for name in names:
         setattr(model, name, counting(getattr(model, name)))
     try:
@@ -140,9 +140,11 @@ def _load(request: Request, composed: Config | None, device: torch.device) -> tu
         import torch
 
         from latentplan.models import WorldModel
+        from latentplan.models.fast import accelerate
 
         torch.manual_seed(0)
-        return WorldModel(composed.model, request.action_size(composed)).to(device), composed, UNTRAINED_DISCOUNT
+        model = accelerate(WorldModel(composed.model, request.action_size(composed)).to(device))
+        return model, composed, UNTRAINED_DISCOUNT
     from latentplan.agents.checkpoint import load_model
 
     assert request.checkpoint is not None

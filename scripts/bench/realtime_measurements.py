@@ -10,7 +10,7 @@ import numpy as np
 
 if TYPE_CHECKING:
     from latentplan.envs.suite import SuiteEnv
-    from latentplan.evaluation.timed import TimedEpisode
+    from latentplan.evaluation.statistics import Episode
 
 ITERATIONS = {  # the first search of a warm planner is cold and has 5 iterations, as in the cold planner
     "5 cold": {"num_iterations": 5, "warm_start": False},
@@ -64,7 +64,7 @@ class Trial:
         agent = load_timed_agent(self.checkpoint, mode, clock, self.device, **settings)
         if prepare is not None:
             prepare(agent)
-        episodes: list[TimedEpisode] = list(iterate_timed_episodes(self.env, agent, self.seeds, clock))
+        episodes: list[Episode] = list(iterate_timed_episodes(self.env, agent, self.seeds, clock))
         return {**summarize_timed(episodes, clock), "mean_decision_ms": _mean_decision_ms(episodes)}
 
 
@@ -114,7 +114,7 @@ def measure_error(trial: Trial) -> Iterator[Row]:
 
 def _record(agent: Any, env: SuiteEnv, seed: int) -> tuple[list[Any], list[np.ndarray], list[float]]:
     """Beliefs of an episode, the action at each belief, and the reward that followed the action."""
-    from latentplan.models.symmetry import unturned
+    from latentplan.models.symmetry import first_turn
 
     beliefs, actions, rewards = [], [], []
     agent.reset()
@@ -122,7 +122,7 @@ def _record(agent: Any, env: SuiteEnv, seed: int) -> tuple[list[Any], list[np.nd
     is_over = False
     while not is_over:
         action = agent.act(frame)
-        beliefs.append(unturned(agent.state))
+        beliefs.append(first_turn(agent.state))
         actions.append(action)
         frame, reward, terminated, truncated, _ = env.step(action)
         rewards.append(reward)
@@ -155,5 +155,5 @@ def _prediction_errors(model: Any, beliefs: list[Any], actions: list[np.ndarray]
     return torch.stack(rows).numpy() if rows else np.zeros((0, 0, 4))
 
 
-def _mean_decision_ms(episodes: Sequence[TimedEpisode]) -> float:
+def _mean_decision_ms(episodes: Sequence[Episode]) -> float:
     return float(np.mean(np.concatenate([episode.decision_ms for episode in episodes])))

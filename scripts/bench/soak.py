@@ -22,7 +22,7 @@ from latentplan.config.parsing import option, raise_unknown
 if TYPE_CHECKING:
     import numpy as np
 
-    from latentplan.evaluation.episodes import Agent
+    from latentplan.agents.base import Agent
 
 MODES = ("actor", "gated", "background", "planner")
 IDLE = "no-op"

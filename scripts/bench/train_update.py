@@ -16,7 +16,7 @@ from torch.utils.flop_counter import FlopCounterMode
 from bench.machine import now
 from latentplan.config import Config
 from latentplan.models import WorldModel
-from latentplan.models.fast import unroll
+from latentplan.models.fast import accelerate
 from latentplan.replay.buffer import Batch, Replay, Rows
 from latentplan.training.learner.graphed import WARM_UP_UPDATES as GRAPH_WARM_UP_UPDATES
 from latentplan.training.learner.graphed import GraphedLearner
@@ -106,7 +106,7 @@ def measure_update(config: Config, action_dim: int, device: torch.device, update
     """
     torch.manual_seed(0)
     replay = synthetic_replay(config, action_dim, device)
-    model = WorldModel(config.model, action_dim).to(device)
+    model = accelerate(WorldModel(config.model, action_dim).to(device))
     learner = StandaloneLearner(model, config.learning, DISCOUNT, replay, seed=0).to(device)
     learner.own_optimizers = learner.configure_optimizers()
     alone = _parts_alone(model, _sample(learner, np.random.default_rng(3)))
@@ -133,7 +133,7 @@ def measure_update(config: Config, action_dim: int, device: torch.device, update
 def measure_graph(config: Config, action_dim: int, device: torch.device, updates: int) -> float:
     """Median milliseconds of an update with `learning.cuda_graph`; on a CPU the same update without a graph."""
     replay = synthetic_replay(replace(config, replay=replace(config.replay, on_device=True)), action_dim, device)
-    model = WorldModel(config.model, action_dim).to(device)
+    model = accelerate(WorldModel(config.model, action_dim).to(device))
     learner = StandaloneGraph(model, config.learning, DISCOUNT, replay, 0, lambda batch: batch).to(device)
     learner.own_optimizers = learner.configure_optimizers()
     rng, seconds = np.random.default_rng(1), []
@@ -230,7 +230,7 @@ def _parts_alone(model: WorldModel, batch: Batch) -> Parts:
             return model.encoder(frames)
 
     def recur() -> Any:
-        return unroll.observe(model.dynamics, embeddings.requires_grad_(), batch.actions, batch.deter, noise)
+        return model.backend.observe(model, embeddings.requires_grad_(), batch.actions, batch.deter, noise)
 
     def decode() -> Tensor:
         with model.trunk_precision():

@@ -1,4 +1,4 @@
-"""The agent that acts at once: frames in, bounded actions out, and where each came from."""
+"""The background agent: actions come from the newest plan that is due, else from the actor."""
 
 import pickle
 import time
@@ -9,11 +9,12 @@ import torch
 
 from latentplan.agents.actor import ActorAgent
 from latentplan.agents.background import BackgroundAgent
-from latentplan.config import Config, ModelConfig, PlannerConfig, UserError
+from latentplan.config import Config, PlannerConfig, UserError
 from latentplan.models import WorldModel
+from tests.agents.small_agents import SIZES
 
 CONFIG = Config(
-    model=ModelConfig(deter_dim=16, hidden_dim=16, encoder_channels=(8, 8), decoder_channels=2, num_bins=15),
+    model=SIZES,
     planner=PlannerConfig(horizon=4, num_samples=16, num_elites=4, num_iterations=2, num_policy_samples=2),
 )
 
@@ -34,7 +35,7 @@ def film():
 
 
 class Ticking:
-    """An executor whose plans take so many decisions; the tick is counted by its polls."""
+    """An executor whose plans are ready after a given number of polls; the agent polls once per decision."""
 
     def __init__(self, planner, model, ticks):
         self.planner, self.model, self.ticks, self.polls, self.work = planner, model, ticks, 0, None
@@ -67,7 +68,7 @@ def make(model, ticks=2, **options):
     )
 
 
-def test_the_actor_acts_until_the_first_plan_is_due(model, film):
+def test_background_agent_acts_by_the_actor_until_the_first_plan_is_due(model, film):
     agent, actor = make(model), ActorAgent(model, CONFIG)
     history = []
     for frames in film:
@@ -75,12 +76,14 @@ def test_the_actor_acts_until_the_first_plan_is_due(model, film):
         assert action.shape == (2,) and action.dtype == np.float32 and np.abs(action).max() <= 1.0
         history.append((agent.last_source, agent.plan_age))
         if len(history) <= 2:
-            assert np.allclose(action, actor.act(frames[0]), atol=0.02)  # the planner's view of it is in bfloat16
+            assert np.allclose(
+                action, actor.act(frames[0]), atol=0.02
+            )  # the background agent's actor computes in bfloat16
     assert history[:3] == [("actor", None), ("actor", None), ("plan", 1)]
     assert set(history[6:]) == {("plan", 0), ("plan", 1)}
 
 
-def test_a_batch_of_environments_is_planned_together(model, film):
+def test_background_agent_plans_a_batch_together_and_drops_its_plans_at_a_masked_reset(model, film):
     agent = make(model)
     for frames in film[:6]:
         actions = agent.act(frames)
@@ -88,11 +91,11 @@ def test_a_batch_of_environments_is_planned_together(model, film):
     assert agent.last_source == "plan"
     agent.reset(np.array([False, True, False]))
     agent.act(film[6])
-    assert agent.last_source == "actor"  # no plan outlives an episode
+    assert agent.last_source == "actor"  # the plans of all environments are dropped
     assert agent.state.deter.shape == (3, 16)
 
 
-def test_resetting_forgets_the_past_and_the_plans(model, film):
+def test_reset_forgets_the_past_and_the_plans(model, film):
     agent, fresh = make(model), make(model)
     for frames in film[:5]:
         agent.act(frames[0])
@@ -101,7 +104,7 @@ def test_resetting_forgets_the_past_and_the_plans(model, film):
     assert np.array_equal(agent.act(film[7, 0]), fresh.act(film[7, 0]))
 
 
-def test_equal_streams_give_equal_actions(model, film):
+def test_act_repeats_with_the_seed(model, film):
     histories = []
     for seed in (5, 5, 6):
         agent = make(model)
@@ -111,7 +114,7 @@ def test_equal_streams_give_equal_actions(model, film):
     assert not np.array_equal(histories[0], histories[2])
 
 
-def test_the_picture_is_of_the_plan_in_use(model, film):
+def test_imagine_gives_a_picture_when_a_plan_is_in_use(model, film):
     agent = make(model)
     agent.act(film[0, 0])
     assert agent.imagine() is None
@@ -122,7 +125,7 @@ def test_the_picture_is_of_the_plan_in_use(model, film):
     assert agent.encode(film[0, 0]).shape == (32,)
 
 
-def test_a_failed_decision_loses_no_reset(model, film):
+def test_act_keeps_a_pending_reset_when_a_decision_fails(model, film):
     agent, fresh = make(model), make(model)
     agent.act(film[0])
     agent.reset(np.array([True, True, True]))
@@ -133,7 +136,7 @@ def test_a_failed_decision_loses_no_reset(model, film):
     assert np.allclose(agent.act(film[1]), fresh.act(film[1]), atol=1e-5)
 
 
-def test_a_goal_that_was_learned_is_acted_for_at_once_and_can_be_sent(film):
+def test_set_objective_takes_the_goal_actor_at_once_when_the_model_learned_goals(film):
     torch.manual_seed(0)
     model = WorldModel(CONFIG.model, action_dim=2, labels={"cart": 1.0}, goal_dim=8)
     with torch.no_grad():
@@ -150,14 +153,17 @@ def test_a_goal_that_was_learned_is_acted_for_at_once_and_can_be_sent(film):
     assert not np.allclose(agent.act(film[0, 0]), wanted.float(), atol=0.02)
 
 
-def test_goals_reach_the_plans_and_not_the_actor(film):
+def test_set_objective_changes_the_plans_and_not_the_actor(film):
     torch.manual_seed(0)
     model = WorldModel(CONFIG.model, action_dim=2, labels={"cart": 1.0})
     agents = [make(model), make(model)]
     agents[1].set_objective("cart > 100", constraints="cart > 50")
     told = agents[1].scheduler.executor.goals
     assert len(told["constraints"]) == 1
-    assert set(pickle.loads(pickle.dumps(told["objective"])).needs) == {"probe", "value"}  # it can go to a process
+    assert set(pickle.loads(pickle.dumps(told["objective"])).needs) == {
+        "probe",
+        "value",
+    }  # the term can be sent to a process
     first, later = [[agent.act(frames[0]) for agent in agents] for frames in film[:3]][::2]
     assert np.array_equal(*first) and not np.array_equal(*later)
     with pytest.raises(UserError, match="height"):
@@ -167,7 +173,7 @@ def test_goals_reach_the_plans_and_not_the_actor(film):
 
 
 @pytest.mark.parametrize("worker", ["process", "thread"])
-def test_plans_come_from_a_real_worker(model, film, worker):
+def test_background_agent_gets_plans_from_a_real_worker(model, film, worker):
     with BackgroundAgent(model, CONFIG, 0.9, worker=worker) as agent:
         assert agent.wait_until_ready()
         sources = set()
@@ -176,7 +182,7 @@ def test_plans_come_from_a_real_worker(model, film, worker):
             sources.add(agent.last_source)
             if "plan" in sources:
                 break
-            time.sleep(0.02)  # a control loop has a period; at full tilt every plan of a few steps comes too late
+            time.sleep(0.02)  # without a period every plan of a few steps comes too late
         assert "plan" in sources
         process = agent.scheduler.executor.process
     assert process is None or not process.is_alive()

@@ -1,7 +1,8 @@
-"""The exported actor: the agent's own actions, from a file alone."""
+"""The exported actor: a file that gives the agent's actions without this package."""
 
 import json
 import sys
+from contextlib import contextmanager
 
 import numpy as np
 import pytest
@@ -11,30 +12,11 @@ from latentplan.agents.actor import ActorAgent
 from latentplan.agents.checkpoint import load_agent, save_checkpoint
 from latentplan.agents.export import export_actor
 from latentplan.commands.main import main
-from latentplan.config import Config, ModelConfig, UserError
+from latentplan.config import Config, UserError
 from latentplan.models import WorldModel
+from tests.agents.small_agents import SIZES
 
-CONFIG = Config(
-    model=ModelConfig(deter_dim=16, hidden_dim=16, encoder_channels=(8, 8), decoder_channels=2, num_bins=15)
-)
-RUNNER = """
-import json, sys
-sys.modules["latentplan"] = None  # importing it is an error from here on
-import numpy as np, torch
-path, film = sys.argv[1:]
-facts = {"actor.json": ""}
-program = torch.export.load(path, extra_files=facts).module()
-sizes = json.loads(facts["actor.json"])
-frames = torch.from_numpy(np.load(film))  # (time, batch, 64, 64, 3)
-batch = frames.shape[1]
-deter, stoch, action = (torch.full((batch, sizes[name]), 7.0) for name in ("deter", "stoch", "action"))
-actions = []
-for time, frame in enumerate(frames):
-    is_first = torch.full((batch,), time in (0, 5))
-    action, deter, stoch = program(frame, deter, stoch, action, is_first)
-    actions.append(action.detach().numpy())
-np.save(film, np.stack(actions))
-"""
+CONFIG = Config(model=SIZES)
 
 
 @pytest.fixture(scope="module")
@@ -55,22 +37,29 @@ def program(checkpoint, tmp_path_factory):
     return path
 
 
-def test_a_process_without_the_package_gets_the_agents_actions(checkpoint, program, run_python, tmp_path):
+@pytest.fixture(scope="module")
+def module(program):
+    """The exported program, ready to be called."""
+    return torch.export.load(program).module()
+
+
+def test_exported_program_gives_the_actions_of_the_agent(checkpoint, module):
     film = np.random.default_rng(3).integers(0, 256, (8, 3, 64, 64, 3), dtype=np.uint8)
-    np.save(tmp_path / "film.npy", film)
-    result = run_python("-c", RUNNER, program, tmp_path / "film.npy", cwd=tmp_path)
-    assert result.returncode == 0, result.stderr
-    agent, expected = load_agent(checkpoint, mode="actor"), []
+    agent, actions, expected = load_agent(checkpoint, mode="actor"), [], []
+    deter, stoch, action = (torch.full((3, size), 7.0) for size in (16, 32, 2))  # not read at first frames
     for time, frames in enumerate(film):
         if time == 5:
             agent.reset()
+        action, deter, stoch = module(torch.from_numpy(frames), deter, stoch, action, torch.full((3,), time in (0, 5)))
+        actions.append(action.detach().numpy())
         expected.append(agent.act(frames))
-    actions = np.load(tmp_path / "film.npy")
     assert np.ptp(expected) > 0.1
-    assert np.allclose(actions, np.stack(expected), atol=1e-4)
+    assert np.allclose(actions, expected, atol=1e-4)
 
 
-def test_the_documented_runner_gets_the_agents_actions(checkpoint, program, run_python, tmp_path, root):
+def test_documented_runner_gives_the_actions_of_the_agent_without_this_package(
+    checkpoint, program, run_python, tmp_path, root
+):
     text = (root / "docs" / "distillation.md").read_text()
     runner = next(part for part in text.split("```python\n")[1:] if "torch.export.load" in part).split("```")[0]
     film = np.random.default_rng(0).integers(0, 256, (6, 64, 64, 3), dtype=np.uint8)
@@ -88,8 +77,7 @@ def test_the_documented_runner_gets_the_agents_actions(checkpoint, program, run_
     assert np.allclose(np.load(program.parent / "actions.npy")[:, 0], expected, atol=1e-4)
 
 
-def test_an_episode_begins_alone(program):
-    module = torch.export.load(program).module()
+def test_exported_program_begins_episodes_row_by_row(module):
     frames = torch.randint(0, 256, (2, 64, 64, 3), dtype=torch.uint8, generator=torch.Generator().manual_seed(0))
     past = torch.full((2, 16), 0.3), torch.full((2, 32), -0.2), torch.full((2, 2), 0.5)
     mixed, first, later = (
@@ -100,7 +88,7 @@ def test_an_episode_begins_alone(program):
         assert not torch.allclose(firsts[1], laters[1], atol=1e-5)
 
 
-def test_the_file_names_its_sizes_and_holds_no_more_than_the_actor_needs(program, checkpoint):
+def test_exported_file_holds_its_sizes_and_only_the_weights_of_the_actor(program, checkpoint):
     facts = {"actor.json": ""}
     exported = torch.export.load(program, extra_files=facts)
     assert json.loads(facts["actor.json"]) == {"deter": 16, "stoch": 32, "action": 2}
@@ -110,15 +98,15 @@ def test_the_file_names_its_sizes_and_holds_no_more_than_the_actor_needs(program
     assert 0 < held <= sum(parameter.numel() for part in parts for parameter in part.parameters())
 
 
-def test_an_agent_in_memory_is_exported_as_it_is(tmp_path, program):
+def test_export_actor_takes_an_agent_in_memory(tmp_path, module):
     torch.manual_seed(1)
     agent = ActorAgent(WorldModel(CONFIG.model, action_dim=2), CONFIG)
     path = export_actor(agent, tmp_path / "mine.pt2")
     frame = np.zeros((1, 64, 64, 3), np.uint8)
     nothing = torch.zeros(1, 16), torch.zeros(1, 32), torch.zeros(1, 2)
     ours, other = (
-        torch.export.load(file).module()(torch.from_numpy(frame), *nothing, torch.ones(1, dtype=torch.bool))[0]
-        for file in (path, program)
+        program(torch.from_numpy(frame), *nothing, torch.ones(1, dtype=torch.bool))[0]
+        for program in (torch.export.load(path).module(), module)
     )
     assert np.allclose(ours.detach().numpy(), agent.act(frame), atol=1e-4)
     assert not torch.allclose(ours, other)
@@ -136,7 +124,7 @@ def test_an_agent_in_memory_is_exported_as_it_is(tmp_path, program):
         (["--chekpoint", "nothing", "--out", "a.pt2"], ["'--chekpoint'", "'--checkpoint'"]),
     ],
 )
-def test_mistakes_are_one_line(flags, words, checkpoint, capsys, tmp_path, monkeypatch):
+def test_export_command_explains_mistakes_in_one_line(flags, words, checkpoint, capsys, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     assert main(["export", *[flag.format(checkpoint=checkpoint) for flag in flags]]) == 2
     captured = capsys.readouterr()
@@ -144,13 +132,13 @@ def test_mistakes_are_one_line(flags, words, checkpoint, capsys, tmp_path, monke
     assert list(tmp_path.iterdir()) == []
 
 
-def test_onnx_without_its_packages_says_what_to_install(checkpoint, tmp_path, monkeypatch):
+def test_export_actor_names_missing_packages_when_the_format_is_onnx(checkpoint, tmp_path, monkeypatch):
     monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
     with pytest.raises(UserError, match="pip install onnx onnxscript"):
         export_actor(checkpoint, tmp_path / "actor.onnx", "onnx")
 
 
-def test_onnx_gives_the_agents_actions(checkpoint, tmp_path):
+def test_onnx_program_gives_the_actions_of_the_agent(checkpoint, tmp_path):
     pytest.importorskip("onnxscript")
     runtime = pytest.importorskip("onnxruntime")
     session = runtime.InferenceSession(export_actor(checkpoint, tmp_path / "actor.onnx", "onnx"))
@@ -163,7 +151,7 @@ def test_onnx_gives_the_agents_actions(checkpoint, tmp_path):
         assert np.allclose(action, agent.act(frame), atol=1e-4)
 
 
-def test_help_needs_no_torch(run_python):
+def test_export_help_imports_no_torch(run_python):
     code = (
         "import sys\nfrom latentplan.commands.main import main\n"
         "print(main(['export', '--help']), 'torch' in sys.modules, 'jsonargparse' in sys.modules)"
@@ -172,14 +160,23 @@ def test_help_needs_no_torch(run_python):
     assert result.stdout.endswith("0 False False\n") and "--checkpoint" in result.stdout, result.stderr
 
 
+@contextmanager
+def largest_file(size):
+    """Lets this process write no file beyond a size in bytes, as on a full disk."""
+    import resource  # Unix only
+
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, before[1]))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+
+
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="limits the size of files")
-def test_a_disk_that_is_full_is_one_line(checkpoint, run_python, tmp_path):
-    code = (
-        "import resource, sys\n"
-        "from latentplan.commands.main import main\n"
-        "resource.setrlimit(resource.RLIMIT_FSIZE, (1000, 1000))\n"
-        f"sys.exit(main(['export', '--checkpoint', {str(checkpoint)!r}, '--out', {str(tmp_path / 'a.pt2')!r}]))\n"
-    )
-    finished = run_python("-c", code)
-    assert finished.returncode == 2 and "error: cannot write" in finished.stderr
+def test_export_command_explains_a_full_disk_in_one_line(checkpoint, capsys, tmp_path):
+    with largest_file(1000):
+        code = main(["export", "--checkpoint", str(checkpoint), "--out", str(tmp_path / "a.pt2")])
+    errors = capsys.readouterr().err
+    assert code == 2 and errors.startswith("error: cannot write") and errors.count("\n") == 1
     assert list(tmp_path.iterdir()) == []

@@ -1,4 +1,4 @@
-"""The gate: plans where it doubts, as often as the budget says, and from a plan that has aged."""
+"""The gated agent: plans at doubtful decisions, within its budget, warm-started from the aged plan."""
 
 import copy
 
@@ -9,11 +9,12 @@ import torch
 from latentplan.agents.actor import ActorAgent
 from latentplan.agents.gated import SIGNALS, GatedAgent, RunningScale
 from latentplan.agents.planning import PlanningAgent
-from latentplan.config import Config, ModelConfig, PlannerConfig
+from latentplan.config import Config, PlannerConfig
 from latentplan.models import WorldModel
+from tests.agents.small_agents import SIZES
 
 CONFIG = Config(
-    model=ModelConfig(deter_dim=16, hidden_dim=16, encoder_channels=(8, 8), decoder_channels=2, num_bins=15),
+    model=SIZES,
     planner=PlannerConfig(
         horizon=3, num_samples=8, num_elites=3, num_iterations=3, warm_start_iterations=1, num_policy_samples=0
     ),
@@ -41,7 +42,7 @@ def make(model, **options):
 
 
 class Script(GatedAgent):
-    """Plans where it is told to, so that what follows from it can be seen."""
+    """A gated agent whose doubts are given, one for each decision."""
 
     def __init__(self, model, doubts):
         super().__init__(model, CONFIG, 0.9)
@@ -52,18 +53,18 @@ class Script(GatedAgent):
 
 
 @pytest.mark.parametrize("signal", SIGNALS)
-def test_the_share_of_plans_tends_to_the_budget(model, film, signal):
+def test_planned_fraction_approaches_the_budget(model, film, signal):
     agent = make(model, planning_budget=0.2, signal=signal)
-    for index in range(600):
-        agent.act(film[index % 37, 0])
-    # The threshold moves by 0.1 times the excess: 0.05 is a way of three standard deviations.
+    for index in range(200):  # 600 decisions, three in each batch
+        agent.act(film[index % 37])
+    # The excess is the change of the threshold divided by 0.1 * 600: 0.05 is a change of three standard deviations.
     assert agent.planned_fraction == pytest.approx(0.2, abs=0.05)
     assert agent.planned_fraction <= 0.2
 
 
 @pytest.mark.parametrize("goal", [None, lambda rollout: rollout.actions[:, 0, 0]])
 @pytest.mark.parametrize("signal", SIGNALS)
-def test_the_budget_is_never_exceeded_but_by_what_must_be_planned(model, film, signal, goal):
+def test_gated_agent_exceeds_the_budget_only_by_decisions_that_must_be_planned(model, film, signal, goal):
     agent = make(model, planning_budget=0.4, signal=signal)
     agent.set_objective(goal)
     for index in range(60):
@@ -73,18 +74,18 @@ def test_the_budget_is_never_exceeded_but_by_what_must_be_planned(model, film, s
     assert agent.planned_fraction > 0.15
 
 
-def test_of_several_environments_the_most_doubtful_are_planned_where_not_all_can_be(model, film):
+def test_gated_agent_plans_the_most_doubtful_environments_when_the_budget_does_not_cover_all(model, film):
     agent = make(model, planning_budget=0.4, signal="value")
     agent._value_gap = lambda state, action: 1.0 + 0.1 * torch.rand(3)
     for frames in film[:5]:
         agent.act(frames)
-    agent._num_planned, agent.threshold = 6, 0.0  # 0.4 * 18 - 6 leaves one
+    agent._num_planned, agent.threshold = 6, 0.0  # the budget of 18 decisions, 7.2, leaves one more plan
     agent._value_gap = lambda state, action: torch.tensor([30.0, 10.0, 20.0])
     agent.act(film[5])
     assert agent.last_source == ["plan", "actor", "actor"]
 
 
-def test_with_another_goal_doubt_is_what_the_plan_did_not_foresee(model, film):
+def test_signal_is_the_mismatch_since_the_last_plan_when_the_objective_is_not_the_actors(model, film):
     agent = make(model, planning_budget=0.3, signal="value")
     agent.set_objective(lambda rollout: rollout.actions[:, 0, 0])
     expected, seen = 0.0, []
@@ -96,16 +97,16 @@ def test_with_another_goal_doubt_is_what_the_plan_did_not_foresee(model, film):
     assert "tail" in seen and agent._scales["drift"].num > 0 and agent._scales["value"].num == 0
 
 
-def test_the_share_counts_the_decisions_that_had_to_be_planned(model, film):
+def test_planned_fraction_counts_first_decisions_of_episodes(model, film):
     agent = make(model, planning_budget=0.3, signal="mismatch")
-    for index in range(600):
+    for index in range(200):
         if index % 10 == 0:
             agent.reset()
-        agent.act(film[index % 37, 0])
+        agent.act(film[index % 37])
     assert agent.planned_fraction == pytest.approx(0.3, abs=0.05)
 
 
-def test_a_budget_of_all_or_nothing_is_kept_exactly(model, film):
+def test_planned_fraction_equals_the_budget_when_that_is_0_or_1(model, film):
     always, never = make(model, planning_budget=1.0), make(model, planning_budget=0.0)
     assert always.planned_fraction == never.planned_fraction == 0.0
     for frames in film[:20]:
@@ -115,19 +116,19 @@ def test_a_budget_of_all_or_nothing_is_kept_exactly(model, film):
     assert never.planned_fraction == 1 / 20  # the first decision of the episode
 
 
-def test_who_always_plans_acts_as_the_planner_and_who_never_does_as_the_actor(model, film):
+def test_gated_agent_acts_as_the_planner_at_budget_1_and_as_the_actor_without_doubt(model, film):
     always, planner = make(model, planning_budget=1.0, seed=3), PlanningAgent(model, CONFIG, 0.9, seed=3)
     for frames in film[:6]:
         assert np.array_equal(always.act(frames[0]), planner.act(frames[0]))
     never, actor = Script(model, [False] * 6), ActorAgent(model, CONFIG)
     never.act(film[0, 0])
     actor.act(film[0, 0])
-    actor.state, actor._action = never.state, never._action  # the first decision is planned all the same
+    actor.state, actor._action = never.state, never._action  # the first decision is always planned
     for frames in film[1:6]:
         assert np.allclose(never.act(frames[0]), actor.act(frames[0]), atol=1e-6)
 
 
-def test_the_first_decision_of_an_episode_is_planned(model, film):
+def test_gated_agent_plans_the_first_decision_of_an_episode(model, film):
     agent = make(model, planning_budget=0.0)
     sources = []
     for index in range(6):
@@ -138,7 +139,7 @@ def test_the_first_decision_of_an_episode_is_planned(model, film):
     assert sources == ["plan", "actor", "actor"] * 2
 
 
-def test_only_environments_that_begin_anew_are_planned_after_a_masked_reset(model, film):
+def test_gated_agent_plans_only_masked_environments_after_a_masked_reset(model, film):
     agent = make(model, planning_budget=0.0)
     agent.act(film[0])
     assert agent.last_source == ["plan"] * 3
@@ -149,7 +150,7 @@ def test_only_environments_that_begin_anew_are_planned_after_a_masked_reset(mode
     assert agent.planned_fraction == pytest.approx(4 / 9)
 
 
-def test_the_plan_ages_while_the_actor_acts(model, film):
+def test_next_search_starts_from_the_shifted_plan_when_the_actor_acted_in_between(model, film):
     agent = Script(model, [True, True, False, True])
     agent.act(film[0, 0])
     agent.act(film[1, 0])
@@ -174,7 +175,7 @@ def test_the_plan_ages_while_the_actor_acts(model, film):
     assert agent.controller.plan.info["iterations"].tolist() == [1]
 
 
-def test_after_as_many_decisions_as_the_horizon_the_search_starts_cold(model, film):
+def test_next_search_starts_cold_when_the_plan_has_run_out(model, film):
     agent = Script(model, [True, False, False, False, True])
     for frames in film[:5]:
         agent.act(frames[0])
@@ -182,7 +183,7 @@ def test_after_as_many_decisions_as_the_horizon_the_search_starts_cold(model, fi
     assert agent.controller.plan.info["iterations"].tolist() == [3]
 
 
-def test_what_stands_out_is_planned(model, film):
+def test_gated_agent_plans_where_the_signal_is_an_outlier(model, film):
     agent = make(model, planning_budget=0.05, signal="value")
     gaps = iter([1.0, 2.0, 3.0] * 20 + [50.0, 2.0])
     agent._value_gap = lambda state, action: torch.full((len(action),), next(gaps))
@@ -193,7 +194,7 @@ def test_what_stands_out_is_planned(model, film):
         assert agent.last_source == source
 
 
-def test_the_mismatch_is_between_what_was_predicted_and_what_was_seen(model, film):
+def test_mismatch_is_the_divergence_of_posterior_and_prior(model, film):
     agent = make(model, signal="mismatch")
     action = agent.act(film[0])
     deter = model.dynamics.advance(agent.state, torch.as_tensor(action))
@@ -205,7 +206,7 @@ def test_the_mismatch_is_between_what_was_predicted_and_what_was_seen(model, fil
     torch.testing.assert_close(agent._mismatch, expected, atol=1e-3, rtol=1e-3)
 
 
-def test_the_value_gap_is_the_error_of_two_steps_of_the_actor(model, film):
+def test_value_gap_is_the_difference_to_the_return_of_two_actor_steps(model, film):
     agent = make(model, signal="value")
     agent.act(film[0])
     state = agent.state
@@ -216,7 +217,7 @@ def test_the_value_gap_is_the_error_of_two_steps_of_the_actor(model, film):
     torch.testing.assert_close(gap, expected, atol=0.05, rtol=0.05)  # bfloat16
 
 
-def test_a_signal_that_is_not_a_number_plans_and_is_not_learned(model, film):
+def test_gated_agent_plans_and_keeps_its_statistics_when_the_signal_is_nan(model, film):
     agent = make(model, planning_budget=0.2, signal="value")
     agent._value_gap = lambda state, action: torch.full((len(action),), float("nan"))
     for frames in film[:5]:
@@ -224,7 +225,7 @@ def test_a_signal_that_is_not_a_number_plans_and_is_not_learned(model, film):
     assert agent.planned_fraction == 1.0 and agent._scales["value"].num == 0
 
 
-def test_a_search_that_found_nothing_leaves_the_decision_to_the_actor(model, film):
+def test_gated_agent_acts_by_the_actor_when_no_candidate_has_a_finite_return(model, film):
     broken = copy.deepcopy(model)
     with torch.no_grad():
         broken.reward_head.mlp.output.weight.fill_(torch.nan)
@@ -235,7 +236,7 @@ def test_a_search_that_found_nothing_leaves_the_decision_to_the_actor(model, fil
             assert gated.last_source == ["actor"] * 3
 
 
-def test_signals_choose_different_moments(model, film):
+def test_signals_choose_different_decisions(model, film):
     moments = {}
     for signal in SIGNALS:
         agent, sources = make(model, planning_budget=0.3, signal=signal), []
@@ -247,7 +248,7 @@ def test_signals_choose_different_moments(model, film):
 
 
 @pytest.mark.parametrize("signal", SIGNALS)
-def test_the_same_stream_gives_the_same_actions(model, film, signal):
+def test_act_repeats_with_the_seed(model, film, signal):
     left, right = (make(model, signal=signal, seed=4) for _ in range(2))
     for frames in film[:10]:
         actions = left.act(frames)
@@ -256,7 +257,7 @@ def test_the_same_stream_gives_the_same_actions(model, film, signal):
     assert left.encode(film[0, 0]).shape == (32,)
 
 
-def test_running_moments_are_those_of_all_values():
+def test_running_scale_has_the_mean_and_std_of_all_values():
     values = torch.randn(50, generator=torch.Generator().manual_seed(0))
     scale = RunningScale()
     first = scale.standardise(values[:1], torch.ones(1, dtype=torch.bool))
@@ -269,12 +270,12 @@ def test_running_moments_are_those_of_all_values():
 
 
 @pytest.mark.parametrize(("options", "words"), [({"planning_budget": 1.2}, "1.2"), ({"signal": "noise"}, "mismatch")])
-def test_what_cannot_be_is_refused(model, options, words):
+def test_gated_agent_refuses_budgets_and_signals_that_do_not_exist(model, options, words):
     with pytest.raises(ValueError, match=words):
         make(model, **options)
 
 
-def test_with_another_goal_the_plan_goes_on_where_none_is_made_and_the_actor_never_acts(model, film):
+def test_gated_agent_executes_the_rest_of_the_plan_when_the_objective_is_not_the_actors(model, film):
     agent, sources = make(model, planning_budget=0.3, signal="random"), []
     agent.set_objective(lambda rollout: -rollout.actions[:, 0, 0])
     for frames in film:
@@ -286,10 +287,10 @@ def test_with_another_goal_the_plan_goes_on_where_none_is_made_and_the_actor_nev
     horizon = agent.controller.planner.horizon
     assert set(sources) == {"plan", "tail"} and sources[0] == "plan"
     longest = max(len(run) for run in "".join(source[0] for source in sources).split("p"))
-    assert 1 <= longest <= horizon - 1  # a plan that has run out is followed by a search
+    assert 1 <= longest <= horizon - 1  # a search follows a plan that has run out
 
 
-def test_a_goal_that_was_just_set_is_planned_for_at_once(model, film):
+def test_gated_agent_plans_at_once_when_an_objective_is_set(model, film):
     agent = make(model, planning_budget=0.0)
     for goal in (lambda rollout: rollout.actions[:, 0, 0], lambda rollout: -rollout.actions[:, 0, 0]):
         agent.set_objective(goal)

@@ -1,4 +1,4 @@
-"""Agents: frames in, bounded actions out, and a past that belongs to each environment alone."""
+"""The planning agent: plans, pictures, deadlines, and the actor in place of plans from surprising frames."""
 
 import dataclasses
 
@@ -8,24 +8,22 @@ import torch
 
 from latentplan.agents.actor import ActorAgent
 from latentplan.agents.planning import PlanningAgent
-from latentplan.agents.random import RandomAgent
+from latentplan.models import State, WorldModel
+from latentplan.models.symmetry import TurnedModel
 from tests.agents.small_agents import CONFIG, make_model
+
+
+def cautious(rollout):
+    """A constraint: small first actions."""
+    return rollout.actions[:, 0].abs().sum(-1) - 0.1
+
+
+ASKED = [{"objective": lambda rollout: rollout.actions[:, 0, 0]}, {"constraints": [cautious]}]
 
 
 @pytest.fixture(scope="module")
 def model():
     return make_model()
-
-
-def make_planner(model, **options):
-    return PlanningAgent(model, CONFIG, 0.9, **options)
-
-
-def make_actor(model, **options):
-    return ActorAgent(model, CONFIG, **options)
-
-
-AGENTS = [pytest.param(make_planner, id="planner"), pytest.param(make_actor, id="actor")]
 
 
 @pytest.fixture
@@ -34,165 +32,24 @@ def film():
     return np.random.default_rng(0).integers(0, 256, (5, 3, 64, 64, 3), dtype=np.uint8)
 
 
-@pytest.mark.parametrize("make", AGENTS)
-def test_frames_become_bounded_float32_actions(make, model, film):
-    agent = make(model)
-    assert agent.num_actions == 2 and agent.config is CONFIG
-    action = agent.act(film[0, 0])
-    assert action.shape == (2,) and action.dtype == np.float32 and np.abs(action).max() <= 1.0
-    agent.reset()
-    actions = agent.act(film[0])
-    assert actions.shape == (3, 2) and actions.dtype == np.float32 and np.abs(actions).max() <= 1.0
+@pytest.fixture
+def frames(film):
+    """Frames of two environments."""
+    return film[0, :2]
 
 
-@pytest.mark.parametrize("make", AGENTS)
-def test_one_environment_alone_acts_as_in_a_batch_of_one(make, model, film):
-    alone, batched = make(model, seed=3), make(model, seed=3)
-    for frames in film:
-        assert np.array_equal(alone.act(frames[0]), batched.act(frames[:1])[0])
+def make_planner(model, **settings):
+    return PlanningAgent(model, CONFIG, 0.9, planner=dataclasses.replace(CONFIG.planner, **settings))
 
 
-@pytest.mark.parametrize("make", AGENTS)
-def test_environments_of_a_batch_do_not_feel_each_other(make, model, film):
-    for frames in film:
-        together, alone = make(model, seed=3), make(model, seed=3)
-        # A batch may be summed in another order than a row alone, and in bfloat16 that can swap two of the elites.
-        assert np.allclose(together.act(frames)[1], alone.act(frames[1]), atol=0.1)
-
-
-@pytest.mark.parametrize("make", AGENTS)
-def test_the_same_stream_gives_the_same_actions(make, model, film):
-    agent = make(model)
-    histories = []
-    for seed in (5, 5):
-        agent.reset()
-        agent.seed(seed)
-        histories.append(np.stack([agent.act(frames) for frames in film]))
-    assert np.array_equal(*histories)
-
-
-@pytest.mark.parametrize("make", AGENTS)
-def test_resetting_forgets_the_past(make, model, film):
-    agent, fresh = make(model), make(model)
-    for frames in film:
-        agent.act(frames)
-    agent.reset()
-    agent.seed(7)
-    fresh.seed(7)
-    assert np.array_equal(agent.act(film[2]), fresh.act(film[2]))
-
-
-@pytest.mark.parametrize("make", AGENTS)
-def test_a_masked_reset_forgets_only_there(make, model, film):
-    agent, kept, fresh = make(model), make(model), make(model)
-    for frames in film[:3]:
-        agent.act(frames)
-        kept.act(frames)
-    agent.reset(np.array([False, True, False]))
-    for one in (agent, kept, fresh):
-        one.seed(7)
-        one.act(film[3])
-    for ours, kepts, freshs in zip(agent.state, kept.state, fresh.state, strict=True):
-        assert torch.allclose(ours[[0, 2]], kepts[[0, 2]], atol=1e-5)
-        assert torch.allclose(ours[1], freshs[1], atol=1e-5)
-        assert not torch.allclose(ours[1], kepts[1], atol=1e-3)
-
-
-@pytest.mark.parametrize("make", AGENTS)
-def test_a_mask_of_other_environments_is_refused_and_changes_nothing(make, model, film):
-    agent = make(model)
-    agent.act(film[0])
-    with pytest.raises(ValueError, match="a mask of 2 for 3"):
-        agent.reset(np.array([True, False]))
-    agent.act(film[0])
-
-
-def test_a_masked_reset_forgets_the_plan_only_there(model, film):
+def test_masked_reset_forgets_the_plans_of_masked_environments_only(model, film):
     agent = make_planner(model)
     agent.act(film[0])
     agent.reset(np.array([False, True, False]))
     assert agent.controller.plan.is_warm.tolist() == [True, False, True]
 
 
-@pytest.mark.parametrize("make", AGENTS)
-def test_masked_resets_add_up(make, model, film):
-    agent, fresh = make(model), make(model)
-    agent.act(film[0])
-    agent.reset(np.array([True, False, False]))
-    agent.reset(np.array([False, True, False]))
-    agent.act(film[1])
-    fresh.act(film[1])
-    assert torch.allclose(agent.state.stoch[:2], fresh.state.stoch[:2], atol=1e-5)
-
-
-def test_the_belief_follows_the_action_that_was_executed(model, film):
-    noisy = make_planner(model, noise_std=0.5)
-    action = noisy.act(film[0])
-    before = noisy.state
-    noisy.act(film[1])
-    expected = model.infer(before, torch.as_tensor(action), torch.as_tensor(film[1]))
-    assert all(torch.allclose(left, right, atol=1e-5) for left, right in zip(noisy.state, expected, strict=True))
-
-
-def test_exploration_noise_moves_actions_and_stays_within_bounds(model, film):
-    plain, noisy = make_planner(model).act(film[0]), make_planner(model, noise_std=5.0).act(film[0])
-    assert not np.allclose(plain, noisy)
-    assert np.abs(noisy).max() <= 1.0
-
-
-def test_an_exploring_actor_samples_and_another_does_not(model, film):
-    firm, free = make_actor(model), make_actor(model, explore=True)
-    actions = {True: [], False: []}
-    for seed in (0, 1):
-        for explores, agent in ((False, firm), (True, free)):
-            agent.reset()
-            agent.seed(seed)
-            actions[explores].append(agent.act(film[0]))
-    assert np.array_equal(*actions[False])
-    assert not np.array_equal(*actions[True])
-    assert np.abs(actions[True]).max() <= 1.0
-
-
-@pytest.mark.parametrize("make", AGENTS)
-@pytest.mark.parametrize(
-    "frame",
-    [
-        np.zeros((64, 64, 3), np.float32),
-        np.zeros((32, 64, 3), np.uint8),
-        np.zeros((3, 64, 64), np.uint8),
-        np.zeros((64, 64), np.uint8),
-        np.zeros((1, 2, 64, 64, 3), np.uint8),
-    ],
-)
-def test_what_is_no_frame_is_refused(make, model, frame):
-    agent = make(model)
-    with pytest.raises(ValueError, match=r"frames must be uint8 \(64, 64, 3\), got"):
-        agent.act(frame)
-    with pytest.raises(ValueError, match=r"frames must be uint8 \(64, 64, 3\), got"):
-        agent.encode(frame)
-
-
-@pytest.mark.parametrize("make", AGENTS)
-def test_another_number_of_environments_needs_a_reset(make, model, film):
-    agent = make(model)
-    agent.act(film[0])
-    with pytest.raises(ValueError, match=r"call reset\(\)"):
-        agent.act(film[0, :2])
-    agent.reset()
-    assert agent.act(film[0, :2]).shape == (2, 2)
-
-
-@pytest.mark.parametrize("make", AGENTS)
-def test_encoding_gives_the_latent_and_leaves_no_trace(make, model, film):
-    agent, other = make(model, seed=1), make(model, seed=1)
-    latent = agent.encode(film[0, 0])
-    assert latent.shape == (32,) and latent.dtype == np.float32
-    assert np.allclose(agent.encode(film[0])[0], latent, atol=1e-5)
-    assert not np.allclose(agent.encode(film[1, 0]), latent)
-    assert np.array_equal(agent.act(film[0]), other.act(film[0]))
-
-
-def test_a_planner_pictures_where_its_plan_ends(model, film):
+def test_imagine_gives_a_picture_when_there_is_a_plan(model, film):
     agent = make_planner(model)
     assert agent.imagine() is None
     agent.act(film[0])
@@ -202,51 +59,8 @@ def test_a_planner_pictures_where_its_plan_ends(model, film):
     assert agent.imagine() is None
 
 
-def test_acting_changes_no_weight(model, film):
-    before = {name: value.clone() for name, value in model.state_dict().items()}
-    make_planner(model).act(film[0])
-    assert all(torch.equal(value, before[name]) for name, value in model.state_dict().items())
-    assert all(parameter.grad is None for parameter in model.parameters())
-
-
-def test_random_actions_fill_the_bounds_and_repeat_with_their_seed(film):
-    agent = RandomAgent(2, seed=4)
-    actions = np.stack([agent.act(film[0]) for _ in range(100)])
-    assert actions.shape == (100, 3, 2) and actions.dtype == np.float32
-    assert -1.0 <= actions.min() < -0.9 and 0.9 < actions.max() <= 1.0
-    agent.seed(4)
-    assert np.array_equal(agent.act(film[0]), actions[0])
-    assert agent.act(film[0, 0]).shape == (2,) and agent.imagine() is None
-
-
-def _noises(agent, frames, decisions):
-    """The noise of each decision, (decision, batch, action), where the agent's own choice is known."""
-    return torch.stack([agent.noise.draw(torch.zeros(frames, 2), agent.generator) for _ in range(decisions)])
-
-
-@pytest.mark.parametrize("correlation", [0.0, 0.8])
-def test_noise_keeps_its_variance_and_has_the_correlation_asked_for(correlation, model):
-    noise = _noises(make_actor(model, explore=True, noise_correlation=correlation), 2000, 20)
-    assert noise.var() == pytest.approx(1.0, abs=0.03)
-    lags = [(noise[lag:] * noise[: 20 - lag]).mean().item() for lag in (1, 2)]
-    assert lags == pytest.approx([correlation, correlation**2], abs=0.03)
-
-
-def test_a_new_episode_forgets_the_noise_of_the_last(model, film):
-    kept, reset = (make_actor(model, explore=True, noise_correlation=0.99, seed=3) for _ in range(2))
-    for agent in (kept, reset):
-        agent.act(film[0])
-    first = reset.noise.last
-    reset.reset(np.array([True] + [False] * (len(film[0]) - 1)))
-    for agent in (kept, reset):
-        agent.act(film[1])
-    assert torch.equal(kept.noise.last[1:], reset.noise.last[1:])
-    assert not torch.allclose(first[0], reset.noise.last[0], atol=0.3)
-
-
-def test_a_planner_without_time_acts_by_its_actor_and_says_so(model, film):
-    settings = dataclasses.replace(CONFIG.planner, deadline_ms=1e5)
-    agent, actor = make_planner(model, planner=settings), make_actor(model)
+def test_planning_agent_acts_by_the_actor_when_the_deadline_is_too_short(model, film):
+    agent, actor = make_planner(model, deadline_ms=1e5), ActorAgent(model, CONFIG)
     for frame in film[:3, 0]:
         agent.act(frame)
     assert agent.last_source == "plan"
@@ -258,7 +72,35 @@ def test_a_planner_without_time_acts_by_its_actor_and_says_so(model, film):
     assert np.allclose(agent.act(film[0, 0]), actor.act(film[0, 0]), atol=0.02) and agent.last_source == "actor"
 
 
-@pytest.mark.parametrize("make", AGENTS)
-def test_frames_may_be_flipped_views(make, model, film):
-    flipped = film[0, 0][::-1]
-    assert np.array_equal(make(model, seed=3).act(flipped), make(model, seed=3).act(flipped.copy()))
+def test_surprise_is_half_the_squared_distance_in_standard_deviations(model):
+    deter = torch.randn(2, 16, generator=torch.Generator().manual_seed(0))
+    prior = model.dynamics.prior(deter)
+    away = prior.std * torch.tensor([[0.0], [2.0]]) * (torch.arange(32) == 5)
+    assert torch.allclose(model.surprise(State(deter, prior.mean + away)), torch.tensor([0.0, 2.0]), atol=1e-4)
+    turned = State(deter[None].repeat(1, 2, 1), (prior.mean + away)[None].repeat(1, 2, 1))
+    assert torch.allclose(TurnedModel(model).surprise(turned), torch.tensor([1.0]), atol=1e-4)
+
+
+@pytest.mark.parametrize("limit", [5.0, 1.0, 0.5])
+def test_planning_agent_acts_by_the_actor_when_a_frame_exceeds_the_surprise_limit(model, frames, monkeypatch, limit):
+    surprise = torch.tensor([3.0, 0.7])
+    monkeypatch.setattr(WorldModel, "surprise", lambda self, state: surprise)
+    planner, actor = make_planner(model), ActorAgent(model, CONFIG)
+    limited = make_planner(model, surprise_limit=limit)
+    planned, acted, action = (agent.act(frames) for agent in (planner, actor, limited))
+    assert not np.allclose(planned, acted, atol=0.05)
+    for row in range(2):
+        expected = acted if surprise[row] > limit else planned
+        assert np.allclose(action[row], expected[row], atol=0.02)
+    is_surprised = bool(surprise[0] > limit)
+    assert (limited.imagine() is None) == is_surprised
+    assert limited.last_source == ("actor" if is_surprised else "plan") and limited.was_surprised == is_surprised
+
+
+@pytest.mark.parametrize("asked", ASKED)
+def test_planning_agent_ignores_surprise_when_an_objective_or_constraint_is_set(model, frames, asked):
+    planner = make_planner(model)
+    limited = make_planner(model, surprise_limit=1e-6)
+    for agent in (planner, limited):
+        agent.set_objective(**asked)
+    assert np.array_equal(planner.act(frames[0]), limited.act(frames[0])) and limited.last_source == "plan"

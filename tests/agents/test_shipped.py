@@ -1,4 +1,4 @@
-"""What is shipped works: every agent in `checkpoints/` loads and acts, and is what its description says."""
+"""Every agent in `checkpoints/` is as its description says, and earns far more than a random agent."""
 
 import hashlib
 from pathlib import Path
@@ -6,17 +6,62 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from latentplan.agents.checkpoint import load_agent, read_info
+from latentplan.agents.checkpoint import load_agent, load_model, read_info
+from latentplan.envs import make_env
+from latentplan.evaluation.episodes import episode_seed
 
 CHECKPOINTS = Path(__file__).parents[2] / "checkpoints"
+# Return of the first decisions of evaluation episode 0; the last two columns are measured returns on the same start.
+FLOORS = {
+    # agent: (decisions, floor)      actor   random agent
+    "ball_in_cup-catch": (50, 120),  # 200       11
+    "cartpole-balance": (50, 250),  #  396      122
+    "cartpole-swingup": (75, 250),  #  462      103
+    "cheetah-run": (75, 50),  #        111        1
+    "finger-spin": (75, 60),  #        122        0
+    "pendulum-swingup": (75, 100),  #  205        0
+    "reacher-easy": (50, 100),  #      188        0
+    "walker-run": (75, 30),  #          57        7
+    "walker-stand": (75, 95),  #       150       39
+    "walker-walk": (75, 55),  #        112        7
+}
+PLANNER_FLOORS = {
+    # agent: (decisions, floor)    planner   random agent
+    "cartpole-swingup": (60, 200),  #  352       59
+    "reacher-easy": (40, 80),  #       147        0
+}
 
 
-@pytest.mark.parametrize("folder", sorted(CHECKPOINTS.iterdir()), ids=lambda folder: folder.name)
-def test_a_shipped_agent_acts(folder):
-    info = read_info(folder)
-    assert folder.name == f"{info['domain']}-{info['task']}"
-    weights = (folder / "weights.safetensors").read_bytes()
+def earned(folder, mode, decisions):
+    """The return of the first decisions from the start of evaluation episode 0."""
+    agent, env = load_agent(folder, mode), make_env(load_model(folder)[1].env)
+    frame, _ = env.reset(seed=episode_seed(0, 0))
+    agent.seed(0)
+    total = 0.0
+    for _ in range(decisions):
+        frame, reward, *_ = env.step(agent.act(frame))
+        total += reward
+    env.close()
+    return total
+
+
+@pytest.mark.parametrize("name", sorted(path.name for path in CHECKPOINTS.iterdir()))
+def test_shipped_checkpoint_is_as_described_and_its_planner_acts(name):
+    info = read_info(CHECKPOINTS / name)
+    assert name == f"{info['domain']}-{info['task']}"
+    weights = (CHECKPOINTS / name / "weights.safetensors").read_bytes()
     assert len(weights) <= 2_500_000 and hashlib.sha256(weights).hexdigest() == info["sha256"]
-    for mode in ("planner", "actor"):
-        action = load_agent(folder, mode=mode).act(np.zeros((64, 64, 3), np.uint8))
-        assert action.shape == (info["action_dim"],) and np.abs(action).max() <= 1.0
+    action = load_agent(CHECKPOINTS / name).act(np.zeros((64, 64, 3), np.uint8))
+    assert action.shape == (info["action_dim"],) and np.abs(action).max() <= 1.0
+
+
+@pytest.mark.parametrize("name", sorted(path.name for path in CHECKPOINTS.iterdir()))
+def test_shipped_actor_earns_more_than_its_floor(name):
+    decisions, floor = FLOORS[name]
+    assert earned(CHECKPOINTS / name, "actor", decisions) > floor
+
+
+@pytest.mark.parametrize("name", PLANNER_FLOORS)
+def test_shipped_planner_earns_more_than_its_floor(name):
+    decisions, floor = PLANNER_FLOORS[name]
+    assert earned(CHECKPOINTS / name, "planner", decisions) > floor

@@ -1,4 +1,4 @@
-"""Agents that look at every frame from four sides: what they do does not depend on which side is up."""
+"""Agents that see four quarter turns of every frame: the turn of the frame does not change the action."""
 
 import copy
 import dataclasses
@@ -58,7 +58,7 @@ def film():
     return np.random.default_rng(0).integers(0, 256, (5, 3, 64, 64, 3), dtype=np.uint8)
 
 
-def test_frames_become_one_action_each(make, model, film):
+def test_act_returns_one_action_per_frame(make, model, film):
     agent = make(model)
     actions = np.stack([agent.act(frames) for frames in film])
     assert actions.shape == (5, 3, 2) and np.abs(actions).max() <= 1.0 and np.ptp(actions[0], axis=0).min() > 0.0
@@ -67,8 +67,8 @@ def test_frames_become_one_action_each(make, model, film):
     assert agent.act(film[0, 0]).shape == (2,)
 
 
-def seen_upright(model):
-    """An actor with the same weights that looks at frames as they are."""
+def without_turns(model):
+    """An actor with the same weights that sees frames as they are."""
     alone = copy.deepcopy(model)
     alone.config = dataclasses.replace(SIZES, turns=1)
     return ActorAgent(alone, CONFIG)
@@ -78,8 +78,8 @@ def turn(frames, quarters):
     return np.ascontiguousarray(np.rot90(frames, quarters, (1, 2)))
 
 
-def test_an_actor_does_the_same_whichever_side_is_up(model, film):
-    agent, turned, plain = ActorAgent(model, CONFIG), ActorAgent(model, CONFIG), seen_upright(model)
+def test_actor_gives_the_same_action_when_the_frame_is_turned(model, film):
+    agent, turned, plain = ActorAgent(model, CONFIG), ActorAgent(model, CONFIG), without_turns(model)
     for frames in film:
         expected = agent.act(frames)
         assert np.allclose(turned.act(turn(frames, 1)), expected, atol=1e-5)
@@ -87,19 +87,21 @@ def test_an_actor_does_the_same_whichever_side_is_up(model, film):
         plain.reset()
 
 
-def test_an_action_is_the_mean_of_what_one_would_do_from_each_side(model, film):
-    sides = [seen_upright(model).act(turn(film[0], side)) for side in range(4)]
+def test_action_is_the_mean_of_the_actions_of_all_turns(model, film):
+    sides = [without_turns(model).act(turn(film[0], side)) for side in range(4)]
     assert np.allclose(ActorAgent(model, CONFIG).act(film[0]), np.mean(sides, axis=0), atol=1e-5)
 
 
-@pytest.mark.parametrize("make", ["planner", "actor"], indirect=True)  # the others share searches or a threshold
-def test_environments_of_a_batch_do_not_feel_each_other(make, model, film):
+@pytest.mark.parametrize(
+    "make", ["planner", "actor"], indirect=True
+)  # gated and background agents share searches or a threshold
+def test_act_gives_each_environment_of_a_batch_its_own_action(make, model, film):
     together, alone = make(model), make(model)
     for frames in film:
         assert np.allclose(together.act(frames)[1], alone.act(frames[1]), atol=0.1)
 
 
-def test_an_episode_that_ends_is_forgotten_from_every_side(model, film):
+def test_masked_reset_forgets_the_beliefs_of_all_turns(model, film):
     agent, fresh = (ActorAgent(model, CONFIG) for _ in range(2))
     for frames in film[:3]:
         agent.act(frames)
@@ -107,13 +109,13 @@ def test_an_episode_that_ends_is_forgotten_from_every_side(model, film):
     assert np.allclose(agent.act(film[3])[1], fresh.act(film[3])[1], atol=1e-5)
 
 
-def test_a_goal_is_planned_for_from_every_side(model, film):
+def test_planning_agent_plans_for_an_objective_in_all_turns(model, film):
     agent = PlanningAgent(model, CONFIG, 0.9)
     agent.set_objective("distance -> 0.0", "distance < 0.5")
     assert agent.act(film[0]).shape == (3, 2)
 
 
-def test_a_goal_that_was_learned_is_pursued_from_every_side(model, film):
+def test_agents_pursue_a_learned_goal_in_all_turns(model, film):
     learned = copy.deepcopy(model)
     learned.add_goal_heads(16)
     for agent in (PlanningAgent(learned, CONFIG, 0.9), GatedAgent(learned, CONFIG, 0.9, planning_budget=0.5)):
@@ -121,7 +123,7 @@ def test_a_goal_that_was_learned_is_pursued_from_every_side(model, film):
         assert all(agent.act(frames).shape == (3, 2) for frames in film)
 
 
-def test_a_picture_is_reached_for_from_every_side(model, film, tmp_path):
+def test_planning_agent_pursues_a_goal_image_in_all_turns(model, film, tmp_path):
     import cv2
 
     cv2.imwrite(str(tmp_path / "goal.png"), film[0, 0])
@@ -130,7 +132,7 @@ def test_a_picture_is_reached_for_from_every_side(model, film, tmp_path):
     assert agent.act(film[1]).shape == (3, 2) and agent.imagine().shape == (32, 32, 3)
 
 
-def test_an_exported_actor_turns_its_frames_itself(model, film, tmp_path):
+def test_exported_program_turns_its_frames_itself(model, film, tmp_path):
     for parameter in model.parameters():
         parameter.data = parameter.data.half().float()
     save_checkpoint(tmp_path / "agent", model, CONFIG, INFO)
@@ -142,7 +144,7 @@ def test_an_exported_actor_turns_its_frames_itself(model, film, tmp_path):
         assert np.allclose(action.detach().numpy(), agent.act(frames), atol=1e-4)
 
 
-def test_it_is_refused_where_nothing_was_learned_from_turned_frames():
+def test_config_refuses_turns_when_no_turned_frames_are_learned_from():
     with pytest.raises(UserError, match="turned_share"):
         Config(model=SIZES)
     with pytest.raises(ValueError, match="turns must be 1 or 4"):

@@ -1,4 +1,4 @@
-"""The OpenGL backend is chosen before MuJoCo is imported, and its absence is explained."""
+"""The OpenGL backend is chosen before MuJoCo is imported, and errors name a remedy."""
 
 import ctypes.util
 
@@ -27,7 +27,7 @@ except UserError as error:
 """
 
 
-def test_the_users_choice_stands(monkeypatch):
+def test_choose_backend_keeps_the_users_choice(monkeypatch):
     monkeypatch.setenv("MUJOCO_GL", "glfw")
     assert gl.choose_backend() == "glfw"
 
@@ -43,7 +43,7 @@ def test_the_users_choice_stands(monkeypatch):
         (set(), True, "unasked", None),
     ],
 )
-def test_hardware_comes_first_then_osmesa_then_mesa(monkeypatch, libraries, device, egl_renderer, expected):
+def test_find_backend_prefers_hardware_then_osmesa_then_mesa(monkeypatch, libraries, device, egl_renderer, expected):
     monkeypatch.setattr(gl.sys, "platform", "linux")
     monkeypatch.setattr(ctypes.util, "find_library", lambda name: name if name in libraries else None)
     monkeypatch.setattr(gl, "_has_graphics_device", lambda: device)
@@ -51,26 +51,26 @@ def test_hardware_comes_first_then_osmesa_then_mesa(monkeypatch, libraries, devi
     assert gl._find_backend() == expected
 
 
-def test_a_machine_without_opengl_is_told_the_remedy(monkeypatch):
+def test_require_backend_names_the_remedy_without_opengl(monkeypatch):
     monkeypatch.delenv("MUJOCO_GL")
     monkeypatch.setattr(gl, "_find_backend", lambda: None)
     with pytest.raises(UserError, match="apt-get install -y libosmesa6"):
         gl.require_backend()
 
 
-def test_a_backend_that_does_not_exist_is_one_line(run_python):
+def test_make_env_explains_a_backend_that_does_not_exist_in_one_line(run_python):
     finished = run_python("-c", BROKEN)
     assert finished.returncode == 0, finished.stderr
     assert finished.stdout.startswith("cannot render with MUJOCO_GL=cardboard: ")
     assert len(finished.stdout.splitlines()) == 1
 
 
-def test_a_program_that_forgets_to_close_ends_without_a_word(run_python):
+def test_program_ends_without_output_when_it_does_not_close_its_environment(run_python):
     finished = run_python("-c", QUIET)
     assert (finished.returncode, finished.stdout, finished.stderr) == (0, "", "")
 
 
-def test_the_renderer_says_its_name():
+def test_render_info_names_backend_renderer_and_mujoco():
     info = render_info()
     assert info["backend"] and info["renderer"] and info["mujoco"]
     assert info["hardware"] == gl.is_hardware(info["renderer"])

@@ -1,4 +1,4 @@
-"""An objective that pays in place of the task's reward."""
+"""An objective whose value replaces the task's reward."""
 
 import numpy as np
 import pytest
@@ -12,7 +12,7 @@ OBJECTIVE = "0.5 * (cart -> 0.5 and upright > 0.9) + 0.1 * abs(pole_speed) + 0.2
 
 
 def config(objective):
-    return EnvConfig(domain="cartpole", render_quality="fastest", action_repeat=8, objective=objective)
+    return EnvConfig(domain="cartpole", render_quality="fastest", action_repeat=25, objective=objective)
 
 
 def returns(env, seed):
@@ -26,7 +26,7 @@ def returns(env, seed):
     return total
 
 
-def test_what_is_earned_is_what_evaluation_scores():
+def test_objective_reward_equals_the_score_of_the_evaluation():
     paid, plain = make_env(config(OBJECTIVE)), make_env(config(None))
     scored = ScoredEnv(plain, read_goals(OBJECTIVE, None, "cartpole"))
     earned, task_return = returns(paid, 3), returns(scored, 3)
@@ -36,7 +36,7 @@ def test_what_is_earned_is_what_evaluation_scores():
     scored.close()
 
 
-def test_a_score_for_the_return_counts_what_is_paid():
+def test_score_of_return_sums_the_objective_reward():
     env = make_env(config("upright > 0.5"))
     scored = ScoredEnv(env, read_goals("return", None, "cartpole"))
     assert scored.scores == [] and returns(scored, 1) == pytest.approx(scored.scores[0].objective_return)
@@ -46,13 +46,13 @@ def test_a_score_for_the_return_counts_what_is_paid():
 @pytest.mark.parametrize(
     "objective", ["return", "0.5 * (cart -> 0.5) + return", "goal:x.png", "carts > 0.5", "cart >", ""]
 )
-def test_what_is_no_function_of_quantities_is_refused(objective):
+def test_make_env_refuses_objectives_that_are_no_function_of_quantities(objective):
     with pytest.raises(UserError):
         make_env(config(objective))
 
 
-def test_an_environment_of_the_users_own_pays_its_own_reward(tmp_path):
+def test_train_refuses_an_objective_reward_in_a_users_environment(tmp_path):
     settings = Config(env=config("cart > 0"), run=RunConfig(frames=100, run_dir=str(tmp_path / "run")))
-    with pytest.raises(UserError, match="pays its own reward"):
+    with pytest.raises(UserError, match="returns its own reward"):
         train(settings, make_env=lambda: None)
     assert not (tmp_path / "run").exists()

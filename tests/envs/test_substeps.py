@@ -1,4 +1,4 @@
-"""Actions that change within a decision leave the simulation what it was."""
+"""Actions that change within a decision: the simulation is the same as with separate control steps."""
 
 import numpy as np
 import pytest
@@ -43,7 +43,7 @@ def same(one, other):
     return all(np.array_equal(a, b) for a, b in zip(one, other, strict=True))
 
 
-def test_a_decision_is_the_simulators_own_control_steps(env):
+def test_step_equals_the_simulators_own_control_steps(env):
     def by_hand(env, action):
         spec = env._task_env.action_spec()
         control = spec.minimum + (action + 1.0) * 0.5 * (spec.maximum - spec.minimum)
@@ -53,7 +53,7 @@ def test_a_decision_is_the_simulators_own_control_steps(env):
     assert same(played(env, lambda env, action: env.step(action)), played(env, by_hand))
 
 
-def test_one_action_cut_anywhere_is_one_action(env):
+def test_step_schedule_equals_step_when_all_its_actions_are_equal(env):
     total = env.substeps_per_decision
     whole = played(env, lambda env, action: env.step(action))
     for cut in {1, total // 2, total - 1}:
@@ -61,7 +61,7 @@ def test_one_action_cut_anywhere_is_one_action(env):
     assert same(whole, played(env, lambda env, action: env.step_schedule([(action, 1)] * total)))
 
 
-def test_a_change_between_control_steps_is_two_decisions_of_one_each(walker):
+def test_step_schedule_equals_two_decisions_when_the_action_changes_between_control_steps(walker):
     single = make_env(config(action_repeat=1), seed=0)
     one, other = some_actions(walker, 2)
     walker.reset(seed=1)
@@ -72,7 +72,7 @@ def test_a_change_between_control_steps_is_two_decisions_of_one_each(walker):
     single.close()
 
 
-def test_a_change_within_a_control_step_happens_at_its_substep(walker):
+def test_step_schedule_changes_the_action_at_its_substep(walker):
     one, other = some_actions(walker, 2)
     walker.reset(seed=1)
     walker.step_schedule([(one, 3), (other, 17)])
@@ -84,7 +84,7 @@ def test_a_change_within_a_control_step_happens_at_its_substep(walker):
     assert np.array_equal(changed, walker.true_state())
 
 
-def test_later_decisions_last_as_long_as_before(walker):
+def test_step_lasts_as_long_as_before_after_a_schedule(walker):
     one, other = some_actions(walker, 2)
     walker.reset(seed=1)
     walker.step_schedule([(one, 3), (other, 17)])
@@ -94,7 +94,7 @@ def test_later_decisions_last_as_long_as_before(walker):
     assert info["env_frames"] == 2
 
 
-def test_the_time_limit_ends_a_schedule_early():
+def test_step_schedule_ends_early_at_the_time_limit():
     env = make_env(config("cartpole", action_repeat=300), seed=0)
     env.reset(seed=0)
     action = np.zeros(1)
@@ -105,12 +105,12 @@ def test_the_time_limit_ends_a_schedule_early():
 
 
 @pytest.mark.parametrize("counts", [(), (19,), (21,), (0, 20), (-1, 21)])
-def test_substeps_must_be_those_of_a_decision(walker, counts):
+def test_step_schedule_refuses_substeps_that_do_not_add_up(walker, counts):
     walker.reset(seed=0)
     with pytest.raises(ValueError, match="add up to 20"):
         walker.step_schedule([(np.zeros(6), count) for count in counts])
 
 
-def test_cutting_keeps_order_and_substeps():
+def test_split_schedule_keeps_order_and_substeps():
     steps = list(split_schedule([("a", 3), ("b", 4), ("c", 2)], 4))
     assert steps == [[("a", 3), ("b", 1)], [("b", 3), ("c", 1)]]

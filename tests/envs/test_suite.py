@@ -1,4 +1,4 @@
-"""A suite task keeps the promises of an environment of frames."""
+"""Tasks of dm_control as environments of frames: determinism, spaces, time limits, rendering, errors."""
 
 import numpy as np
 import pytest
@@ -33,13 +33,13 @@ def play(env, seed, num_decisions=5):
     return np.stack(frames), np.array(rewards), np.stack(states)
 
 
-def test_an_episode_depends_on_its_seed_alone(env):
+def test_episode_depends_on_its_seed_alone(env):
     first, other, again = play(env, 5), play(env, 6), play(env, 5)
     assert all(np.array_equal(a, b) for a, b in zip(first, again, strict=True))
     assert not np.array_equal(first[2], other[2])
 
 
-def test_resets_without_a_seed_go_on_with_the_stream(env):
+def test_reset_continues_the_random_stream_without_a_seed(env):
     env.reset(seed=3)
     states = []
     for _ in range(2):
@@ -51,7 +51,7 @@ def test_resets_without_a_seed_go_on_with_the_stream(env):
     assert np.array_equal(states[0], env.true_state())
 
 
-def test_the_seed_given_at_the_start_is_that_of_the_first_reset(env):
+def test_make_env_seeds_the_first_reset(env):
     other = make_env(config(), seed=11)
     other.reset()
     env.reset(seed=11)
@@ -59,7 +59,7 @@ def test_the_seed_given_at_the_start_is_that_of_the_first_reset(env):
     other.close()
 
 
-def test_two_environments_do_not_disturb_each_others_frames(env):
+def test_frames_are_independent_of_other_environments(env):
     alone, _, _ = play(env, 5)
     other = make_env(config(domain="pendulum"), seed=0)
     other.reset()
@@ -71,7 +71,7 @@ def test_two_environments_do_not_disturb_each_others_frames(env):
     assert np.array_equal(alone, np.stack(frames))
 
 
-def test_frames_are_never_changed_later(env):
+def test_frames_are_new_arrays(env):
     frame, _ = env.reset(seed=0)
     copy = frame.copy()
     for _ in range(5):
@@ -79,7 +79,7 @@ def test_frames_are_never_changed_later(env):
     assert np.array_equal(frame, copy)
 
 
-def test_spaces_are_bytes_in_and_bounded_floats_out(env):
+def test_spaces_are_uint8_frames_and_bounded_float32_actions(env):
     assert env.observation_space.shape == (64, 64, 3)
     assert env.observation_space.dtype == np.uint8
     assert env.action_space.dtype == np.float32
@@ -87,11 +87,11 @@ def test_spaces_are_bytes_in_and_bounded_floats_out(env):
 
 
 @pytest.mark.filterwarnings("ignore::UserWarning")
-def test_gymnasiums_own_checker_agrees(env):
+def test_suite_env_passes_gymnasiums_checker(env):
     check_env(env, skip_render_check=True)
 
 
-def test_action_repeat_sums_the_rewards_of_single_steps(env):
+def test_step_sums_the_rewards_of_its_control_steps(env):
     single = make_env(config(action_repeat=1), seed=0)
     env.reset(seed=2)
     single.reset(seed=2)
@@ -105,7 +105,7 @@ def test_action_repeat_sums_the_rewards_of_single_steps(env):
 
 
 @pytest.mark.parametrize(("action_repeat", "decisions", "last"), [(8, 125, 8), (300, 4, 100)])
-def test_the_time_limit_truncates_after_a_thousand_control_steps(action_repeat, decisions, last):
+def test_step_truncates_after_a_thousand_control_steps(action_repeat, decisions, last):
     env = make_env(config(action_repeat=action_repeat), seed=0)
     env.reset()
     taken, total, ended = [], 0.0, False
@@ -121,7 +121,7 @@ def test_the_time_limit_truncates_after_a_thousand_control_steps(action_repeat, 
     env.close()
 
 
-def test_a_task_that_ends_itself_terminates():
+def test_step_terminates_when_the_task_ends():
     env = make_env(config(domain="lqr", action_repeat=1), seed=0)
     env.reset()
     with env.physics.reset_context():
@@ -131,7 +131,7 @@ def test_a_task_that_ends_itself_terminates():
     assert terminated and not truncated
 
 
-def test_actions_beyond_the_bounds_act_like_the_bounds(env):
+def test_step_clips_actions_to_the_bounds(env):
     states = []
     for value in (1.0, 7.0):
         env.reset(seed=4)
@@ -141,7 +141,7 @@ def test_actions_beyond_the_bounds_act_like_the_bounds(env):
 
 
 @pytest.mark.parametrize(("domain", "largest"), [("lqr", 1.0), ("quadruped", [1.0, 1.1, 0.8] * 4)])
-def test_the_largest_action_is_the_bodys_largest_control_or_1_where_it_has_none(domain, largest):
+def test_step_scales_actions_to_the_control_range_or_1_without_one(domain, largest):
     env = make_env(config(domain=domain, action_repeat=1), seed=0)
     env.reset(seed=0)
     env.step(np.ones(env.action_space.shape))
@@ -151,13 +151,13 @@ def test_the_largest_action_is_the_bodys_largest_control_or_1_where_it_has_none(
 
 
 @pytest.mark.parametrize("action", [np.zeros(2), np.array([np.nan])])
-def test_an_action_that_cannot_be_is_refused(env, action):
+def test_step_refuses_actions_of_another_shape_or_not_finite(env, action):
     env.reset(seed=0)
     with pytest.raises(ValueError, match="action"):
         env.step(action)
 
 
-def test_the_exact_picture_is_dm_controls_own():
+def test_exact_frame_equals_dm_controls_rendering():
     env = make_env(config(render_quality="exact"), seed=0)
     frame, _ = env.reset()
     expected = env.physics.render(64, 64, camera_id=0)
@@ -166,8 +166,8 @@ def test_the_exact_picture_is_dm_controls_own():
 
 
 @pytest.mark.parametrize("domain", ["walker", "cheetah"])
-def test_an_endless_floor_changes_nothing_but_what_is_seen_behind_the_start(domain):
-    """Behind, the suite draws no floor: pictures differ there; ahead they are the same, to rounding."""
+def test_endless_floor_changes_only_frames_behind_the_start(domain):
+    """The suite draws no floor behind the start: frames differ there, and ahead they are equal up to rounding."""
     envs = [make_env(config(domain=domain, floor=floor), seed=0) for floor in ("suite", "endless")]
     differences = {}
     for place in (-8.0, 8.0):
@@ -184,7 +184,7 @@ def test_an_endless_floor_changes_nothing_but_what_is_seen_behind_the_start(doma
     assert np.array_equal(*states)
 
 
-def test_large_pictures_show_the_same_view(env):
+def test_render_large_shows_the_same_view(env):
     frame, _ = env.reset(seed=0)
     large = env.unwrapped.render_large(256)
     assert large.shape == (256, 256, 3)
@@ -201,12 +201,12 @@ def test_large_pictures_show_the_same_view(env):
         ({"camera": 9}, r"camera 9 does not exist; cartpole has 2 cameras"),
     ],
 )
-def test_unknown_names_are_refused_with_the_nearest_choice(changes, message):
+def test_make_env_names_the_nearest_choice_for_unknown_names(changes, message):
     with pytest.raises(UserError, match=message):
         make_env(config(**changes))
 
 
-def test_every_domain_has_a_default_task_that_exists():
+def test_default_task_exists_in_every_domain():
     from dm_control import suite
 
     for domain, tasks in suite.TASKS_BY_DOMAIN.items():

@@ -1,12 +1,12 @@
-"""Named quantities are what the simulator knows, and the rewards of sibling tasks are the suite's own."""
+"""Named quantities have the simulator's values, and task quantities the rewards of the suite."""
 
 import numpy as np
 import pytest
 
 from latentplan.config import EnvConfig
-from latentplan.config.quantities import QUANTITIES, TASK_PREFIX
+from latentplan.config.quantities import QUANTITIES, TASK_PREFIX, scales
 from latentplan.envs import make_env
-from latentplan.envs.true_quantities import clause_degree, measure, quantity_names, scales, true_values
+from latentplan.envs.true_quantities import clause_degree, measure, true_values
 
 NOT_IN_THE_SUITE = {("walker", "backward"), ("cheetah", "backward")}
 REWARDS = [
@@ -24,18 +24,18 @@ def load(domain, task):
 
 
 def value(domain, physics, name):
-    return true_values(domain, physics)[quantity_names(domain, "").index(name)]
+    return true_values(domain, physics)[list(scales(domain)).index(name)]
 
 
 @pytest.mark.parametrize(("domain", "task"), [pair for pair in REWARDS if pair not in NOT_IN_THE_SUITE])
-def test_rewards_of_sibling_tasks_are_those_of_the_suite(domain, task):
+def test_task_quantities_equal_the_rewards_of_the_suite(domain, task):
     env, rng = load(domain, task), np.random.default_rng(0)
     spec = env.action_spec()
     errors = []
     for _ in range(3):
         env.reset()
         for _ in range(25):
-            # Large velocities reach the parts of the rewards that random actions do not.
+            # Large velocities reach the parts of the rewards that random actions do not reach.
             env.physics.data.qvel[:] += rng.normal(size=env.physics.data.qvel.shape)
             timestep = env.step(rng.uniform(spec.minimum, spec.maximum))
             errors.append(abs(value(domain, env.physics, f"task.{task}") - timestep.reward))
@@ -45,7 +45,7 @@ def test_rewards_of_sibling_tasks_are_those_of_the_suite(domain, task):
 @pytest.mark.parametrize(
     ("domain", "task"), [("reacher", "easy"), ("reacher", "hard"), ("ball_in_cup", "catch"), ("finger", "turn_hard")]
 )
-def test_sparse_rewards_are_paid_at_the_target(domain, task):
+def test_task_quantities_of_sparse_tasks_are_1_at_the_target(domain, task):
     env = load(domain, task)
     env.reset()
     data, model = env.physics.named.data, env.physics.named.model
@@ -60,7 +60,7 @@ def test_sparse_rewards_are_paid_at_the_target(domain, task):
 
 
 @pytest.mark.parametrize(("domain", "forward"), [("walker", "walk"), ("cheetah", "run")])
-def test_backward_mirrors_the_forward_reward(domain, forward):
+def test_task_quantity_backward_mirrors_the_forward_reward(domain, forward):
     env = load(domain, "run")
     env.reset()
     paid = {}
@@ -73,43 +73,43 @@ def test_backward_mirrors_the_forward_reward(domain, forward):
 
 
 @pytest.mark.parametrize("domain", QUANTITIES)
-def test_every_name_has_one_value_and_a_scale(domain):
+def test_measure_gives_one_value_per_name(domain):
     env = load(domain, REWARDS[[pair[0] for pair in REWARDS].index(domain)][1])
     env.reset()
-    names, values = quantity_names(domain, "any"), measure(domain, env.physics)
+    names, values = tuple(scales(domain)), measure(domain, env.physics)
     assert (values.shape, values.dtype) == ((len(names),), np.float32)
     assert len(set(names)) == len(names)
     assert all(name.removeprefix(TASK_PREFIX).isidentifier() for name in names)
     assert min(scales(domain).values()) > 0
 
 
-def test_quantities_are_read_from_the_body():
+def test_true_values_are_those_of_the_body():
     env = load("cartpole", "swingup")
     env.reset()
     for angle in (0.0, 0.5, -2.0, 3.5):
         with env.physics.reset_context():
             env.physics.named.data.qpos["slider"], env.physics.named.data.qpos["hinge_1"] = 0.7, angle
             env.physics.data.qvel[:] = (0.3, -4.0)
-        names, values = quantity_names("cartpole", "swingup"), true_values("cartpole", env.physics)
+        names, values = scales("cartpole"), true_values("cartpole", env.physics)
         found = dict(zip(names, values, strict=True))
         wrapped = (angle + np.pi) % (2 * np.pi) - np.pi
         expected = {"cart": 0.7, "pole_angle": wrapped, "upright": np.cos(angle), "cart_speed": 0.3, "pole_speed": -4.0}
         assert {name: found[name] for name in expected} == pytest.approx(expected, abs=1e-9)
 
 
-def test_a_body_without_names_has_no_quantities():
+def test_measure_is_empty_for_a_domain_without_quantities():
     env = load("acrobot", "swingup")
-    assert quantity_names("acrobot", "swingup") == ()
+    assert scales("acrobot") == {}
     assert measure("acrobot", env.physics).shape == (0,)
 
 
-def test_a_clause_is_worth_a_tenth_one_margin_short_of_it():
+def test_clause_degree_is_a_tenth_at_a_shortfall_of_one_margin():
     degrees = clause_degree(np.array([-3.0, 0.0, 0.5, 1.0, np.nan]))
     assert degrees[:4] == pytest.approx([1.0, 1.0, 0.1**0.25, 0.1])
     assert np.isnan(degrees[4])
 
 
-def test_a_step_tells_what_was_true_after_each_of_its_control_steps():
+def test_step_reports_true_values_after_each_control_step_when_recorded():
     config = EnvConfig("walker", "walk", action_repeat=3, render_quality="fastest")
     env, twin = make_env(config, seed=1), load("walker", "walk")
     env.record_quantities = True
@@ -130,7 +130,7 @@ def test_a_step_tells_what_was_true_after_each_of_its_control_steps():
     env.close()
 
 
-def test_the_documentation_lists_every_quantity_with_its_margin(root):
+def test_documentation_lists_every_quantity_with_its_margin(root):
     text = (root / "docs" / "zero-shot.md").read_text()
     rows = [
         f"`{quantity.name}` | {quantity.unit.replace('1', '')} | {quantity.scale:g} | {quantity.meaning} |"

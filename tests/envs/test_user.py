@@ -1,4 +1,4 @@
-"""A user's environment becomes frames of 64 x 64 and actions in [-1, 1], or is refused by name."""
+"""A user's environment becomes frames of 64 x 64 and actions in [-1, 1], or is refused with a reason."""
 
 import gymnasium
 import numpy as np
@@ -14,7 +14,7 @@ ACTIONS = Box(np.array([0.0, -4.0], np.float32), np.array([2.0, 4.0], np.float32
 
 
 class Clock(gymnasium.Env):
-    """Its picture is as bright as the number of steps taken; its reward is the first action."""
+    """The pixels hold the number of steps taken; the reward is the first entry of the action."""
 
     def __init__(self, observation_space=IMAGE, action_space=ACTIONS):
         self.observation_space = observation_space
@@ -33,7 +33,7 @@ class Clock(gymnasium.Env):
         return self.picture, action[0], bool(self.picture.max() == 7), False, {}
 
 
-def test_pictures_are_resized_and_never_changed_later():
+def test_frames_are_resized_new_arrays():
     env = wrap_user_env(Clock())
     first, _ = env.reset()
     second, *_ = env.step(np.zeros(2))
@@ -42,14 +42,14 @@ def test_pictures_are_resized_and_never_changed_later():
     assert env.render_large(256).shape == (256, 256, 3)
 
 
-def test_pictures_of_the_right_size_are_copied():
+def test_frames_are_copied_when_the_size_fits():
     env = wrap_user_env(Clock(Box(0, 255, (64, 64, 3), np.uint8)))
     first, _ = env.reset()
     env.step(np.zeros(2))
     assert (first == 0).all()
 
 
-def test_actions_are_scaled_to_the_users_bounds():
+def test_step_scales_actions_to_the_users_bounds():
     clock = Clock()
     env = wrap_user_env(clock)
     env.reset()
@@ -59,7 +59,7 @@ def test_actions_are_scaled_to_the_users_bounds():
     assert clock.actions[0].dtype == np.float32
 
 
-def test_action_repeat_sums_rewards_and_stops_at_the_end():
+def test_step_sums_rewards_and_stops_at_the_end_of_the_episode():
     env = wrap_user_env(Clock(), action_repeat=4)
     env.reset()
     _, reward, terminated, _, info = env.step(np.ones(2))
@@ -69,7 +69,7 @@ def test_action_repeat_sums_rewards_and_stops_at_the_end():
     assert (frame == 7).all()
 
 
-def test_a_time_limit_gives_the_decisions_per_episode():
+def test_decisions_per_episode_follows_from_the_time_limit():
     assert wrap_user_env(Clock(), action_repeat=4).decisions_per_episode is None
     gymnasium.register("latentplan-test/Clock-v0", lambda: Clock(), max_episode_steps=10)
     limited = gymnasium.make("latentplan-test/Clock-v0", disable_env_checker=True)
@@ -77,11 +77,11 @@ def test_a_time_limit_gives_the_decisions_per_episode():
     assert wrap_user_env(limited, action_repeat=4).decisions_per_episode == 3
 
 
-def test_a_time_limit_around_an_environment_without_a_spec_counts_too():
+def test_decisions_per_episode_follows_from_a_wrapper_without_a_spec():
     assert wrap_user_env(TimeLimit(Clock(), 10), action_repeat=4).decisions_per_episode == 3
 
 
-def test_without_a_limit_an_episode_is_cut(monkeypatch):
+def test_step_truncates_after_the_longest_episode_without_a_time_limit(monkeypatch):
     monkeypatch.setattr(user, "LONGEST", 5)
     env = wrap_user_env(Clock())
     for _ in range(2):
@@ -93,14 +93,14 @@ def test_without_a_limit_an_episode_is_cut(monkeypatch):
     assert [limited.step(np.zeros(2))[3] for _ in range(6)] == [False] * 5 + [True]
 
 
-def test_films_keep_the_pace_of_the_environment():
+def test_render_fps_is_divided_by_the_action_repeat():
     clock = Clock()
     clock.metadata = {"render_fps": 30}
     assert wrap_user_env(clock, action_repeat=4).metadata["render_fps"] == 7.5
     assert "render_fps" not in wrap_user_env(Clock()).metadata
 
 
-def test_extreme_actions_lie_within_the_users_bounds():
+def test_step_keeps_extreme_actions_within_the_users_bounds():
     for low, high in np.random.default_rng(0).integers(-20, 20, (200, 2)) / 10.0:
         space = Box(np.float32(min(low, high)), np.float32(max(low, high)) + np.float32(0.1), (2,), np.float32)
         clock = Clock(action_space=space)
@@ -111,19 +111,19 @@ def test_extreme_actions_lie_within_the_users_bounds():
 
 
 @pytest.mark.parametrize("action", [np.zeros(1), np.zeros((1, 2)), np.array([0.0, np.nan]), 0.5])
-def test_actions_of_another_shape_or_without_numbers_are_refused(action):
+def test_step_refuses_actions_of_another_shape_or_not_finite(action):
     env = wrap_user_env(Clock())
     env.reset()
     with pytest.raises(ValueError, match="finite numbers"):
         env.step(action)
 
 
-def test_an_action_is_held_for_at_least_one_step():
+def test_wrap_user_env_refuses_an_action_repeat_below_1():
     with pytest.raises(UserError, match="action_repeat must be at least 1"):
         wrap_user_env(Clock(), 0)
 
 
-def test_the_factory_builder_seeds_the_first_reset_only():
+def test_make_from_seeds_the_first_reset_only():
     build = make_from(Clock)
     starts = [build(EnvConfig(), 5).reset()[1]["start"] for _ in range(2)]
     env = build(EnvConfig(), 5)
@@ -140,7 +140,7 @@ def test_the_factory_builder_seeds_the_first_reset_only():
         (Box(0, 255, (64, 64), np.uint8), r"got shape \(64, 64\)"),
     ],
 )
-def test_observations_that_are_no_images_are_refused(space, got):
+def test_wrap_user_env_refuses_observations_that_are_no_images(space, got):
     with pytest.raises(UserError, match=f"observations must be .*{got}"):
         wrap_user_env(Clock(observation_space=space))
 
@@ -155,16 +155,16 @@ def test_observations_that_are_no_images_are_refused(space, got):
         (Box(np.finfo(np.float32).min, np.finfo(np.float32).max, (2,), np.float32), "got bounds"),
     ],
 )
-def test_actions_that_are_no_bounded_box_are_refused(space, got):
+def test_wrap_user_env_refuses_actions_that_are_no_bounded_box(space, got):
     with pytest.raises(UserError, match=f"actions must be .*{got}"):
         wrap_user_env(Clock(action_space=space))
 
 
-def test_what_only_its_user_can_make_is_not_looked_for_in_the_suite():
+def test_make_env_refuses_the_domain_of_users_environments():
     with pytest.raises(UserError, match="an environment of your own"):
         make_env(EnvConfig(domain=USER_DOMAIN))
 
 
-def test_a_factory_of_something_else_is_refused():
+def test_make_from_refuses_a_factory_of_something_else():
     with pytest.raises(UserError, match=r"make_env must return a gymnasium.Env, got dict"):
         make_from(dict)(EnvConfig(), 0)

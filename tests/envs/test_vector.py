@@ -1,4 +1,4 @@
-"""Several environments behave as the same environments one by one."""
+"""A vector environment behaves as the same environments one by one."""
 
 import os
 
@@ -14,7 +14,7 @@ ACTIONS = np.random.default_rng(0).uniform(-1.0, 1.0, (6, 2, 1)).astype(np.float
 
 @pytest.fixture(scope="module")
 def pair():
-    make_env(CONFIG).close()  # loads MuJoCo, which leaves a variable of its own behind the first time
+    make_env(CONFIG).close()  # loads MuJoCo, which sets an environment variable the first time
     before = dict(os.environ)
     pair = make_vector_env(CONFIG, 2, seed=0)
     assert dict(os.environ) == before
@@ -22,7 +22,7 @@ def pair():
     pair.close()
 
 
-def test_a_pair_equals_two_single_environments(pair):
+def test_vector_env_equals_single_environments(pair):
     singles = [make_env(CONFIG, seed=0) for _ in range(2)]
     frames, _ = pair.reset(seed=[3, 4])
     expected = [env.reset(seed=seed)[0] for env, seed in zip(singles, (3, 4), strict=True)]
@@ -40,7 +40,7 @@ def test_a_pair_equals_two_single_environments(pair):
         env.close()
 
 
-def test_only_masked_environments_restart(pair):
+def test_reset_restarts_only_masked_environments(pair):
     pair.reset(seed=[3, 4])
     before, *_ = pair.step(ACTIONS[0])
     after, _ = pair.reset(options={"reset_mask": np.array([True, False])})
@@ -48,14 +48,14 @@ def test_only_masked_environments_restart(pair):
     assert np.array_equal(before[1], after[1])
 
 
-def test_frames_of_a_pair_are_never_changed_later(pair):
+def test_frames_are_new_arrays(pair):
     frames, _ = pair.reset(seed=[3, 4])
     copy = frames.copy()
     pair.step(ACTIONS[0])
     assert np.array_equal(frames, copy)
 
 
-def test_a_single_environment_needs_no_process_and_restarts_alike():
+def test_vector_env_of_one_restarts_like_several():
     one = make_vector_env(CONFIG, 1, seed=0)
     first, _ = one.reset()
     for _ in range(4):
@@ -66,7 +66,7 @@ def test_a_single_environment_needs_no_process_and_restarts_alike():
     one.close()
 
 
-def test_a_users_factory_runs_in_every_process():
+def test_vector_env_calls_a_users_factory_in_every_process():
     import gymnasium
     from gymnasium.spaces import Box
 
@@ -81,12 +81,10 @@ def test_a_users_factory_runs_in_every_process():
         def step(self, action):
             return self.np_random.integers(0, 256, (32, 32, 3), np.uint8), float(action[0]), False, False, {}
 
-    pictures = []
-    for _ in range(2):
-        pair = make_vector_env(EnvConfig(), 2, seed=9, make_env=lambda: Noise())
-        pictures.append(pair.reset()[0])
-        _, rewards, *_ = pair.step(np.array([[1.0, 0.0], [0.5, 0.0]], np.float32))
-        pair.close()
-    assert np.array_equal(*pictures)  # the same seed, the same streams
-    assert not np.array_equal(pictures[0][0], pictures[0][1])  # and another stream for each
+    pair, alone = (make_vector_env(EnvConfig(), count, seed=9, make_env=lambda: Noise()) for count in (2, 1))
+    pictures = pair.reset()[0]
+    _, rewards, *_ = pair.step(np.array([[1.0, 0.0], [0.5, 0.0]], np.float32))
+    pair.close()
+    assert np.array_equal(pictures[0], alone.reset()[0][0])  # the same seed and index give the same stream
+    assert not np.array_equal(pictures[0], pictures[1])  # each environment has another stream
     assert np.array_equal(rewards, [4.0, 2.0])  # action repeat 2

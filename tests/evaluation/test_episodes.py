@@ -1,16 +1,19 @@
+"""Closed-loop episodes: starts that depend on the seed alone, and what is counted on the way."""
+
 import math
+import time
 
 import gymnasium
 import numpy as np
 import pytest
 
 from latentplan.config import UserError
-from latentplan.evaluation.episodes import episode_seed, iterate_episodes, run_episodes
-from latentplan.evaluation.statistics import confidence_interval, latency_percentiles, summarize
+from latentplan.evaluation.episodes import episode_seed, evaluate_agent, iterate_episodes, run_episodes
+from latentplan.evaluation.statistics import summarize
 
 
 class ClockEnv(gymnasium.Env):
-    """Every pixel tells the time, counted from a start drawn by the seed; the reward is the action."""
+    """The pixels hold the time since a start drawn from the seed; the reward is the action."""
 
     def __init__(self, length=5, terminates=False):
         self.observation_space = gymnasium.spaces.Box(0, 255, (64, 64, 3), np.uint8)
@@ -38,7 +41,7 @@ class ClockEnv(gymnasium.Env):
 
 
 class NoisyAgent:
-    """Adds noise of its own stream to a constant, and counts what it saw since the last reset."""
+    """Adds noise from its own stream to a constant, and keeps the times of the frames since the last reset."""
 
     def __init__(self, constant=0.0):
         self.constant, self.seen = constant, None
@@ -64,24 +67,24 @@ def returns_of(episodes):
     return [episode.total_return for episode in episodes]
 
 
-def test_episode_seeds_depend_on_seed_and_index_only():
+def test_episode_seed_depends_on_seed_and_index_only():
     seeds = [episode_seed(seed, index) for seed in range(5) for index in range(20)]
     assert len(set(seeds)) == 100
     assert seeds == [episode_seed(seed, index) for seed in range(5) for index in range(20)]
 
 
-def test_episode_seeds_suit_every_generator():
+def test_episode_seed_fits_into_32_bits():
     assert all(0 <= episode_seed(0, index) < 2**32 for index in range(1000))
 
 
-def test_agents_meet_the_same_starts():
+def test_run_episodes_gives_all_agents_the_same_starts():
     seeds = [episode_seed(0, index) for index in range(4)]
     starts = first_frames(ClockEnv(), NoisyAgent(), seeds)
     assert starts == first_frames(ClockEnv(length=9), NoisyAgent(0.5), seeds)
     assert len(set(starts)) > 1
 
 
-def test_an_episode_does_not_depend_on_those_before_it():
+def test_run_episodes_plays_each_episode_independently_of_earlier_ones():
     seeds = [episode_seed(3, index) for index in range(4)]
     env, agent = ClockEnv(), NoisyAgent()
     together = returns_of(run_episodes(env, agent, seeds))
@@ -89,7 +92,7 @@ def test_an_episode_does_not_depend_on_those_before_it():
     assert together == alone[::-1]
 
 
-def test_the_stream_of_the_agent_is_not_the_stream_of_the_start():
+def test_run_episodes_seeds_the_agent_with_a_stream_of_its_own():
     class Recorder(NoisyAgent):
         def seed(self, seed):
             self.given = seed
@@ -100,25 +103,34 @@ def test_the_stream_of_the_agent_is_not_the_stream_of_the_start():
     assert agent.given != 7
 
 
-def test_the_agent_sees_every_frame_but_the_last_in_order():
+def test_run_episodes_shows_the_agent_every_frame_but_the_last_in_order():
     agent = NoisyAgent()
     run_episodes(ClockEnv(length=6), agent, [1])
     assert agent.seen == list(range(agent.seen[0], agent.seen[0] + 6))
 
 
 @pytest.mark.parametrize("terminates", [False, True])
-def test_episodes_end_where_the_environment_ends(terminates):
+def test_run_episodes_ends_an_episode_when_the_environment_does(terminates):
     (episode,) = run_episodes(ClockEnv(length=7, terminates=terminates), NoisyAgent(), [0])
     assert (episode.num_decisions, episode.env_frames, episode.decision_ms.shape) == (7, 28, (7,))
 
 
 @pytest.mark.parametrize("value", [math.nan, math.inf])
-def test_a_reward_that_is_no_number_is_an_error(value):
+def test_run_episodes_refuses_rewards_that_are_not_finite(value):
     with pytest.raises(UserError, match="not finite"):
         run_episodes(ClockEnv(), NoisyAgent(value), [0])
 
 
-def test_steps_tell_the_reward_before_the_action_and_then_the_end():
+def test_evaluate_agent_summarizes_the_episodes_of_its_seeds():
+    result = evaluate_agent(NoisyAgent(), ClockEnv(), seed=3, episodes=2)
+    played = run_episodes(ClockEnv(), NoisyAgent(), [episode_seed(3, 0), episode_seed(3, 1)])
+    assert (result["seed"], result["episodes"], result["returns"]) == (3, 2, returns_of(played))
+    assert result.keys() == {"seed", *summarize(played)}
+    with pytest.raises(ValueError, match="at least one"):
+        evaluate_agent(NoisyAgent(), ClockEnv(), seed=3, episodes=0)
+
+
+def test_on_step_gets_the_return_before_each_decision_and_at_the_end():
     steps = []
     (episode,) = run_episodes(ClockEnv(length=3), NoisyAgent(1.0), [0], on_step=steps.append)
     assert [step.decision for step in steps] == [0, 1, 2, 3]
@@ -128,19 +140,17 @@ def test_steps_tell_the_reward_before_the_action_and_then_the_end():
     assert steps[-1].total_return == episode.total_return
 
 
-def test_decision_time_leaves_out_the_simulator_and_the_callback():
-    import time
-
+def test_decision_ms_excludes_simulator_and_callback():
     class SlowEnv(ClockEnv):
         def step(self, action):
             time.sleep(0.05)
             return super().step(action)
 
     (episode,) = run_episodes(SlowEnv(), NoisyAgent(), [0], on_step=lambda step: time.sleep(0.05))
-    assert np.median(episode.decision_ms) < 25.0  # either sleep inside would make it 50
+    assert np.median(episode.decision_ms) < 25.0  # with either sleep in it the median would be 50 ms
 
 
-def test_finished_episodes_are_there_before_the_next_begins():
+def test_iterate_episodes_gives_an_episode_before_the_next_begins():
     class Impatient(NoisyAgent):
         def act(self, frame):
             if len(finished) == 2:
@@ -152,45 +162,3 @@ def test_finished_episodes_are_there_before_the_next_begins():
         for episode in iterate_episodes(ClockEnv(), Impatient(), [0, 1, 2]):
             finished.append(episode)
     assert len(finished) == 2
-
-
-@pytest.mark.parametrize(
-    ("freedom", "quantile"),
-    [(1, 12.7062), (4, 2.7764), (9, 2.2622), (10, 2.2281), (11, 2.2010), (19, 2.0930), (99, 1.9842)],
-)
-def test_intervals_are_students(freedom, quantile):
-    returns = np.random.default_rng(0).normal(size=freedom + 1)
-    low, high = confidence_interval(returns)
-    half = quantile * returns.std(ddof=1) / math.sqrt(freedom + 1)
-    assert (low, high) == pytest.approx((returns.mean() - half, returns.mean() + half), abs=2e-4)
-
-
-def test_intervals_cover_the_truth_95_times_in_100():
-    rng = np.random.default_rng(0)
-    intervals = np.array([confidence_interval(rng.normal(size=5)) for _ in range(4000)])
-    covered = np.mean((intervals[:, 0] < 0) & (intervals[:, 1] > 0))
-    assert covered == pytest.approx(0.95, abs=0.012)  # 3.5 standard errors of 4000 trials
-
-
-def test_one_return_has_no_interval():
-    assert all(math.isnan(bound) for bound in confidence_interval([3.0]))
-
-
-def test_equal_returns_have_an_interval_of_no_width():
-    assert confidence_interval([2.0, 2.0, 2.0]) == (2.0, 2.0)
-
-
-def test_no_return_is_an_error():
-    with pytest.raises(ValueError, match="at least one"):
-        confidence_interval([])
-
-
-def test_percentiles_are_in_order_and_exact_on_a_ramp():
-    assert latency_percentiles(np.arange(101.0)) == {"p50": 50.0, "p95": 95.0, "p99": 99.0}
-
-
-def test_a_summary_of_one_episode_has_no_nan():
-    summary = summarize(run_episodes(ClockEnv(), NoisyAgent(), [0]))
-    assert summary["ci95"] == [None, None]
-    assert summary["episodes"] == 1
-    assert summary["mean_return"] == summary["returns"][0]

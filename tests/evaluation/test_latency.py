@@ -1,3 +1,5 @@
+"""Latencies: files of durations, and what is charged for decisions and plans."""
+
 import json
 
 import pytest
@@ -13,29 +15,29 @@ def read(tmp_path, text):
 
 
 @pytest.mark.parametrize("text", ["[5, 7.5]", '{"decision_ms": [5, 7.5]}', "5\n7.5\n", "\n5\n\n7.5"])
-def test_every_format_gives_the_same_durations(tmp_path, text):
+def test_read_latency_reads_every_format(tmp_path, text):
     latency = read(tmp_path, text)
     assert latency.decision_ms.tolist() == latency.plan_ms.tolist() == [5.0, 7.5]
     assert latency.is_replayed
     assert latency.name.endswith("latency.json")
 
 
-def test_one_number_alone_is_a_distribution(tmp_path):
+def test_read_latency_takes_a_single_number(tmp_path):
     assert read(tmp_path, "12\n").decision_ms.tolist() == [12.0]
 
 
-def test_plans_may_have_durations_of_their_own(tmp_path):
+def test_read_latency_reads_durations_of_plans(tmp_path):
     latency = read(tmp_path, '{"decision_ms": [1], "plan_ms": [30, 40]}')
     assert (latency.decision_ms.tolist(), latency.plan_ms.tolist()) == ([1.0], [30.0, 40.0])
 
 
-def test_what_was_measured_is_charged_as_it_is():
+def test_charges_are_the_measured_times_when_latency_is_measured():
     decision, plan = read_latency("measured").charges(seed=0)
     assert (decision(3.25), plan(7.5)) == (3.25, 7.5)
     assert not Latency().is_replayed
 
 
-def test_draws_depend_on_the_seed_and_cover_the_distribution(tmp_path):
+def test_charges_depend_on_the_seed_and_cover_the_distribution(tmp_path):
     latency = read(tmp_path, json.dumps(list(range(10))))
 
     def drawn(seed):
@@ -46,7 +48,7 @@ def test_draws_depend_on_the_seed_and_cover_the_distribution(tmp_path):
     assert set(drawn(1)) == set(range(10))
 
 
-def test_plans_do_not_disturb_the_draws_of_decisions(tmp_path):
+def test_charges_of_decisions_are_independent_of_the_number_of_plans(tmp_path):
     latency = read(tmp_path, json.dumps(list(range(10))))
     alone, _ = latency.charges(0)
     decision, plan = latency.charges(0)
@@ -72,13 +74,13 @@ def test_plans_do_not_disturb_the_draws_of_decisions(tmp_path):
         ('{"decision_ms": [1], "plan_ms": []}', "plan_ms must be a list"),
     ],
 )
-def test_a_file_without_durations_is_refused(tmp_path, text, words):
+def test_read_latency_refuses_files_without_durations(tmp_path, text, words):
     with pytest.raises(UserError, match="latency.json") as error:
         read(tmp_path, text)
     assert words in str(error.value)
 
 
-def test_a_file_that_cannot_be_read_is_named(tmp_path):
+def test_read_latency_names_a_file_that_cannot_be_read(tmp_path):
     for path in (tmp_path / "no-such-file", tmp_path):
         with pytest.raises(UserError, match=str(path)):
             read_latency(str(path))

@@ -1,3 +1,7 @@
+"""Episodes in a world that goes on while the agent decides, with decisions of known durations."""
+
+import time
+
 import gymnasium
 import numpy as np
 import pytest
@@ -11,7 +15,7 @@ SUBSTEPS = 10
 
 
 class TapeEnv:
-    """Every pixel tells the period; what acted at each substep is kept, and rewarded."""
+    """The pixels hold the number of the period; the actions of all substeps are kept, and summed as reward."""
 
     def __init__(self, length=4, low=-1.0):
         self.action_space = gymnasium.spaces.Box(low, 1.0, (1,), np.float32)
@@ -36,7 +40,7 @@ class TapeEnv:
 
 
 class CountingAgent:
-    """Acts 1, 2, 3 and so on, and keeps what it saw."""
+    """Acts 1, 2, 3 and so on, and keeps the periods that it saw."""
 
     def seed(self, seed):
         pass
@@ -61,7 +65,7 @@ def play(milliseconds, control_hz=20.0, length=4, on_step=None, env=None):
     return env.tape, agent.seen, episode
 
 
-def test_thoughts_that_take_no_time_are_the_world_that_waits():
+def test_timed_episode_equals_a_plain_episode_when_decisions_take_no_time():
     tape, seen, episode = play(0.0)
     (waited,) = run_episodes(TapeEnv(), CountingAgent(), [0])
     assert tape == [[float(action)] * SUBSTEPS for action in (1, 2, 3, 4)]
@@ -70,62 +74,62 @@ def test_thoughts_that_take_no_time_are_the_world_that_waits():
     assert episode.deadline_misses == 0
 
 
-def test_an_action_acts_as_late_as_its_decision_took():
+def test_action_takes_effect_after_the_time_of_its_decision():
     tape, _, episode = play(15.0)  # 0.3 periods, 3 substeps of 5 ms
     assert tape == [[float(before)] * 3 + [before + 1.0] * 7 for before in range(4)]
     assert episode.deadline_misses == 0
 
 
 @pytest.mark.parametrize(("milliseconds", "late"), [(0.4, 0), (2.4, 0), (2.6, 1), (5.0, 1), (48.0, 10), (50.0, 10)])
-def test_an_action_waits_for_the_nearest_substep(milliseconds, late):
+def test_action_takes_effect_at_the_nearest_substep(milliseconds, late):
     tape, _, episode = play(milliseconds)
     assert tape[0] == [0.0] * late + [1.0] * (SUBSTEPS - late)
     assert episode.deadline_misses == 0
 
 
 @pytest.mark.parametrize("control_hz", [3.0, 7.0, 30.0, 49.0, 1000.0])
-def test_a_thought_of_exactly_one_period_misses_nothing(control_hz):
+def test_decision_of_exactly_one_period_misses_no_deadline(control_hz):
     tape, seen, episode = play(1000.0 / control_hz, control_hz)
     assert seen == [0, 1, 2, 3]
     assert tape == [[float(action)] * SUBSTEPS for action in (0, 1, 2, 3)]
     assert episode.deadline_misses == 0
 
 
-def test_a_boundary_is_missed_by_any_part_of_a_substep():
+def test_decision_misses_a_deadline_by_any_part_of_a_substep():
     tape, seen, episode = play(51.0)
     assert (seen, episode.deadline_misses) == ([0, 2], 2)
     assert tape == [[0.0] * 10, [1.0] * 10, [1.0] * 10, [2.0] * 10]
 
 
-def test_a_busy_agent_misses_boundaries_and_decides_at_the_next_one():
+def test_agent_decides_next_at_the_first_boundary_after_a_long_decision():
     tape, seen, episode = play(60.0, length=5)  # 12 substeps
     assert seen == [0, 2, 4]
     assert tape == [[0.0] * 10, [0.0] * 2 + [1.0] * 8, [1.0] * 10, [1.0] * 2 + [2.0] * 8, [2.0] * 10]
     assert (episode.deadline_misses, episode.num_decisions) == (2, 3)
 
 
-def test_a_thought_of_three_periods_misses_two_boundaries():
+def test_decision_of_three_periods_misses_two_deadlines():
     _, seen, episode = play(150.0, length=7)
     assert (seen, episode.deadline_misses) == ([0, 3, 6], 4)
 
 
-def test_an_action_that_comes_after_the_end_never_acts():
+def test_action_never_takes_effect_when_it_comes_after_the_end():
     tape, _, episode = play(1000.0)
     assert tape == [[0.0] * SUBSTEPS] * 4
     assert (episode.num_decisions, episode.deadline_misses) == (1, 3)
 
 
-def test_zeros_clamped_into_the_bounds_act_before_the_first_decision():
+def test_zeros_clamped_into_the_bounds_hold_before_the_first_decision():
     tape, _, _ = play(15.0, env=TapeEnv(low=0.25))
     assert tape[0][:3] == [0.25] * 3
 
 
-def test_the_same_latency_is_a_greater_share_of_a_shorter_period():
+def test_action_comes_more_substeps_late_when_the_period_is_shorter():
     slow, fast = (play(10.0, control_hz)[0][0] for control_hz in (10.0, 50.0))
     assert (slow.count(0.0), fast.count(0.0)) == (1, 5)
 
 
-def test_a_film_sees_every_period_and_the_end():
+def test_on_step_is_called_at_every_period_and_at_the_end():
     steps = []
     play(60.0, length=5, on_step=steps.append)
     assert [step.decision for step in steps] == [0, 1, 2, 3, 4, 5]
@@ -133,7 +137,7 @@ def test_a_film_sees_every_period_and_the_end():
     assert [None if step.action is None else step.action[0] for step in steps] == [1, 1, 2, 2, 3, None]
 
 
-def test_what_is_drawn_repeats_and_differs_between_episodes():
+def test_timed_episodes_repeat_with_their_seed_and_differ_between_seeds():
     spread = Latency("file", np.linspace(0.0, 120.0, 25), np.zeros(1))
 
     def played(seeds):
@@ -147,9 +151,7 @@ def test_what_is_drawn_repeats_and_differs_between_episodes():
     assert both[1:] == played([2])
 
 
-def test_measured_thoughts_are_charged_what_they_took():
-    import time
-
+def test_timed_episode_charges_measured_decisions_their_time():
     class Sleeper(CountingAgent):
         def act(self, frame):
             time.sleep(0.02)
@@ -162,7 +164,7 @@ def test_measured_thoughts_are_charged_what_they_took():
     assert episode.deadline_misses == 2
 
 
-def test_a_summary_adds_how_the_agent_kept_up():
+def test_summarize_timed_adds_the_figures_of_real_time():
     clock = VirtualClock(20.0, constant(60.0))
     summary = summarize_timed(list(iterate_timed_episodes(TapeEnv(5), CountingAgent(), [0, 1], clock)), clock)
     assert summary["episodes"] == 2

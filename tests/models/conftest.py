@@ -1,4 +1,4 @@
-"""A small world model that is not quite fresh: its zero-initialised heads have been stirred."""
+"""A small untrained world model; the heads that start at zero have random weights."""
 
 import pytest
 import torch

@@ -1,4 +1,4 @@
-"""The RSSM: the belief after a sequence is the belief after its steps."""
+"""The RSSM: sequences equal their single steps."""
 
 import torch
 
@@ -9,12 +9,12 @@ def gaussian(generator, rows=200):
     return Gaussian(torch.randn(rows, 32, generator=generator), torch.rand(rows, 32, generator=generator) + 0.1)
 
 
-def test_the_divergence_of_equals_is_zero(generator):
+def test_kl_divergence_is_zero_for_equal_gaussians(generator):
     left = gaussian(generator)
     assert torch.equal(kl_divergence(left, left), torch.zeros(200))
 
 
-def test_the_divergence_of_others_is_positive_and_the_known_one(generator):
+def test_kl_divergence_equals_that_of_torch_distributions(generator):
     left, right = gaussian(generator), gaussian(generator)
     divergence = kl_divergence(left, right)
     expected = torch.distributions.kl_divergence(torch.distributions.Normal(*left), torch.distributions.Normal(*right))
@@ -22,7 +22,7 @@ def test_the_divergence_of_others_is_positive_and_the_known_one(generator):
     assert torch.allclose(divergence, expected.sum(-1), rtol=1e-4)
 
 
-def test_observing_a_sequence_equals_stepping_by_hand(model, generator):
+def test_observe_equals_single_posterior_steps(model, generator):
     dynamics = model.dynamics
     embeddings = torch.randn(2, 5, 20, generator=generator)
     actions = torch.rand(2, 4, 3, generator=generator) * 2 - 1
@@ -40,7 +40,7 @@ def test_observing_a_sequence_equals_stepping_by_hand(model, generator):
             deter = dynamics.advance(State(deter, stoch), actions[:, time])
 
 
-def test_what_comes_later_does_not_change_a_belief(model, generator):
+def test_observe_does_not_use_later_frames_or_actions(model, generator):
     embeddings, noise = torch.randn(2, 5, 20, generator=generator), torch.randn(2, 5, 32, generator=generator)
     actions, deter = torch.rand(2, 4, 3, generator=generator), torch.zeros(2, 24)
     before, _ = model.dynamics.observe(embeddings, actions, deter, noise)
@@ -50,16 +50,16 @@ def test_what_comes_later_does_not_change_a_belief(model, generator):
     assert not torch.allclose(before.stoch[:, 3:], after.stoch[:, 3:])
 
 
-def test_the_deterministic_state_stays_within_one(model, state):
+def test_advance_keeps_deter_within_one(model, state):
     for _ in range(50):
         state = State(model.dynamics.advance(state, torch.ones(5, 3)), state.stoch * 3.0)
     assert state.deter.abs().max() <= 1.0
 
 
-def test_every_std_has_a_floor(model, generator):
+def test_prior_std_is_at_least_a_tenth(model, generator):
     deter = torch.randn(100, 24, generator=generator) * 50.0
     assert model.dynamics.prior(deter).std.min() >= 0.1
 
 
-def test_before_anything_was_seen_the_state_is_zero(model):
+def test_initial_state_is_zero(model):
     assert all(part.eq(0.0).all() and len(part) == 3 for part in model.dynamics.initial(3))

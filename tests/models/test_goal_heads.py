@@ -1,4 +1,4 @@
-"""Heads for goals: beside the model, without a trace in it."""
+"""Heads for goals, and the view of the model through them."""
 
 import math
 
@@ -25,16 +25,16 @@ def knowing(model):
     return knowing.eval()
 
 
-def test_goals_name_all_quantities_but_rewards(knowing):
+def test_goal_names_are_all_labels_but_task_rewards(knowing):
     assert knowing.goal_names == ("height", "speed") and knowing.goal_scales.tolist() == [0.5, 2.0]
 
 
-def test_a_model_without_quantities_can_have_no_goals(model):
+def test_goal_heads_raise_for_a_model_without_labels(model):
     with pytest.raises(ValueError, match="without labels"):
         WorldModel(model.config, 3, goal_dim=16)
 
 
-def test_nothing_else_notices_the_heads(model, knowing, state, generator):
+def test_goal_heads_do_not_change_other_predictions(model, knowing, state, generator):
     actions = torch.rand(5, 4, 3, generator=generator) * 2 - 1
     with torch.no_grad():
         rewards, last = model.rollout(state, actions)
@@ -44,7 +44,7 @@ def test_nothing_else_notices_the_heads(model, knowing, state, generator):
         assert torch.equal(model.policy(state), knowing.policy(state))
 
 
-def test_a_code_tells_ends_that_are_there_from_those_that_are_not(knowing):
+def test_encode_distinguishes_missing_ends_from_ends_at_zero(knowing):
     heads, inf = knowing.goal_heads, math.inf
     ends = [((-inf, -inf), (inf, inf)), ((-inf, 0.0), (inf, inf)), ((-inf, 0.0), (inf, 0.0)), ((-inf, 1.0), (inf, inf))]
     codes = [heads.encode(torch.tensor(low), torch.tensor(high)) for low, high in ends]
@@ -52,7 +52,7 @@ def test_a_code_tells_ends_that_are_there_from_those_that_are_not(knowing):
     assert len({tuple(code.tolist()) for code in codes}) == 4
 
 
-def test_the_view_of_a_box_is_a_model_that_can_be_planned_in(knowing, state, generator):
+def test_box_view_follows_the_planner_protocol(knowing, state, generator):
     view = BoxView(GOAL, frames_per_step=2)(knowing)
     check_model(view, state, action_dim=3)
     action = torch.zeros(5, 3)
@@ -69,10 +69,10 @@ def test_the_view_of_a_box_is_a_model_that_can_be_planned_in(knowing, state, gen
         code = knowing.goal_heads.encode(torch.tensor([-math.inf, -1.0]), torch.tensor([math.inf, -1.0]))
         mode, _ = knowing.goal_action(state.features, code)  # not rounded to bfloat16, as `policy` is
         assert torch.allclose(proposals[::4, 0], mode, atol=1e-4)
-        assert torch.allclose(proposals[8:12], alone, atol=1e-2)  # does not feel who shares the call
+        assert torch.allclose(proposals[8:12], alone, atol=1e-2)  # independent of the other states of the call
 
 
-def test_fresh_heads_do_what_the_task_does(model, state):
+def test_untrained_goal_actor_acts_like_the_task_actor(model, state):
     torch.manual_seed(2)
     fresh = WorldModel(model.config, 3, LABELS, goal_dim=16)
     fresh.load_state_dict(model.state_dict(), strict=False)
@@ -81,7 +81,7 @@ def test_fresh_heads_do_what_the_task_does(model, state):
         assert torch.equal(BoxView(GOAL, 2)(fresh).policy(state), model.policy(state))
 
 
-def test_other_boxes_are_worth_and_done_otherwise(knowing, state):
+def test_box_view_value_and_policy_depend_on_the_box(knowing, state):
     views = [BoxView(box, 2)(knowing) for box in ({}, GOAL, {"speed": (3.0, math.inf)})]
     with torch.no_grad():
         for method in ("value", "policy"):
@@ -89,7 +89,7 @@ def test_other_boxes_are_worth_and_done_otherwise(knowing, state):
             assert not any(torch.allclose(results[i], results[j]) for i, j in ((0, 1), (0, 2), (1, 2)))
 
 
-def test_plans_for_a_box_can_keep_constraints(knowing, state):
+def test_plan_for_a_box_accepts_constraints(knowing, state):
     from latentplan.objectives.objective import plan_constraint
     from latentplan.objectives.parser import parse_constraints
 

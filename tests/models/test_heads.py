@@ -21,19 +21,19 @@ def best_logits(head, target):
     return (1.0 / len(head.bins) - logits.grad).clamp_min(0.0).log()
 
 
-def test_the_mean_of_the_target_distribution_is_the_target(head):
+def test_scalar_head_mean_of_the_target_distribution_is_the_target(head):
     # Four significant digits: a weight between bins of thousands is a float32 near 1.
     assert torch.allclose(head.mean(best_logits(head, TARGETS)), TARGETS, rtol=1e-4, atol=2e-4)
 
 
-def test_the_target_distribution_has_at_most_two_neighbouring_bins(head):
+def test_scalar_head_target_uses_at_most_two_neighbouring_bins(head):
     for row in best_logits(head, TARGETS).exp():
         held = row.gt(1e-6).nonzero().squeeze(-1)
         assert 1 <= len(held) <= 2
         assert held[-1] - held[0] <= 1
 
 
-def test_the_loss_is_least_at_the_target_distribution(head):
+def test_scalar_head_loss_is_smallest_at_the_target_distribution(head):
     best = best_logits(head, TARGETS).clamp_min(-30.0)
     entropy = -(best.log_softmax(-1) * best.softmax(-1)).sum(-1)
     assert torch.allclose(head.loss(best, TARGETS), entropy, atol=1e-4)
@@ -41,29 +41,29 @@ def test_the_loss_is_least_at_the_target_distribution(head):
     assert (head.loss(other, TARGETS) >= head.loss(best, TARGETS)).all()
 
 
-def test_targets_beyond_the_bins_saturate(head):
+def test_scalar_head_saturates_for_targets_beyond_the_bins(head):
     top = head.mean(best_logits(head, torch.tensor([1e9])))
     assert torch.allclose(top, head.values[-1:], rtol=1e-4)
 
 
-def test_a_target_that_is_not_a_number_stays_one(head):
+def test_scalar_head_loss_is_nan_for_a_nan_target(head):
     assert head.loss(torch.zeros(1, 63), torch.tensor([float("nan")])).isnan().all()
 
 
 @pytest.mark.parametrize("num_bins", [3, 31, 62, 63, 255])
-def test_a_fresh_head_predicts_zero(num_bins):
+def test_scalar_head_predicts_zero_when_untrained(num_bins):
     head = ScalarHead(in_features=6, hidden_dim=8, num_bins=num_bins)
     # Bins reach 8,100 to both sides and cancel in float32.
     assert head.mean(head(torch.randn(4, 6))).abs().max() < 1e-3
 
 
-def test_bins_are_even_in_symlog_space(head):
+def test_scalar_head_spaces_bins_evenly_in_symlog_space(head):
     assert torch.allclose(symexp(head.bins), head.values)
     assert torch.allclose(head.values.sign() * head.values.abs().log1p(), head.bins, atol=1e-5)
     assert torch.allclose(head.bins.diff(), head.bins.diff()[0], atol=1e-5)
 
 
-def test_heads_answer_in_float32_under_autocast(head):
+def test_heads_return_float32_under_autocast(head):
     features = torch.randn(4, 6)
     actor = Actor(6, 8, 2)
     with torch.autocast("cpu", dtype=torch.bfloat16):
@@ -71,7 +71,7 @@ def test_heads_answer_in_float32_under_autocast(head):
     assert all(output.dtype == torch.float32 for output in outputs)
 
 
-def test_means_and_stds_of_the_actor_are_bounded():
+def test_actor_bounds_means_and_stds():
     torch.manual_seed(0)
     actor = Actor(6, 8, 2)
     with torch.no_grad():
@@ -81,7 +81,7 @@ def test_means_and_stds_of_the_actor_are_bounded():
     assert 0.1 <= std.min() and std.max() <= 1.0
 
 
-def test_sampled_actions_lie_within_bounds_and_pass_every_gradient():
+def test_sample_action_clamps_values_and_passes_every_gradient():
     mean = torch.linspace(-1.0, 1.0, 101, requires_grad=True)
     noise = torch.randn(101, generator=torch.Generator().manual_seed(0)) * 5.0
     action = sample_action(mean, torch.ones(101), noise)

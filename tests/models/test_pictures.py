@@ -1,4 +1,4 @@
-"""Frames in and frames out: uint8 outside, numbers only inside."""
+"""Encoder and decoder: uint8 frames outside, float inside."""
 
 import pytest
 import torch
@@ -13,20 +13,20 @@ def shrunk(frames):
 
 
 @pytest.mark.parametrize("channels", [(4,), (4, 8), (32, 48, 64), (4, 4, 4, 4, 4)])
-def test_frames_become_float32_embeddings(channels, frames):
+def test_encoder_returns_float32_embeddings(channels, frames):
     encoder = Encoder(channels, embedding_dim=10)
     with torch.autocast("cpu", dtype=torch.bfloat16):
         embedding = encoder(frames)
     assert embedding.shape == (5, 10) and embedding.dtype == torch.float32
 
 
-def test_encoding_leaves_the_frames_as_they_were(frames):
+def test_encoder_leaves_frames_unchanged(frames):
     before = frames.clone()
     Encoder((4, 4), 10)(frames)
     assert torch.equal(frames, before)
 
 
-def test_every_pixel_is_read():
+def test_encoder_reads_every_pixel():
     torch.manual_seed(0)
     encoder = Encoder((8, 8), 10)
     grey = torch.full((1, 64, 64, 3), 128, dtype=torch.uint8)
@@ -37,7 +37,7 @@ def test_every_pixel_is_read():
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16])
-def test_the_first_layer_reads_pixels_centred_and_scaled(dtype, frames):
+def test_encoder_first_layer_equals_a_linear_layer_on_scaled_pixels(dtype, frames):
     torch.manual_seed(0)
     encoder = Encoder((8, 8), 10)
     patches = rearrange(frames, "rows (h y) (w x) c -> rows h w (y x c)", y=4, x=4)
@@ -49,12 +49,12 @@ def test_the_first_layer_reads_pixels_centred_and_scaled(dtype, frames):
     assert torch.allclose(projected.float(), expected, atol=tolerance)
 
 
-def test_pictures_are_uint8_at_half_resolution(model, state):
+def test_decoder_picture_is_uint8_at_half_resolution(model, state):
     picture = model.decoder.picture(state.features)
     assert picture.shape == (5, 32, 32, 3) and picture.dtype == torch.uint8
 
 
-def test_the_loss_of_a_picture_is_its_summed_squared_error(frames):
+def test_decoder_loss_is_the_summed_squared_error(frames):
     torch.manual_seed(0)
     decoder = Decoder(7, channels=4)
     patches = decoder(torch.randn(5, 7))
@@ -63,7 +63,7 @@ def test_the_loss_of_a_picture_is_its_summed_squared_error(frames):
     assert torch.allclose(decoder.loss(patches, frames), expected, rtol=1e-4)
 
 
-def test_a_perfect_reconstruction_costs_nothing_and_is_the_frame(frames):
+def test_decoder_loss_is_zero_for_a_perfect_reconstruction(frames):
     decoder = Decoder(7, channels=4)
     perfect = rearrange(shrunk(frames) / 255.0 - 0.5, "rows (h y) (w x) c -> rows h w (y x c)", y=4, x=4)
     decoder.forward = lambda features: perfect

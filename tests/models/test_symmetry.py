@@ -1,4 +1,4 @@
-"""Beliefs of four turns: the same world, told four times."""
+"""Beliefs of a frame and its three quarter turns."""
 
 import pickle
 
@@ -7,7 +7,7 @@ import torch
 
 from latentplan.config import ModelConfig
 from latentplan.models import State, WorldModel
-from latentplan.models.symmetry import QUARTERS, TurnedModel, flat, folded, mean_over_turns, turned, unturned
+from latentplan.models.symmetry import QUARTERS, TurnedModel, first_turn, flat, folded, mean_over_turns, turned
 from latentplan.planning import CEMPlanner
 from latentplan.planning.check import check_model
 from latentplan.planning.objectives import learned_return, risk, terminal_value
@@ -36,7 +36,7 @@ def plan_for(model, state, **options):
     return planner.plan(model, state, generator=torch.Generator().manual_seed(2), **options)
 
 
-def test_a_frame_comes_first_and_four_turns_lead_back_to_it():
+def test_turned_puts_the_frame_first_and_four_turns_restore_it():
     frames = torch.randint(0, 256, (2, 64, 64, 3), dtype=torch.uint8)
     turns = turned(frames).unflatten(0, (2, QUARTERS))
     assert torch.equal(turns[:, 0], frames)
@@ -45,17 +45,17 @@ def test_a_frame_comes_first_and_four_turns_lead_back_to_it():
     assert turned(frames, 1) is frames
 
 
-def test_rows_and_beliefs_are_the_same_numbers(beliefs):
+def test_folded_and_flat_are_inverse(beliefs):
     rows = flat(beliefs)
     assert rows.deter.shape == (12, 16)
     assert all(torch.equal(one, other) for one, other in zip(folded(rows, QUARTERS), beliefs, strict=True))
-    assert torch.equal(unturned(beliefs).stoch, beliefs.stoch[:, 0])
+    assert torch.equal(first_turn(beliefs).stoch, beliefs.stoch[:, 0])
     assert all(torch.equal(one, other) for one, other in zip(flat(rows), rows, strict=True))
     assert torch.equal(mean_over_turns(rows.deter, beliefs), beliefs.deter.mean(1))
 
 
 @pytest.mark.parametrize("method", ["value", "continues", "policy"])
-def test_what_is_told_of_a_belief_is_the_mean_of_its_turns(method, model, beliefs):
+def test_turned_model_returns_the_mean_over_turns(method, model, beliefs):
     seen = TurnedModel(model)
     each = torch.stack([getattr(model, method)(State(*(part[:, turn] for part in beliefs))) for turn in range(4)])
     assert torch.allclose(getattr(seen, method)(beliefs), each.mean(0), atol=1e-2)  # a trunk in bfloat16
@@ -63,7 +63,7 @@ def test_what_is_told_of_a_belief_is_the_mean_of_its_turns(method, model, belief
 
 
 @pytest.mark.parametrize("method", ["step", "fast_step"])
-def test_a_step_takes_every_turn_along(method, model, beliefs):
+def test_turned_model_step_advances_every_turn(method, model, beliefs):
     action = torch.rand(3, 2) * 2 - 1
     following, reward = getattr(TurnedModel(model), method)(beliefs, action)
     for turn in range(QUARTERS):
@@ -74,7 +74,7 @@ def test_a_step_takes_every_turn_along(method, model, beliefs):
 
 
 @pytest.mark.parametrize("num", [1, 3, 6])
-def test_proposals_begin_with_the_mode_of_all_turns_then_those_of_each(num, model, beliefs):
+def test_turned_model_proposes_the_mode_of_all_turns_then_of_each_turn(num, model, beliefs):
     seen, streams = TurnedModel(model), [torch.Generator().manual_seed(seed) for seed in range(3)]
     proposals = seen.propose(beliefs, num, 5, streams)
     assert proposals.shape == (3 * num, 5, 2)
@@ -85,25 +85,25 @@ def test_proposals_begin_with_the_mode_of_all_turns_then_those_of_each(num, mode
     assert torch.allclose(proposals[::num, 1].float(), seen.policy(state).float(), atol=0.05)
 
 
-def test_a_belief_that_is_the_same_from_every_side_is_planned_for_as_one(model, beliefs):
+def test_turned_model_scores_equal_turns_like_a_single_belief(model, beliefs):
     alike = State(*(part[:, :1].expand(-1, QUARTERS, -1).contiguous() for part in beliefs))
     actions = torch.rand(3, 24, 3, 2) * 2 - 1
     one, all_turns = (
-        judged(seen, state, actions) for seen, state in ((model, unturned(alike)), (TurnedModel(model), alike))
+        scores(seen, state, actions) for seen, state in ((model, first_turn(alike)), (TurnedModel(model), alike))
     )
     assert torch.allclose(one, all_turns, atol=2e-2) and one.std() > 0.1
 
 
-def test_a_candidate_is_worth_the_mean_of_what_the_turns_promise(model, beliefs):
+def test_turned_model_scores_a_candidate_by_the_mean_over_turns(model, beliefs):
     actions = torch.rand(3, 24, 3, 2) * 2 - 1
-    each = [judged(model, State(*(part[:, turn] for part in beliefs)), actions) for turn in range(QUARTERS)]
-    together = judged(TurnedModel(model), beliefs, actions)
+    each = [scores(model, State(*(part[:, turn] for part in beliefs)), actions) for turn in range(QUARTERS)]
+    together = scores(TurnedModel(model), beliefs, actions)
     assert torch.allclose(together, torch.stack(each).mean(0), atol=2e-2)
     assert not torch.allclose(together, each[0], atol=0.1)
 
 
-def judged(model, state, actions):
-    """What candidates are worth, (batch, sample)."""
+def scores(model, state, actions):
+    """Returns of candidates, (batch, sample)."""
     from latentplan.planning.search.scorer import Scorer
 
     discounts = 0.9 ** torch.arange(actions.shape[2] + 1)
@@ -111,7 +111,7 @@ def judged(model, state, actions):
     return scorer.score(scorer.start_rows(state, actions.shape[1]), actions).returns
 
 
-def test_plans_are_of_environments_and_do_not_depend_on_who_shares_the_call(model, beliefs):
+def test_plan_with_turned_model_does_not_depend_on_other_environments(model, beliefs):
     seen = TurnedModel(model)
     plan = plan_for(seen, beliefs)
     alone = plan_for(seen, State(*(part[1:2] for part in beliefs)))
@@ -120,14 +120,14 @@ def test_plans_are_of_environments_and_do_not_depend_on_who_shares_the_call(mode
     assert plan_for(seen, beliefs, previous=plan).actions.shape == (3, 3, 2)
 
 
-def test_an_objective_of_so_many_particles_gets_so_many(model, beliefs):
+def test_turned_model_particles_repeat_its_turns(model, beliefs):
     seen = TurnedModel(model)
     assert torch.equal(seen.particles(beliefs, 6).stoch[4:6], beliefs.stoch[0, :2])
     worst = risk(learned_return() + terminal_value(), measure="worst", num_particles=QUARTERS)
     assert torch.isfinite(plan_for(seen, beliefs, objective=worst).actions).all()
 
 
-def test_a_planner_accepts_it_in_another_process_too(model, beliefs):
+def test_turned_model_can_be_pickled(model, beliefs):
     seen = pickle.loads(pickle.dumps(TurnedModel(model)))
     assert torch.allclose(seen.value(beliefs), TurnedModel(model).value(beliefs))
     assert seen.label_names == ("height",)

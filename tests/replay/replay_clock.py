@@ -1,4 +1,4 @@
-"""Rows that tell the time, for tests of the replay."""
+"""Rows whose values follow from their time, for tests of the replay."""
 
 import numpy as np
 import torch
@@ -9,7 +9,7 @@ CPU = torch.device("cpu")
 
 
 class Clock:
-    """Writes episodes of given lengths to one lane; everything about a row follows from its lane, episode and time.
+    """Rows of one lane with episodes of given lengths; every value of a row follows from its lane, episode and time.
 
     The frame is filled with time, episode and lane; action[t] leads from t to t + 1, so it holds t + 0.5 (scaled to
     stay within [-1, 1]), and the reward that arrives with frame t + 1 is t + 1.
@@ -57,7 +57,7 @@ def sample(replay, batch_size=64, length=3, seed=0):
     return replay.gather(replay.draw(batch_size, length, np.random.default_rng(seed)))
 
 
-def told(batch):
-    """Time, episode and lane that each frame tells, (batch, time + 1) each."""
+def frame_values(batch):
+    """Time, episode and lane, read from each frame, (batch, time + 1) each."""
     assert (batch.frames == batch.frames[:, :, :1, :1]).all()
     return batch.frames[:, :, 0, 0].float().unbind(-1)

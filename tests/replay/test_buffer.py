@@ -1,4 +1,4 @@
-"""Replay, fed by environments whose frames tell the time: nothing is misaligned, torn or lost."""
+"""Replay, filled with frames that hold the time: rows stay aligned, complete and in order."""
 
 from pathlib import Path
 
@@ -9,11 +9,11 @@ import torch
 from latentplan.config import UserError
 from latentplan.replay import memory
 from latentplan.replay.buffer import Replay, replay_bytes
-from tests.replay.replay_clock import CPU, Clock, filled, make_replay, sample, told
+from tests.replay.replay_clock import CPU, Clock, filled, frame_values, make_replay, sample
 
 
 def assert_aligned(batch):
-    time, episode, lane = told(batch)
+    time, episode, lane = frame_values(batch)
     assert (time.diff(dim=1) == 1.0).all()
     assert (episode == episode[:, :1]).all() and (lane == lane[:, :1]).all()
     assert torch.allclose(batch.actions[..., 0], (time[:, :-1] + 0.5) / 256)
@@ -32,7 +32,7 @@ RINGS = [
 
 @pytest.mark.parametrize("ring", RINGS)
 @pytest.mark.parametrize("length", [1, 3, 6])
-def test_sequences_are_aligned_and_never_cross_episodes(ring, length):
+def test_sample_is_aligned_and_never_crosses_episodes(ring, length):
     batch = sample(filled(**ring), length=length)
     assert batch.frames.shape == (64, length + 1, 64, 64, 3) and batch.frames.dtype == torch.uint8
     assert batch.deter.shape == (64, 2) and batch.deter.dtype == torch.float32
@@ -40,9 +40,9 @@ def test_sequences_are_aligned_and_never_cross_episodes(ring, length):
 
 
 @pytest.mark.parametrize("ring", RINGS)
-def test_every_sequence_that_is_held_is_drawn(ring):
+def test_draw_reaches_every_sequence_that_is_held(ring):
     replay, length = filled(**ring), 3
-    drawn = {tuple(start) for start in torch.stack(told(sample(replay, 1000, length)), -1)[:, 0].tolist()}
+    drawn = {tuple(start) for start in torch.stack(frame_values(sample(replay, 1000, length)), -1)[:, 0].tolist()}
     rows = replay.frames[:, 0, 0].float()
     held = {tuple(row) for row in rows.tolist()} if len(replay) == len(rows) else None
     lanes, lengths = ring.get("lanes", 1), ring.get("lengths", (7, 4, 9))
@@ -54,15 +54,15 @@ def test_every_sequence_that_is_held_is_drawn(ring):
                 assert (first in drawn) == is_held, first
 
 
-def test_an_interrupted_episode_ends_where_the_next_begins():
+def test_draw_ends_an_interrupted_episode_where_the_next_begins():
     replay, clock = make_replay(), Clock(0, (9,))
-    replay.add(0, clock.rows(0, 4))  # the run stopped here; a resumed one begins a new episode
+    replay.add(0, clock.rows(0, 4))  # the run stopped here, and a resumed run begins a new episode
     replay.add(0, clock.rows(0, 6))
     for seed in range(5):
         assert_aligned(sample(replay, seed=seed))
 
 
-def test_each_frame_is_stored_once():
+def test_add_stores_each_frame_once():
     replay = filled(lengths=(7, 4, 9))
     assert len(replay) == 8 + 5 + 10
     stored = {tuple(frame) for frame in replay.frames[: len(replay), 0, 0].tolist()}
@@ -70,29 +70,29 @@ def test_each_frame_is_stored_once():
     assert replay.frames.numel() == 60 * 64 * 64 * 3
 
 
-def test_a_ring_keeps_the_newest_rows():
+def test_add_keeps_the_newest_rows_when_the_ring_is_full():
     replay = filled(capacity=12, lengths=(7, 4, 9))
     newest = [entry[2::-1] for entry in Clock(0, (7, 4, 9)).entries[-12:]]
     assert sorted(map(tuple, replay.frames[:, 0, 0].tolist())) == sorted(newest)
     assert len(replay) == 12
 
 
-def test_batches_follow_from_the_random_stream():
+def test_draw_repeats_with_its_random_stream():
     replay = filled()
     first, again, other = (sample(replay, seed=seed) for seed in (0, 0, 1))
     assert all(torch.equal(left, right) for left, right in zip(first, again, strict=True))
     assert not torch.equal(first.rows, other.rows)
 
 
-def test_refreshed_beliefs_go_back_to_where_the_batch_came_from():
+def test_refresh_writes_beliefs_to_the_rows_of_the_batch():
     replay = filled(capacity=40, lanes=2, lengths=(7, 4, 9, 6))
     batch = sample(replay)
-    time, episode, lane = told(batch)
+    time, episode, lane = frame_values(batch)
     replay.refresh(
         batch.rows, torch.stack([time * 2.0, episode + 100.0 * lane], -1), torch.ones_like(batch.rows, dtype=torch.bool)
     )
     again = sample(replay, seed=1)
-    time, episode, lane = (part[:, 0] for part in told(again))
+    time, episode, lane = (part[:, 0] for part in frame_values(again))
     refreshed = torch.isin(again.rows[:, 0], batch.rows)
     assert refreshed.any()
     expected = torch.stack([time * 2.0, episode + 100.0 * lane], -1)
@@ -100,7 +100,7 @@ def test_refreshed_beliefs_go_back_to_where_the_batch_came_from():
     assert torch.equal(again.deter, torch.where(refreshed[:, None], expected, untouched))
 
 
-def test_where_a_row_is_refreshed_twice_the_last_counts():
+def test_refresh_keeps_the_last_belief_of_a_row_that_occurs_twice():
     replay = filled()
     deter = torch.arange(12.0).reshape(2, 3, 2)
     replay.refresh(torch.tensor([[4, 5, 4], [6, 4, 5]]), deter, torch.ones(2, 3, dtype=torch.bool))
@@ -108,7 +108,7 @@ def test_where_a_row_is_refreshed_twice_the_last_counts():
 
 
 @pytest.mark.parametrize("chosen", [((1, 1, 1), (0, 0, 0)), ((0, 0, 0), (1, 1, 1)), ((0, 1, 0), (0, 0, 1))])
-def test_what_is_not_chosen_is_not_refreshed_even_where_it_comes_last(chosen):
+def test_refresh_ignores_beliefs_that_are_not_chosen(chosen):
     replay = filled()
     before = replay.deter.clone()
     rows, deter = torch.tensor([[4, 5, 6], [5, 6, 7]]), torch.arange(12.0).reshape(2, 3, 2)
@@ -126,7 +126,7 @@ def assert_same(left, right):
 
 
 @pytest.mark.parametrize("ring", RINGS)
-def test_a_saved_replay_is_the_same_when_loaded(ring, tmp_path):
+def test_load_restores_a_saved_replay(ring, tmp_path):
     replay = filled(**ring)
     replay.save(tmp_path)
     loaded = make_replay(ring.get("capacity", 60), ring.get("lanes", 1))
@@ -135,7 +135,7 @@ def test_a_saved_replay_is_the_same_when_loaded(ring, tmp_path):
 
 
 @pytest.mark.parametrize("capacity", [60, 12])
-def test_saving_now_and_then_equals_saving_once(capacity, tmp_path):
+def test_save_gives_the_same_files_in_parts_as_at_once(capacity, tmp_path):
     replay, clock = make_replay(capacity), Clock(0, (7, 4, 9))
     for start in range(0, len(clock.entries), 4):
         replay.add(0, clock.rows(start, start + 4))
@@ -149,7 +149,7 @@ def test_saving_now_and_then_equals_saving_once(capacity, tmp_path):
     assert_same(filled(capacity=capacity), loaded)
 
 
-def test_saving_again_writes_new_frames_only(tmp_path):
+def test_save_writes_new_frames_only(tmp_path):
     replay, clock = make_replay(), Clock(0, (7, 4, 9))
     replay.add(0, clock.rows(0, 8))
     replay.save(tmp_path)
@@ -162,7 +162,7 @@ def test_saving_again_writes_new_frames_only(tmp_path):
 
 
 @pytest.mark.parametrize(("before", "after"), [(60, 100), (12, 60), (60, 14), (12, 8)])
-def test_a_replay_can_be_loaded_into_another_capacity(before, after, tmp_path):
+def test_load_keeps_the_newest_rows_in_another_capacity(before, after, tmp_path):
     replay = filled(capacity=before)
     replay.save(tmp_path)
     loaded = make_replay(after)
@@ -179,7 +179,7 @@ def test_a_replay_can_be_loaded_into_another_capacity(before, after, tmp_path):
     assert_same(loaded, again)
 
 
-def test_what_is_no_replay_of_this_run_is_refused(tmp_path):
+def test_load_refuses_replays_of_other_sizes(tmp_path):
     with pytest.raises(UserError, match="no replay found"):
         make_replay().load(tmp_path)
     filled().save(tmp_path)
@@ -193,7 +193,7 @@ def test_what_is_no_replay_of_this_run_is_refused(tmp_path):
             other.load(tmp_path)
 
 
-def test_missing_frames_are_noticed(tmp_path):
+def test_load_refuses_a_file_with_missing_frames(tmp_path):
     filled().save(tmp_path)
     with (tmp_path / "frames_0.u8").open("r+b") as file:
         file.truncate(10 * 64 * 64 * 3)
@@ -202,13 +202,13 @@ def test_missing_frames_are_noticed(tmp_path):
 
 
 @pytest.mark.parametrize("lengths", [(), (2,), (4, 4, 4)])
-def test_too_short_episodes_are_named(lengths):
+def test_draw_names_the_sequence_length_when_episodes_are_too_short(lengths):
     replay = filled(lengths=lengths)
     with pytest.raises(UserError, match=r"sequence_length \(5\)"):
         sample(replay, length=5)
 
 
-def test_a_replay_too_small_for_a_sequence_says_so():
+def test_draw_advises_more_capacity_when_a_lane_is_too_small():
     with pytest.raises(UserError, match="raise --replay.capacity"):
         sample(filled(lengths=(9,), capacity=4), length=5)
 
@@ -216,25 +216,25 @@ def test_a_replay_too_small_for_a_sequence_says_so():
 @pytest.mark.parametrize(
     ("lengths", "advice"), [((4, 4, 4), "lower --learning.sequence_length"), ((2,), "raise --collection.prefill")]
 )
-def test_what_is_too_short_decides_what_is_advised(lengths, advice):
+def test_draw_advises_by_the_reason_that_no_sequence_fits(lengths, advice):
     with pytest.raises(UserError, match=advice):
         sample(filled(lengths=lengths), length=5)
 
 
-def test_an_episode_of_the_sequence_length_is_long_enough():
+def test_draw_takes_an_episode_of_exactly_the_sequence_length():
     assert_aligned(sample(filled(lengths=(2, 5, 3)), length=5))
 
 
-def test_a_replay_beyond_the_free_memory_is_refused(monkeypatch):
+def test_replay_refuses_more_than_nine_tenths_of_the_free_memory(monkeypatch):
     monkeypatch.setattr(memory, "free_memory", lambda: replay_bytes(100, 1, 2, 2))
     make_replay(capacity=90)
     with pytest.raises(UserError, match=r"lower --replay\.capacity"):
         make_replay(capacity=91)
 
 
-def test_the_memory_a_replay_takes_is_what_its_arrays_hold():
+def test_replay_bytes_equals_the_size_of_the_arrays():
     replay = make_replay(capacity=10, lanes=3)
-    arrays = [replay.frames, replay.deter, replay.actions, replay.rewards, replay.continues, replay.labels, replay.plan]
+    arrays = [replay.frames, replay.deter, replay.actions, replay.rewards, replay.continues, replay.labels]
     held = sum(array.numel() * array.element_size() for array in arrays) + replay.episode.nbytes + replay.is_end.nbytes
     assert held == replay.num_bytes
 
@@ -246,14 +246,14 @@ def test_free_memory_is_known_or_unlimited_without_proc(monkeypatch):
 
 
 @pytest.mark.parametrize(("limit", "left"), [("4096", 4096 - 3000 + 500), ("2000", 0)])
-def test_free_memory_is_what_a_containers_limit_leaves(tmp_path, monkeypatch, limit, left):
+def test_free_memory_is_the_rest_of_a_containers_limit(tmp_path, monkeypatch, limit, left):
     for name, text in {"max": limit, "current": "3000", "stat": "anon 2000\ninactive_file 500"}.items():
         (tmp_path / f"memory.{name}").write_text(f"{text}\n")
     monkeypatch.setattr(memory, "LIMIT_FACTS", tmp_path)
     assert memory.free_memory() == left
 
 
-def test_a_container_without_a_limit_has_what_the_machine_has(tmp_path, monkeypatch):
+def test_free_memory_is_the_machines_without_a_containers_limit(tmp_path, monkeypatch):
     for name, text in {"max": "max", "current": "3000", "stat": "anon 2000"}.items():
         (tmp_path / f"memory.{name}").write_text(f"{text}\n")
     monkeypatch.setattr(memory, "LIMIT_FACTS", tmp_path)

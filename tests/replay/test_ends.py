@@ -1,14 +1,19 @@
-"""What ends in a terminal state is drawn to its end, and no further is learned from."""
+"""Sequences at the end of an episode: drawn beyond terminal states, but not beyond time limits."""
 
 import numpy as np
 import pytest
 import torch
 
 from latentplan.replay.buffer import Batch
-from tests.replay.replay_clock import Clock, filled, make_replay, sample, told
+from tests.replay.replay_clock import Clock, filled, make_replay, sample
 
 
-def test_terminal_states_are_drawn_as_often_as_they_come():
+def batch_of(continues):
+    """A batch of which only `continues` is given."""
+    return Batch(**{**dict.fromkeys(Batch._fields, torch.empty(0)), "continues": continues})
+
+
+def test_draw_reaches_terminal_states_at_their_true_rate():
     replay, rng = make_replay(capacity=4000), np.random.default_rng(0)
     lengths = rng.geometric(0.1, 200)
     rows = Clock(0, lengths).rows()
@@ -16,24 +21,25 @@ def test_terminal_states_are_drawn_as_often_as_they_come():
     last = transitions[~np.isin(transitions + 1, transitions)]
     rows.continues[last] = 0.0
     replay.add(0, rows)
-    drawn = replay.gather(replay.draw(4000, 16, rng))
-    time, weights = told(drawn)[0], drawn.within
+    drawn = replay.draw(4000, 16, rng)
+    time = replay.frames[:, 0, 0, 0].float()[drawn]
+    continues = replay.continues[drawn[:, :-1]]
+    weights = batch_of(continues).within
     assert (time.diff(dim=1)[weights == 1.0] == 1.0).all()
-    share = ((1.0 - drawn.continues) * weights).sum() / weights.sum()
-    assert share == pytest.approx(0.1, abs=0.02)  # what an episode of these has of ending at any step
+    share = ((1.0 - continues) * weights).sum() / weights.sum()
+    assert share == pytest.approx(0.1, abs=0.02)  # the lengths are geometric: each step ends with probability 0.1
 
 
-def test_what_follows_a_terminal_state_is_not_refreshed_nor_within():
+def test_within_is_0_after_a_terminal_state():
     continues = torch.tensor([[1.0, 0.0, 1.0, 0.0], [1.0, 1.0, 1.0, 1.0], [0.0, 1.0, 1.0, 1.0]])
-    batch = Batch(*[torch.empty(0)] * 4, continues, *[torch.empty(0)] * 3)
-    assert batch.within.tolist() == [[1, 1, 0, 0], [1, 1, 1, 1], [1, 0, 0, 0]]
+    assert batch_of(continues).within.tolist() == [[1, 1, 0, 0], [1, 1, 1, 1], [1, 0, 0, 0]]
 
 
-def test_an_end_by_the_clock_is_not_reached_beyond(tmp_path):
+def test_draw_reaches_beyond_terminal_states_but_not_beyond_time_limits(tmp_path):
     replay = filled(lengths=(7, 4, 9))
     assert not replay.is_end.any() and (sample(replay, length=5).within == 1.0).all()
     rows = Clock(0, (7, 4, 9)).rows()
-    rows.continues[11] = 0.0  # the second ends in a terminal state
+    rows.continues[11] = 0.0  # the second episode ends in a terminal state
     ended = make_replay()
     ended.add(0, rows)
     starts = {int(row) for row in ended.draw(200, 5, np.random.default_rng(0))[:, 0]}

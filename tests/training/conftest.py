@@ -1,10 +1,10 @@
-"""A world small enough to learn from within seconds: a dot to be kept in the middle of a picture."""
+"""A task that a run learns within seconds (keep a dot in the middle of a picture), and runs that tests share."""
 
 import os
+import shutil
 import signal
 from dataclasses import replace
 
-import gymnasium
 import numpy as np
 import pytest
 import torch
@@ -21,8 +21,10 @@ from latentplan.config import (
 )
 from latentplan.models import WorldModel
 from latentplan.replay.buffer import Batch, Replay
-from latentplan.training import train
+from latentplan.training import resume, train
 from latentplan.training.learner.module import Learner
+from latentplan.training.learner.registry import BEHAVIOUR_LOSSES, WORLD_MODEL_LOSSES
+from tests.training.dot import Dot
 
 TINY = Config(
     env=EnvConfig(action_repeat=1),
@@ -37,37 +39,15 @@ TINY = Config(
 )
 
 
-class Dot(gymnasium.Env):
-    """A dot in a picture of 16 x 16, pushed sideways by the action; the reward is how near the middle it is."""
-
-    observation_space = gymnasium.spaces.Box(0, 255, (16, 16, 3), np.uint8)
-    action_space = gymnasium.spaces.Box(-1.0, 1.0, (1,), np.float32)
-
-    def reset(self, *, seed=None, options=None):
-        super().reset(seed=seed)
-        self.place, self.steps = self.np_random.uniform(-1.0, 1.0), 0
-        return self.picture(), {}
-
-    def step(self, action):
-        self.place = float(np.clip(self.place + 0.2 * action[0], -1.0, 1.0))
-        self.steps += 1
-        return self.picture(), 1.0 - abs(self.place), False, self.steps == 20, {}
-
-    def picture(self):
-        picture = np.zeros((16, 16, 3), np.uint8)
-        picture[:, round(7.5 + 7.0 * self.place)] = 255
-        return picture
-
-
 @pytest.fixture(scope="session")
 def dot():
-    """The environment, to be made or to be made worse."""
+    """The environment's class, to make or to extend."""
     return Dot
 
 
 @pytest.fixture(scope="session")
 def tiny():
-    """The settings of a run in a folder: sections take replacements, as in `tiny(folder, run={"seed": 1})`."""
+    """Makes the settings of a run in a folder; arguments replace fields, as in `tiny(folder, run={"seed": 1})`."""
 
     def make(folder, **changes):
         sections = {name: replace(getattr(TINY, name), **fields) for name, fields in changes.items()}
@@ -79,13 +59,27 @@ def tiny():
 
 @pytest.fixture(scope="session")
 def finished(tiny, dot, tmp_path_factory):
-    """A run that came to its end."""
+    """A finished run of 90 frames."""
     folder = tmp_path_factory.mktemp("runs") / "finished"
     return train(tiny(folder), dot)
 
 
+@pytest.fixture(scope="session")
+def short(tiny, dot, tmp_path_factory):
+    """A finished run of 60 frames."""
+    folder = tmp_path_factory.mktemp("runs") / "short"
+    return train(tiny(folder, run={"frames": 60}), dot)
+
+
+@pytest.fixture(scope="session")
+def extended(short, dot, tmp_path_factory):
+    """The run of 60 frames, resumed to 90 frames in another folder."""
+    folder = shutil.copytree(short.run_dir, tmp_path_factory.mktemp("runs") / "extended")
+    return resume(folder, frames=90, make_env=dot)
+
+
 class Interrupting:
-    """A factory of environments that press Ctrl-C at a given step of all, once."""
+    """Extends an environment's class so that one step, counted over all its environments, sends SIGINT."""
 
     def __init__(self, kind, at_step):
         self.steps_left = at_step
@@ -103,7 +97,7 @@ class Interrupting:
 
 @pytest.fixture(scope="session")
 def interrupting():
-    """`interrupting(kind, at_step).make` makes environments of a kind; one of them interrupts the run."""
+    """`interrupting(kind, at_step).make` is a class of environments, of which one interrupts the run."""
     return Interrupting
 
 
@@ -118,13 +112,12 @@ def batch():
         continues=torch.ones(4, 5),
         labels=torch.zeros(4, 6, 0),
         rows=torch.arange(24).reshape(4, 6),
-        plan=torch.zeros(4, 5, 2),
     )
 
 
 @pytest.fixture
 def model(tiny):
-    """A tiny world model whose heads say something from the first on."""
+    """A tiny world model with random weights also in the last layers of its heads."""
     torch.manual_seed(0)
     model = WorldModel(tiny("").model, action_dim=1)
     with torch.no_grad():
@@ -136,6 +129,17 @@ def model(tiny):
 
 @pytest.fixture
 def learner(model, tiny):
-    """What teaches that model."""
+    """A learner of that model."""
     replay = Replay(24, 1, 16, 1, torch.device("cpu"))
     return Learner(model, tiny("").learning, 0.9, replay, seed=0)
+
+
+@pytest.fixture
+def restored_losses():
+    """Removes the losses that a test registers."""
+    registries = (WORLD_MODEL_LOSSES, BEHAVIOUR_LOSSES)
+    before = [dict(losses) for losses in registries]
+    yield
+    for losses, entries in zip(registries, before, strict=True):
+        losses.clear()
+        losses.update(entries)

@@ -1,4 +1,4 @@
-"""Reads what a run left in its folder."""
+"""Reads the files of a run folder."""
 
 import csv
 
@@ -11,7 +11,7 @@ def rows_of(folder):
 
 
 def epochs_of(folder):
-    """The rows of epochs, without those of evaluations."""
+    """The rows of epochs, without the rows of evaluations."""
     return [row for row in rows_of(folder) if row["reconstruction"]]
 
 

@@ -1,4 +1,6 @@
-"""What a run keeps as its best agent."""
+"""The agents that a run saves as best and last."""
+
+import shutil
 
 import numpy as np
 import pytest
@@ -9,78 +11,119 @@ from latentplan.training import resume, train
 from latentplan.training.callbacks import Experience, Save, Stop
 from latentplan.training.collection.collector import Collector
 from latentplan.training.state import RunState
+from tests.training.run_folder import saved_state
 
 
-def test_the_best_agent_is_the_one_that_was_judged(tiny, dot, tmp_path, monkeypatch):
-    """Also where the next evaluation is asked for as soon as one is taken."""
-    judged, kept = [], []
+@pytest.fixture(scope="module")
+def observed(tiny, dot, tmp_path_factory):
+    """Weights that a run evaluated, saved as best and collected with; the next evaluation always follows at once."""
+    evaluated, saved, collected = [], [], []
+    collect, start = Collector.collect, Experience.on_train_epoch_start
 
-    def weights_of(model):
+    def state_of(model):
         return {name: value.clone() for name, value in model.state_dict().items()}
 
-    def judge(collector, episodes, film=None, weights=None, actor=True):
+    def evaluate(collector, episodes, film=None, weights=None, actor=True):
         if weights is not None:
             collector._load(weights)
-        judged.append(weights_of(collector.model))
-        return {"planner": [float(len(judged))], "actor": [0.0]}  # better each time
+        evaluated.append(state_of(collector.model))
+        return {"planner": [float(len(evaluated))], "actor": [0.0]}  # every evaluation is better than the last
 
-    def keep(save, name, model, info):
+    def save_agent(save, name, model, info):
         if name == "best":
-            kept.append(weights_of(model))
+            saved.append(state_of(model))
 
-    monkeypatch.setattr(Collector, "evaluate", judge)
-    monkeypatch.setattr(Save, "save_agent", keep)
-    train(tiny(tmp_path / "run", evaluation={"every_frames": 15}), dot)
-    assert len(kept) == len(judged) > 3
-    for theirs, ours in zip(judged, kept, strict=True):
+    def keep_weights(collector, weights, *arguments):
+        collected.append((weights,))
+        return collect(collector, weights, *arguments)
+
+    def keep_models(experience, trainer, learner):
+        before = len(collected)
+        start(experience, trainer, learner)
+        if len(collected) > before:
+            collected[-1] += (state_of(learner.averaged), state_of(learner.model))
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Collector, "evaluate", evaluate)
+        patch.setattr(Collector, "collect", keep_weights)
+        patch.setattr(Save, "save_agent", save_agent)
+        patch.setattr(Experience, "on_train_epoch_start", keep_models)
+        train(tiny(tmp_path_factory.mktemp("observed") / "run", evaluation={"every_frames": 15}), dot)
+    return evaluated, saved, [entry for entry in collected if entry[0] is not None]
+
+
+def test_best_agent_has_the_weights_that_were_evaluated(observed):
+    evaluated, saved, _ = observed
+    assert len(saved) == len(evaluated) > 3
+    for theirs, ours in zip(evaluated, saved, strict=True):
         assert all(torch.equal(theirs[name], ours[name]) for name in theirs)
 
 
-@pytest.mark.parametrize(("again", "best"), [(3.0, "last"), (7.0, "early")])
-def test_at_the_end_the_best_and_the_last_agent_meet_the_same_starts(tiny, dot, tmp_path, monkeypatch, again, best):
-    """The best of many short evaluations is good by chance too."""
-    returns = iter([10.0, 5.0, again, 5.0, again])  # an evaluation, then last and best at the end and when resumed
-
-    def judge(collector, episodes, film=None, weights=None, actor=True):
-        mean = next(returns)
-        return {"planner": [mean] * episodes, "actor": [0.0] * episodes}
-
-    monkeypatch.setattr(Collector, "evaluate", judge)
-    first = train(tiny(tmp_path / "run", evaluation={"every_frames": 45}), dot)
-    for run in (first, resume(first.run_dir, make_env=dot)):
-        assert run.summary["planner"] == 5.0
-        frames = {name: read_info(run.run_dir / "checkpoints" / name)["env_frames"] for name in ("best", "last")}
-        assert (frames["last"], frames["best"]) == (90, {"last": 90, "early": 45}[best])
+def test_collection_acts_with_the_averaged_weights(observed):
+    _, _, collected = observed
+    is_latest = []
+    for weights, averaged, latest in collected:
+        assert all(np.array_equal(weights[name], value.numpy()) for name, value in averaged.items())
+        is_latest.append(all(np.array_equal(weights[name], value.numpy()) for name, value in latest.items()))
+    assert len(is_latest) > 2 and is_latest[0]  # before the first update the average is the initial weights
+    assert not all(is_latest)
 
 
-def test_who_is_only_compared_with_the_last_agent_plays_as_a_planner_alone(tiny, dot, tmp_path, monkeypatch):
-    judged, evaluate = [], Collector.evaluate
-    means = iter([10.0, 5.0, 7.0])  # an evaluation, then last and best at the end
+def evaluating(returns, calls):
+    """A stand-in for `Collector.evaluate` with given returns of the planner; records whether the actor plays."""
 
-    def judge(collector, episodes, *arguments):
-        returns = evaluate(collector, episodes, *arguments)
-        judged.append(tuple(returns))
-        return returns | {"planner": [next(means)]}
+    def evaluate(collector, episodes, film=None, weights=None, actor=True):
+        calls.append(actor)
+        return {"planner": [next(returns)] * episodes, "actor": [0.0] * episodes}
 
-    monkeypatch.setattr(Collector, "evaluate", judge)
-    train(tiny(tmp_path / "run", evaluation={"every_frames": 45}), dot)
-    assert judged == [("planner", "actor"), ("planner", "actor"), ("planner",)]
+    return evaluate
 
 
-def test_an_evaluation_that_is_under_way_when_time_is_up_can_be_the_best(tiny, dot, tmp_path, monkeypatch):
-    returns = iter([1.0, -1.0, 1.0])
+@pytest.fixture(scope="module")
+def compared(tiny, dot, tmp_path_factory):
+    """A run whose evaluation at 45 frames gave 10; at the end the last agent earns 5 and the best agent 7."""
+    calls = []
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Collector, "evaluate", evaluating(iter([10.0, 5.0, 7.0]), calls))
+        folder = tmp_path_factory.mktemp("compared") / "run"
+        return train(tiny(folder, evaluation={"every_frames": 45}), dot), calls
+
+
+def frames_of(folder):
+    return {name: read_info(folder / "checkpoints" / name)["env_frames"] for name in ("best", "last")}
+
+
+def test_best_agent_stays_when_it_beats_the_last_agent_on_the_final_starts(compared):
+    run, _ = compared
+    assert run.summary["planner"] == 5.0
+    assert frames_of(run.run_dir) == {"best": 45, "last": 90}
+
+
+def test_best_agent_is_replaced_when_the_last_agent_beats_it_on_the_final_starts(compared, dot, tmp_path, monkeypatch):
+    """The best mean of many short evaluations is also high by chance, so the final evaluation repeats it."""
+    folder = shutil.copytree(compared[0].run_dir, tmp_path / "run")
+    monkeypatch.setattr(Collector, "evaluate", evaluating(iter([5.0, 3.0]), []))
+    assert resume(folder, make_env=dot).summary["planner"] == 5.0
+    assert frames_of(folder) == {"best": 90, "last": 90}
+
+
+def test_best_agent_is_evaluated_with_the_planner_only(compared):
+    _, calls = compared
+    assert calls == [True, True, False]  # an evaluation during the run, the last agent, the best agent
+
+
+def test_evaluation_that_runs_when_the_time_is_up_can_be_the_best(tiny, dot, tmp_path, monkeypatch):
     monkeypatch.setattr(Stop, "_is_late", lambda stop: stop.state.decisions >= 45)
-    monkeypatch.setattr(Collector, "evaluate", lambda *_: {"planner": [next(returns)], "actor": [0.0]})
+    monkeypatch.setattr(Collector, "evaluate", evaluating(iter([1.0, -1.0, 1.0]), []))
     run = train(tiny(tmp_path / "run"), dot)
-    state = torch.load(run.run_dir / "resume" / "state.pt", weights_only=True)["run"]
-    assert [entry["planner"] for entry in state["evaluations"]] == [1.0]
-    assert read_info(run.run_dir / "checkpoints" / "best")["env_frames"] == 45
+    assert [entry["planner"] for entry in saved_state(run.run_dir)["run"]["evaluations"]] == [1.0]
+    assert frames_of(run.run_dir)["best"] == 45
 
 
-def test_a_signal_that_ends_the_process_that_collects_too_ends_the_run_in_order(tiny, tmp_path):
+def test_take_drops_requests_of_a_worker_that_ended_with_an_interrupted_run(tiny, tmp_path):
     class Gone:
         def result(self):
-            raise RuntimeError("the process that collects has ended unexpectedly")
+            raise RuntimeError("the collection process ended unexpectedly")
 
     state = RunState()
     experience = Experience(tiny(tmp_path), None, state, Gone(), tmp_path)
@@ -90,31 +133,3 @@ def test_a_signal_that_ends_the_process_that_collects_too_ends_the_run_in_order(
     state.interrupted = True
     experience.take()
     assert not experience._asked_round
-
-
-@pytest.mark.parametrize("rate", [0.01, 1.0])
-def test_who_collects_is_the_average_of_the_latest_weights(tiny, dot, tmp_path, monkeypatch, rate):
-    collected, is_latest, collect = [], [], Collector.collect
-    start = Experience.on_train_epoch_start
-
-    def equal(weights, model):
-        return all(np.array_equal(weights[name], value.numpy()) for name, value in model.state_dict().items())
-
-    def keep(collector, weights, *arguments):
-        collected.append(weights)
-        return collect(collector, weights, *arguments)
-
-    def compare(experience, trainer, learner):
-        before = len(collected)
-        start(experience, trainer, learner)
-        if len(collected) == before or collected[-1] is None:  # the last epoch learns from what there is
-            return
-        assert equal(collected[-1], learner.averaged)
-        is_latest.append(equal(collected[-1], learner.model))
-
-    monkeypatch.setattr(Collector, "collect", keep)
-    monkeypatch.setattr(Experience, "on_train_epoch_start", compare)
-    settings = {"evaluation": {"every_frames": 15}, "learning": {"average_rate": rate}}
-    train(tiny(tmp_path / "run", **settings), dot)
-    assert len(is_latest) > 2 and is_latest[0]  # before the first update there is nothing to average
-    assert all(is_latest) if rate == 1.0 else not all(is_latest)

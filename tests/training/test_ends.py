@@ -1,11 +1,11 @@
-"""What lies beyond a terminal state is not learned from."""
+"""Nothing is learned from rows beyond a terminal state."""
 
 import pytest
 import torch
 
 from latentplan.models import WorldModel
 from latentplan.training.learner.losses import world_model_loss
-from latentplan.training.learner.module import refreshed
+from latentplan.training.learner.module import is_refreshed
 
 END = 2  # transitions of the first sequence until it ends
 
@@ -19,7 +19,7 @@ def ended(batch):
 
 @pytest.fixture
 def disturbed(ended):
-    """The same, with other pictures, actions and rewards beyond the end."""
+    """The batch `ended` with other pictures, actions and rewards beyond the end."""
     frames, actions, rewards = ended.frames.clone(), ended.actions.clone(), ended.rewards.clone()
     frames[0, END + 1 :] //= 2
     actions[0, END:] *= -1.0
@@ -31,14 +31,14 @@ def stream():
     return torch.Generator().manual_seed(0)
 
 
-def test_the_model_learns_nothing_from_beyond_an_end(model, ended, disturbed, tiny):
+def test_world_model_loss_ignores_rows_beyond_an_end(model, ended, disturbed, tiny):
     config = tiny("", learning={"overshooting_scale": 1.0, "overshooting_horizon": 2, "free_nats": 0.0}).learning
     one, other = (world_model_loss(model, batch, config, stream()).parts for batch in (ended, disturbed))
     for name, part in one.items():
         assert part.item() == pytest.approx(other[name].item(), rel=1e-5), name
 
 
-def test_neither_does_behaviour(learner, ended, disturbed):
+def test_behaviour_loss_ignores_rows_beyond_an_end(learner, ended, disturbed):
     losses = []
     for batch in (ended, disturbed):
         learned = world_model_loss(learner.model, batch, learner.config, stream())
@@ -47,13 +47,13 @@ def test_neither_does_behaviour(learner, ended, disturbed):
     assert losses[0] == pytest.approx(losses[1], rel=1e-5)
 
 
-def test_neither_are_beliefs_stored(ended):
-    kept = refreshed(ended, torch.tensor([True, True, False, True]))
+def test_is_refreshed_excludes_rows_beyond_an_end(ended):
+    kept = is_refreshed(ended, torch.tensor([True, True, False, True]))
     assert kept[0].tolist() == [True] * (END + 1) + [False] * (5 - END)
     assert kept[1].all() and not kept[2].any()
 
 
-def test_a_batch_of_few_states_that_go_on_is_enough(learner, batch):
+def test_behaviour_loss_is_finite_when_every_row_ends_an_episode(learner, batch):
     ends = batch._replace(continues=torch.zeros_like(batch.continues))
     learned = world_model_loss(learner.model, ends, learner.config, stream())
     loss, parts = learner._behaviour_loss(learned, ends, stream())

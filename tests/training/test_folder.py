@@ -1,35 +1,36 @@
-"""Two learnings never share a folder."""
+"""A folder is locked by one process at a time."""
 
 import multiprocessing
 
 import pytest
 
 from latentplan.config import UserError
-from latentplan.training.folder import claim
+from latentplan.training.folder import lock_folder
 
 
-def test_a_folder_is_claimed_once(tmp_path):
+def test_lock_folder_refuses_a_second_lock_until_the_first_is_released(tmp_path):
     folder = tmp_path / "deep" / "run"
-    with claim(folder), pytest.raises(UserError, match="another process learns in .*run"), claim(folder):
+    with lock_folder(folder), pytest.raises(UserError, match="another process learns in .*run"), lock_folder(folder):
         pass
-    with claim(folder):  # let go
+    with lock_folder(folder):  # the lock was released
         pass
 
 
-def test_a_process_that_is_killed_lets_go(tmp_path):
-    held = multiprocessing.get_context("spawn").Event()
-    process = multiprocessing.get_context("spawn").Process(target=_hold, args=(tmp_path, held))
+def test_lock_folder_is_released_when_its_process_is_killed(tmp_path):
+    context = multiprocessing.get_context("fork")  # the child imports nothing and starts no thread
+    held = context.Event()
+    process = context.Process(target=_hold, args=(tmp_path, held))
     process.start()
     assert held.wait(60)
-    with pytest.raises(UserError), claim(tmp_path):
+    with pytest.raises(UserError), lock_folder(tmp_path):
         pass
     process.kill()
     process.join()
-    with claim(tmp_path):
+    with lock_folder(tmp_path):
         pass
 
 
 def _hold(folder, held):
-    with claim(folder):
+    with lock_folder(folder):
         held.set()
         multiprocessing.Event().wait()

@@ -1,7 +1,7 @@
-"""Whole imagined rollouts in one compiled call, on processors that multiply bfloat16 (AVX-512 or AMX).
+"""Rollouts in one call of compiled C, on processors with bfloat16 products (AVX-512 or AMX).
 
-The weights are laid out here as `imagine.c` reads them. Sums and everything between the products are float32, so that
-rollouts differ from torch's only by what torch rounds in between.
+This module arranges the weights as `imagine.c` reads them. Sums and elementwise work are float32, so rollouts differ
+from torch's only where torch rounds intermediate results.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from latentplan.models.fast.rollout import Trunk, Weights
 
 TILE = 16  # columns of a tile of weights, and row pairs
-MULTIPLE = 2 * TILE  # what every size must be a multiple of
+MULTIPLE = 2 * TILE  # every size of the model must be a multiple of this
 
 
 class _Layer(ctypes.Structure):
@@ -39,18 +39,18 @@ class _Model(ctypes.Structure):
 
 
 class Packed(NamedTuple):
-    """What the compiled rollout reads, and the tensors that its pointers point into."""
+    """The struct that compiled calls read, and the tensors that keep its pointers valid."""
 
     model: _Model
     tensors: tuple[Tensor, ...]
 
 
 def pack(weights: Weights, critic: tuple[Trunk, Tensor, Tensor]) -> Packed | None:
-    """The weights as the compiled rollout reads them; None where it cannot: here, in this dtype, or in these sizes.
+    """Weights for compiled calls; None if the processor, the dtype or the sizes of the model do not allow them.
 
     Args:
-        weights: Of what imagines.
-        critic: Trunk, logits and their shift of the value head, as `weights` has those of the reward head.
+        weights: Converted weights from `rollout.convert_weights`.
+        critic: Trunk, logits and shift of the value head, in the form that `weights` has for the reward head.
     """
     library = load()
     (action, hidden), latent, deter = weights.action.shape, len(weights.stoch), len(weights.prior)
@@ -59,48 +59,48 @@ def pack(weights: Weights, critic: tuple[Trunk, Tensor, Tensor]) -> Packed | Non
     if library is None or not (known and fit and library.can_imagine()):
         return None
 
-    def turned(matrix: Tensor, first: int) -> Tensor:
-        """The rows from `first` on, before those above them: the state lies in another order here."""
+    def rotated(matrix: Tensor, first: int) -> Tensor:
+        """The rows from `first` on, then the first rows: compiled calls store stoch before deter."""
         return torch.cat([matrix[first:], matrix[:first]])
 
     def output(matrix: Tensor, shift: Tensor) -> tuple[Tensor, None, Tensor]:
-        """A float32 product as two of bfloat16: what rounding leaves out goes beside what it keeps."""
+        """A float32 product as two bfloat16 products: of the rounded weights, and of the rounding errors."""
         matrix, shift = _padded(matrix, 1), _padded(shift, 0)
         rounded = matrix.bfloat16()
         return torch.cat([rounded, (matrix - rounded.float()).bfloat16()], 1), None, shift
 
     def mlp(trunk: Trunk, matrix: Tensor, shift: Tensor) -> list[tuple[Tensor, Tensor | None, Tensor]]:
         (first, first_norm), (second, second_norm) = trunk
-        return [(turned(first, deter), *first_norm), (second, *second_norm), output(matrix, shift)]
+        return [(rotated(first, deter), *first_norm), (second, *second_norm), output(matrix, shift)]
 
     layers = [
         (torch.cat([_padded(weights.action, 0), weights.stoch]), *weights.input_norm),
-        (turned(weights.gates, hidden), *weights.gates_norm),
+        (rotated(weights.gates, hidden), *weights.gates_norm),
         (weights.prior, *weights.prior_norm),
         (weights.mean, None, weights.mean_shift.float()),
         *mlp(weights.head, weights.logits, weights.logits_shift),
         *mlp(weights.actor, weights.actor_output, weights.actor_shift),
         *mlp(*critic),
     ]
-    return _lay_out(layers, weights.values, (action, latent, deter, hidden))
+    return _to_tiles(layers, weights.values, (action, latent, deter, hidden))
 
 
 def rollout(packed: Packed, deter: Tensor, stoch: Tensor, actions: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Rewards (rows, time) along actions (rows, time, action), and the deter and stoch reached, all float32."""
+    """Rewards (rows, time) along actions (rows, time, action), and the last deter and stoch, all float32."""
     rewards = torch.empty(actions.shape[:2])
     deter, stoch, actions = _own(deter), _own(stoch), actions.float().contiguous()
     _call(packed, deter, stoch, actions, rewards)
     return rewards, deter, stoch
 
 
-def follow(packed: Packed, deter: Tensor, stoch: Tensor, noise: Tensor) -> Tensor:
+def propose(packed: Packed, deter: Tensor, stoch: Tensor, noise: Tensor) -> Tensor:
     """The actor's actions, float32 (rows, time, action), for standard normal draws of the same shape."""
     actions = _own(noise)
     _call(packed, _own(deter), _own(stoch), actions)
     return actions
 
 
-def judge(packed: Packed, deter: Tensor, stoch: Tensor) -> Tensor:
+def value(packed: Packed, deter: Tensor, stoch: Tensor) -> Tensor:
     """The value of states, float32 (rows,)."""
     values = torch.empty(len(deter))
     _call(packed, _own(deter), _own(stoch), torch.empty(len(deter), 0, 0), values=values)
@@ -108,7 +108,7 @@ def judge(packed: Packed, deter: Tensor, stoch: Tensor) -> Tensor:
 
 
 def _own(tensor: Tensor) -> Tensor:
-    """A copy to write to."""
+    """A contiguous float32 copy, which the compiled call overwrites."""
     return tensor.to(torch.float32, memory_format=torch.contiguous_format, copy=True)
 
 
@@ -132,12 +132,12 @@ def _call(
 
 
 def _padded(matrix: Tensor, dim: int) -> Tensor:
-    """With zeros after the last row or column, up to a multiple of what a tile holds."""
+    """The matrix with zeros after the last row or column, up to a multiple of `MULTIPLE`."""
     missing = -matrix.shape[dim] % MULTIPLE
     return functional.pad(matrix, [0, 0] * (matrix.dim() - 1 - dim) + [0, missing])
 
 
-def _lay_out(
+def _to_tiles(
     layers: Sequence[tuple[Tensor, Tensor | None, Tensor]], values: Tensor, sizes: tuple[int, int, int, int]
 ) -> Packed:
     built, kept = [], [values]

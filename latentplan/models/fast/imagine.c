@@ -1,5 +1,5 @@
-// Following action sequences by the mean of the prior, many steps of 32 rows at a time, so that nothing but the weights
-// leaves a core's cache. Products are bfloat16 with float32 sums, everything between them is float32.
+// Rollouts along the mean of the prior, 32 rows at a time over all steps, so that everything but the weights stays in a
+// core's cache. Products are bfloat16 with float32 sums; elementwise work is float32.
 
 #include <stddef.h>
 
@@ -18,7 +18,7 @@ int imagine(void) { return 1; }
 #define TILE 16
 #define ALIGNMENT 64
 
-// A product's weights lie in tiles of 16 columns x 32 rows, the rows in pairs side by side: (column tile, row tile,
+// A product's weights are stored in tiles of 16 columns x 32 rows, with the rows in pairs: (column tile, row tile,
 // row pair, column, 2). `inputs` and `outputs` are multiples of 32.
 typedef struct {
     const bfloat16 *weights;
@@ -33,17 +33,17 @@ typedef struct {
 typedef struct {
     Layer input, gates, prior, mean;
     Mlp head, actor, value;
-    const float *bin_values;  // of the reward head and of the value head
+    const float *bin_values;  // the same for the reward head and the value head
     long action, latent, deter, hidden, bins;
 } Model;
 
-// What each thread works on: up to BLOCK rows of [action, padded to 32 | stoch | deter | hidden], and beside them in
-// float32 the deter, and the last product.
+// The working memory of a thread: up to BLOCK rows of [action, padded to 32 | stoch | deter | hidden] in bfloat16, and
+// deter and the last product in float32.
 typedef struct {
     bfloat16 *rows, *stoch, *rounded, *hidden;
     float *deter, *product;
     long width, count;
-} Desk;
+} Workspace;
 
 #if defined(__AMX_BF16__) && defined(__linux__)
 #include <sys/syscall.h>
@@ -68,8 +68,8 @@ static void set_up(void) {
 
 static void tear_down(void) { _tile_release(); }
 
-static void multiply(Desk *desk, const bfloat16 *rows, const Layer *layer) {
-    long width = desk->width;
+static void multiply(Workspace *work, const bfloat16 *rows, const Layer *layer) {
+    long width = work->width;
     for (long column = 0; column < layer->outputs; column += 2 * TILE) {
         const bfloat16 *left = layer->weights + column * layer->inputs, *right = left + TILE * layer->inputs;
         _tile_zero(0);
@@ -86,7 +86,7 @@ static void multiply(Desk *desk, const bfloat16 *rows, const Layer *layer) {
             _tile_dpbf16ps(2, 5, 6);
             _tile_dpbf16ps(3, 5, 7);
         }
-        float *upper = desk->product + column, *lower = upper + TILE * layer->outputs;
+        float *upper = work->product + column, *lower = upper + TILE * layer->outputs;
         _tile_stored(0, upper, layer->outputs * 4);
         _tile_stored(1, upper + TILE, layer->outputs * 4);
         _tile_stored(2, lower, layer->outputs * 4);
@@ -100,9 +100,9 @@ int can_imagine(void) { return 1; }
 static void set_up(void) {}
 static void tear_down(void) {}
 
-static void multiply(Desk *desk, const bfloat16 *rows, const Layer *layer) {
-    long width = desk->width;
-    for (long top = 0; top < desk->count; top += TILE) {
+static void multiply(Workspace *work, const bfloat16 *rows, const Layer *layer) {
+    long width = work->width;
+    for (long top = 0; top < work->count; top += TILE) {
         for (long column = 0; column < layer->outputs; column += TILE) {
             const bfloat16 *weights = layer->weights + column * layer->inputs;
             __m512 sums[TILE];
@@ -115,7 +115,7 @@ static void multiply(Desk *desk, const bfloat16 *rows, const Layer *layer) {
                     sums[r] = _mm512_dpbf16_ps(sums[r], (__m512bh)_mm512_set1_epi32(pair), (__m512bh)pairs);
                 }
             }
-            float *place = desk->product + top * layer->outputs + column;
+            float *place = work->product + top * layer->outputs + column;
             for (int r = 0; r < TILE; r++) _mm512_storeu_ps(place + r * layer->outputs, sums[r]);
         }
     }
@@ -123,55 +123,55 @@ static void multiply(Desk *desk, const bfloat16 *rows, const Layer *layer) {
 
 #endif
 
-// One hidden layer of every row, written where hidden layers are.
-static void layer_of(Desk *desk, const bfloat16 *from, const Layer *layer) {
-    multiply(desk, from, layer);
-    for (long r = 0; r < desk->count; r++) {
-        const float *row = desk->product + r * layer->outputs;
-        silu_row(desk->hidden + r * desk->width, row, layer->scale, layer->shift, layer->outputs);
+// One hidden layer of every row, written to `hidden`.
+static void layer_of(Workspace *work, const bfloat16 *from, const Layer *layer) {
+    multiply(work, from, layer);
+    for (long r = 0; r < work->count; r++) {
+        const float *row = work->product + r * layer->outputs;
+        silu_row(work->hidden + r * work->width, row, layer->scale, layer->shift, layer->outputs);
     }
 }
 
-// The output of an Mlp at every row. Its weights are the sum of two bfloat16 parts, side by side; so is the product.
-static void output_of(Desk *desk, const Mlp *mlp) {
+// The output of an Mlp at every row. Its weights are two bfloat16 matrices side by side, whose products are added.
+static void output_of(Workspace *work, const Mlp *mlp) {
     const Layer *output = &mlp->output;
     long half = output->outputs / 2;
-    layer_of(desk, desk->stoch, &mlp->first);
-    layer_of(desk, desk->hidden, &mlp->second);
-    multiply(desk, desk->hidden, output);
-    for (long r = 0; r < desk->count; r++) {
-        float *row = desk->product + r * output->outputs;
+    layer_of(work, work->stoch, &mlp->first);
+    layer_of(work, work->hidden, &mlp->second);
+    multiply(work, work->hidden, output);
+    for (long r = 0; r < work->count; r++) {
+        float *row = work->product + r * output->outputs;
         VECTOR() for (long i = 0; i < half; i++) row[i] += row[half + i] + output->shift[i];
     }
 }
 
-static void advance(Desk *desk, const Model *model) {
-    layer_of(desk, desk->rows, &model->input);
-    multiply(desk, desk->rounded, &model->gates);
-    for (long r = 0; r < desk->count; r++) {
-        const float *row = desk->product + r * model->gates.outputs;
-        float *deter = desk->deter + r * model->deter;
-        gate_row(deter, desk->rounded + r * desk->width, row, model->gates.scale, model->gates.shift, model->deter);
+static void advance(Workspace *work, const Model *model) {
+    layer_of(work, work->rows, &model->input);
+    multiply(work, work->rounded, &model->gates);
+    for (long r = 0; r < work->count; r++) {
+        const float *row = work->product + r * model->gates.outputs;
+        float *deter = work->deter + r * model->deter;
+        gate_row(deter, work->rounded + r * work->width, row, model->gates.scale, model->gates.shift, model->deter);
     }
-    layer_of(desk, desk->rounded, &model->prior);
-    multiply(desk, desk->hidden, &model->mean);
-    for (long r = 0; r < desk->count; r++) {
-        const float *row = desk->product + r * model->latent;
-        bfloat16 *stoch = desk->stoch + r * desk->width;
+    layer_of(work, work->rounded, &model->prior);
+    multiply(work, work->hidden, &model->mean);
+    for (long r = 0; r < work->count; r++) {
+        const float *row = work->product + r * model->latent;
+        bfloat16 *stoch = work->stoch + r * work->width;
         VECTOR() for (long i = 0; i < model->latent; i++) stoch[i] = write_bfloat16(row[i] + model->mean.shift[i]);
     }
 }
 
-// The scalar that a head reads at every row, one every `apart`.
-static void read_bins(Desk *desk, const Model *model, const Mlp *head, float *scalars, long apart) {
-    output_of(desk, head);
-    for (long r = 0; r < desk->count; r++)
-        scalars[r * apart] = wide_expected(desk->product + r * head->output.outputs, model->bin_values, model->bins);
+// The scalar of a head at every row, written with a stride of `apart`.
+static void read_bins(Workspace *work, const Model *model, const Mlp *head, float *scalars, long apart) {
+    output_of(work, head);
+    for (long r = 0; r < work->count; r++)
+        scalars[r * apart] = wide_expected(work->product + r * head->output.outputs, model->bin_values, model->bins);
 }
 
 static long padded(long size) { return (size + BLOCK - 1) / BLOCK * BLOCK; }
 
-static size_t desk_floats(const Model *model) {
+static size_t workspace_floats(const Model *model) {
     long widest = 3 * model->deter;
     widest = widest > model->hidden ? widest : model->hidden;
     widest = widest > model->latent ? widest : model->latent;
@@ -181,44 +181,45 @@ static size_t desk_floats(const Model *model) {
     return (size_t)(BLOCK * (width / 2 + model->deter + widest));
 }
 
-static float *open_desk(const Model *model) {
+static float *open_workspace(const Model *model) {
     set_up();
-    return aligned_alloc(ALIGNMENT, (desk_floats(model) * sizeof(float) + ALIGNMENT - 1) / ALIGNMENT * ALIGNMENT);
+    return aligned_alloc(ALIGNMENT, (workspace_floats(model) * sizeof(float) + ALIGNMENT - 1) / ALIGNMENT * ALIGNMENT);
 }
 
-static void close_desk(float *memory) {
+static void close_workspace(float *memory) {
     free(memory);
     tear_down();
 }
 
-// Lays the rows from `first` on where one thread works; rows that are none are zeros.
-static Desk lay(float *memory, const Model *model, const float *deter, const float *stoch, long rows) {
+// Copies up to BLOCK rows into the working memory of a thread; missing rows are zeros.
+static Workspace copy_rows(float *memory, const Model *model, const float *deter, const float *stoch, long rows) {
     long width = padded(model->action) + model->latent + model->deter + model->hidden;
     bfloat16 *halves = (bfloat16 *)memory, *stochs = halves + padded(model->action), *rounded = stochs + model->latent;
     float *deters = memory + BLOCK * width / 2;
-    Desk desk = {halves, stochs, rounded, rounded + model->deter, deters, deters + BLOCK * model->deter, width, rows};
-    memset(memory, 0, desk_floats(model) * sizeof(float));
-    memcpy(desk.deter, deter, (size_t)(rows * model->deter) * sizeof(float));
+    bfloat16 *hidden = rounded + model->deter;
+    Workspace work = {halves, stochs, rounded, hidden, deters, deters + BLOCK * model->deter, width, rows};
+    memset(memory, 0, workspace_floats(model) * sizeof(float));
+    memcpy(work.deter, deter, (size_t)(rows * model->deter) * sizeof(float));
     for (long r = 0; r < rows; r++) {
         for (long i = 0; i < model->latent; i++)
-            desk.stoch[r * width + i] = write_bfloat16(stoch[r * model->latent + i]);
+            work.stoch[r * width + i] = write_bfloat16(stoch[r * model->latent + i]);
         for (long i = 0; i < model->deter; i++)
-            desk.rounded[r * width + i] = write_bfloat16(deter[r * model->deter + i]);
+            work.rounded[r * width + i] = write_bfloat16(deter[r * model->deter + i]);
     }
-    return desk;
+    return work;
 }
 
-static void take(Desk *desk, const Model *model, const float *actions, long time) {
-    for (long r = 0; r < desk->count; r++)
+static void set_actions(Workspace *work, const Model *model, const float *actions, long time) {
+    for (long r = 0; r < work->count; r++)
         for (long i = 0; i < model->action; i++)
-            desk->rows[r * desk->width + i] = write_bfloat16(actions[r * time * model->action + i]);
+            work->rows[r * work->width + i] = write_bfloat16(actions[r * time * model->action + i]);
 }
 
-// Where the actor decides: the mean of its distribution, and the std times what was drawn, which its action replaces.
-static void decide(Desk *desk, const Model *model, float *actions, long time) {
-    output_of(desk, &model->actor);
-    for (long r = 0; r < desk->count; r++) {
-        const float *raw = desk->product + r * model->actor.output.outputs;
+// Replaces standard normal draws by the actor's actions: the mean plus std times the draw, clamped to [-1, 1].
+static void sample_actions(Workspace *work, const Model *model, float *actions, long time) {
+    output_of(work, &model->actor);
+    for (long r = 0; r < work->count; r++) {
+        const float *raw = work->product + r * model->actor.output.outputs;
         float *action = actions + r * time * model->action;
         for (long i = 0; i < model->action; i++) {
             float std = 0.9f * sigmoid(raw[model->action + i] + 2.0f) + 0.1f;
@@ -228,9 +229,9 @@ static void decide(Desk *desk, const Model *model, float *actions, long time) {
     }
 }
 
-// Rewards (rows, time) along actions (rows, time, action), and the states reached, which replace the first ones. With
-// no rewards to write to, the actor decides, and its actions replace the standard normal draws (rows, time, action).
-// With values to write to (rows,), the states reached are judged. Returns 0, or 1 when there was no memory.
+// Writes rewards (rows, time) along actions (rows, time, action), and replaces the start states by the last states. If
+// `rewards` is NULL, `actions` holds standard normal draws, which the actor's actions replace. If `values` is not NULL,
+// it receives the values of the last states, (rows,). Returns 0, or 1 if memory could not be allocated.
 int imagine(const Model *model, float *deter, float *stoch, float *actions, float *rewards, float *values, long rows,
             long time, int threads) {
     int failed = 0;
@@ -238,28 +239,28 @@ int imagine(const Model *model, float *deter, float *stoch, float *actions, floa
     if (blocks == 0) return failed;
 #pragma omp parallel num_threads(threads < blocks ? threads : (int)blocks) reduction(| : failed)
     {
-        float *memory = open_desk(model);
+        float *memory = open_workspace(model);
         failed = memory == NULL;
 #pragma omp for schedule(static)
         for (long block = 0; block < blocks; block++) {
             if (memory == NULL) continue;
             long from = block * BLOCK, here = rows - from < BLOCK ? rows - from : BLOCK;
             float *deters = deter + from * model->deter, *stochs = stoch + from * model->latent;
-            Desk desk = lay(memory, model, deters, stochs, here);
+            Workspace work = copy_rows(memory, model, deters, stochs, here);
             for (long step = 0; step < time; step++) {
                 float *action = actions + (from * time + step) * model->action;
-                if (rewards == NULL) decide(&desk, model, action, time);
-                take(&desk, model, action, time);
-                advance(&desk, model);
-                if (rewards != NULL) read_bins(&desk, model, &model->head, rewards + from * time + step, time);
+                if (rewards == NULL) sample_actions(&work, model, action, time);
+                set_actions(&work, model, action, time);
+                advance(&work, model);
+                if (rewards != NULL) read_bins(&work, model, &model->head, rewards + from * time + step, time);
             }
-            if (values != NULL) read_bins(&desk, model, &model->value, values + from, 1);
-            memcpy(deters, desk.deter, (size_t)(here * model->deter) * sizeof(float));
+            if (values != NULL) read_bins(&work, model, &model->value, values + from, 1);
+            memcpy(deters, work.deter, (size_t)(here * model->deter) * sizeof(float));
             for (long r = 0; r < here; r++)
                 for (long i = 0; i < model->latent; i++)
-                    stochs[r * model->latent + i] = read_bfloat16(desk.stoch[r * desk.width + i]);
+                    stochs[r * model->latent + i] = read_bfloat16(work.stoch[r * work.width + i]);
         }
-        close_desk(memory);
+        close_workspace(memory);
     }
     return failed;
 }

@@ -1,4 +1,4 @@
-// Elementwise work between the matrix products of the recurrence and the heads, one pass per row.
+// Elementwise work of the GRU and the heads, one pass per row.
 // Rows are bfloat16 or float32; sums, means and functions are float32. NaN in gives NaN out.
 
 #include "rows.h"

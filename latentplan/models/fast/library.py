@@ -1,8 +1,8 @@
-"""What stands between the matrix products of imagination, fused: one pass over each row instead of many.
+"""Compiled C code: kernels for the elementwise parts of a rollout, one pass over each row instead of many.
 
-The C sources beside this file are compiled by the machine's own compiler when they are first needed (a second), and
-kept in the user's cache. Where there is no compiler, on devices other than the CPU, and where gradients are asked for,
-the same is done in torch; so it is when `LATENTPLAN_KERNELS=0`.
+The machine's own compiler builds the C sources beside this file when they are first needed (about a second); the result
+is kept in the user's cache. Torch computes the same where there is no compiler, on other devices than the CPU, where
+gradients are required, and if `LATENTPLAN_KERNELS=0`.
 """
 
 from __future__ import annotations
@@ -19,15 +19,14 @@ from pathlib import Path
 
 import torch
 from torch import Tensor
-from torch.nn import functional
 
-from latentplan.models.dynamics import next_deter
+from latentplan.models.fast import pointwise
 
 SOURCES = tuple(Path(__file__).with_name(name) for name in ("rows.h", "vectors.h", "kernels.c", "imagine.c"))
-# Sums may be taken in any order, without which none would be a vector's; nothing else of IEEE 754 is given up.
+# Sums may be reordered, because compilers cannot vectorize them otherwise; all other rules of IEEE 754 hold.
 ARITHMETIC = ("-fassociative-math", "-fno-signed-zeros", "-fno-trapping-math", "-fno-math-errno")
 FLAGS = ("-O3", "-march=native", *ARITHMETIC, "-fopenmp", "-shared", "-fPIC")
-WIDE = "-mprefer-vector-width=512"  # x86 compilers know it
+WIDE = "-mprefer-vector-width=512"  # only x86 compilers accept it
 LONGEST_ROW = 4096  # as in kernels.c
 COMPILE_SECONDS = 60
 DTYPES = {torch.bfloat16: "bfloat16", torch.float32: "float32"}
@@ -36,11 +35,11 @@ Norm = tuple[Tensor, Tensor]  # scale and shift
 
 
 def norm_silu(product: Tensor, norm: Norm) -> Tensor:
-    """SiLU of the layer norm of rows (..., size), in the product's dtype; where no gradient is asked for, in place."""
+    """SiLU of the layer norm of rows (..., size), in the product's dtype; in place if no gradient is required."""
     scale, shift = norm
     library = _library_for(product, scale, shift)
     if library is None:
-        return functional.silu(functional.layer_norm(product, product.shape[-1:], scale, shift))
+        return pointwise.norm_silu(product, scale, shift)
     rows, size = product.numel() // product.shape[-1], product.shape[-1]
     kernel = getattr(library, f"norm_silu_{DTYPES[product.dtype]}")
     kernel(*_places(product, scale, shift), rows, size, torch.get_num_threads())
@@ -48,12 +47,12 @@ def norm_silu(product: Tensor, norm: Norm) -> Tensor:
 
 
 def gates(product: Tensor, norm: Norm, deter: Tensor) -> tuple[Tensor, Tensor]:
-    """The next deterministic state of the recurrence: its update gate, less 1, moves it towards its candidate.
+    """The next deterministic state of the GRU, from the gates before their norm; see `next_deter`.
 
     Args:
         product: Reset, candidate and update gate before their norm, side by side, (rows, 3 deter).
-        norm: Of the gates.
-        deter: The state before, float32 (rows, deter).
+        norm: Scale and shift of the gates' layer norm.
+        deter: The previous state, float32 (rows, deter).
 
     Returns:
         The state, float32 (rows, deter), and the same in the product's dtype.
@@ -61,8 +60,7 @@ def gates(product: Tensor, norm: Norm, deter: Tensor) -> tuple[Tensor, Tensor]:
     scale, shift = norm
     library = _library_for(product, scale, shift, deter)
     if library is None:
-        normed = functional.layer_norm(product.to(scale.dtype), product.shape[-1:], scale, shift).to(deter.dtype)
-        following = next_deter(normed, deter)
+        following = pointwise.update_deter(product.to(scale.dtype), scale, shift, deter)
         return following, following.to(product.dtype)
     deter = deter.contiguous()
     following, rounded = torch.empty_like(deter), torch.empty_like(deter, dtype=product.dtype)
@@ -82,7 +80,7 @@ def expectation(logits: Tensor, values: Tensor) -> Tensor:
 
 
 def _library_for(rows: Tensor, *others: Tensor) -> ctypes.CDLL | None:
-    """The compiled kernels, if they can do what is asked for."""
+    """The compiled kernels; None if they cannot compute with these tensors."""
     tensors = (rows, *others)
     if torch.is_grad_enabled() and any(tensor.requires_grad for tensor in tensors):
         return None
@@ -97,7 +95,7 @@ def _places(*tensors: Tensor) -> list[int]:
 
 @functools.cache
 def load() -> ctypes.CDLL | None:
-    """The compiled kernels; None where they are switched off or cannot be made."""
+    """The compiled library; None if it is switched off or cannot be built."""
     if os.environ.get("LATENTPLAN_KERNELS") == "0":
         return None
     try:
@@ -114,11 +112,11 @@ def load() -> ctypes.CDLL | None:
 
 
 def _compiled() -> Path:
-    """Where the compiled kernels are, after compiling them if this machine has not done so before.
+    """The path of the compiled library, which is built if this machine has not done so before.
 
     Raises:
-        OSError: There is no compiler, or nowhere to write.
-        RuntimeError: Nobody's home directory is known.
+        OSError: There is no compiler, or the cache cannot be written.
+        RuntimeError: The user's home directory is unknown.
         subprocess.SubprocessError: The compiler failed.
     """
     compiler = os.environ.get("CC") or next(filter(shutil.which, ("cc", "gcc", "clang")), None)
@@ -132,7 +130,7 @@ def _compiled() -> Path:
     library = home / f"kernels-{key}.so"
     if not library.exists():
         home.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryDirectory(dir=home) as folder:  # another process may be at it too: the last one wins
+        with tempfile.TemporaryDirectory(dir=home) as folder:  # another process may build too: the last one wins
             fresh = Path(folder) / library.name
             subprocess.run([*command, "-o", str(fresh)], check=True, capture_output=True, timeout=COMPILE_SECONDS)
             os.replace(fresh, library)
@@ -140,7 +138,7 @@ def _compiled() -> Path:
 
 
 def _processor() -> str:
-    """What code made for this processor depends on."""
+    """The features of this processor, on which compiled code depends."""
     try:
         lines = Path("/proc/cpuinfo").read_text().splitlines()
     except OSError:

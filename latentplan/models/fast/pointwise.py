@@ -1,6 +1,6 @@
-"""What lies between the matrix products of a step, forwards and backwards: on a GPU a kernel each, or two.
+"""Elementwise parts of a GRU step and their gradients; on a GPU each is compiled into one or two kernels.
 
-All are of plain tensors, without autograd. Names ending in `_back` take gradients of what the others return.
+The functions take plain tensors and run without autograd. A function `name_back` computes the gradients of `name`.
 """
 
 from __future__ import annotations
@@ -18,11 +18,11 @@ from latentplan.models.dynamics import UPDATE_SHIFT, gaussian, next_deter
 from latentplan.models.heads import action_distribution, sample_action
 
 NORM_EPS = 1e-5
-MOST_SHAPES = 64  # for which a function is compiled: beyond, torch runs it uncompiled
+MOST_SHAPES = 64  # torch compiles a function for this many shapes, then runs it uncompiled
 
 
 def run(function: Callable[..., Any], *arguments: Any) -> Any:
-    """Call a function such as those here, compiled where its tensors are on a GPU and torch can compile for it."""
+    """The result of a function of tensors, compiled if the tensors are on a GPU for which torch can compile."""
     return (_compiled(function) if arguments[0].is_cuda else function)(*arguments)
 
 
@@ -33,7 +33,7 @@ def _compiled(function: Callable[..., Any]) -> Callable[..., Any]:
 
 @functools.cache
 def can_compile(device: str) -> bool:
-    """Whether torch compiles for a device here, tried once: it wants a C compiler, and a GPU that Triton knows."""
+    """Whether torch can compile for a device, tried once: it needs a C compiler and a GPU that Triton supports."""
     import torch._dynamo
 
     torch._dynamo.config.recompile_limit = max(torch._dynamo.config.recompile_limit, MOST_SHAPES)
@@ -51,13 +51,13 @@ def norm_silu(product: Tensor, scale: Tensor, shift: Tensor) -> Tensor:
     return functional.silu(functional.layer_norm(product, product.shape[-1:], scale, shift, NORM_EPS))
 
 
-def norm_silu_beside(product: Tensor, scale: Tensor, shift: Tensor, deter: Tensor) -> Tensor:
-    """The same with deter beside it, (rows, size + deter)."""
+def norm_silu_with_deter(product: Tensor, scale: Tensor, shift: Tensor, deter: Tensor) -> Tensor:
+    """`norm_silu` of the product, concatenated with deter, (rows, size + deter)."""
     return torch.cat([norm_silu(product, scale, shift), deter], -1)
 
 
 def norm_silu_back(gradient: Tensor, product: Tensor, scale: Tensor, shift: Tensor) -> tuple[Tensor, Tensor]:
-    """Gradients of the product, and of its norm scaled and shifted, for that of the first `size` columns."""
+    """Gradients of the product and of the scaled norm, given the gradient (rows, size or more) of the result."""
     centred, rstd = _centred(product)
     normed = centred * rstd
     scaled = normed * scale + shift
@@ -66,13 +66,13 @@ def norm_silu_back(gradient: Tensor, product: Tensor, scale: Tensor, shift: Tens
     return _norm_input_back(of_scaled * scale, normed, rstd), of_scaled
 
 
-def gated(product: Tensor, scale: Tensor, shift: Tensor, deter: Tensor) -> Tensor:
-    """The next deter (rows, deter) from reset, candidate and update gates side by side, as in `Rssm.advance`."""
+def update_deter(product: Tensor, scale: Tensor, shift: Tensor, deter: Tensor) -> Tensor:
+    """The next deter (rows, deter) from reset, candidate and update gates (rows, 3 deter), as in `Rssm.advance`."""
     normed = functional.layer_norm(product, product.shape[-1:], scale, shift, NORM_EPS)
     return next_deter(normed, deter)
 
 
-def gated_back(
+def update_deter_back(
     by_latent: Tensor,
     by_others: Tensor | None,
     directly: Tensor | None,
@@ -83,18 +83,18 @@ def gated_back(
     shift: Tensor,
     deter: Tensor,
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Gradients of the product, of its norm scaled and shifted, and of the deter before, past the product.
+    """Gradients of the product, of the scaled norm, and of the previous deter without its share through the product.
 
     Args:
-        by_latent: The first of four gradients of the deter after: the step's own latent's.
-        by_others: Of whatever else reads it.
-        directly: Of the next step, past its product.
-        beside: Of the next step, in the last columns of what its product is of.
-        decay: Share of the last two that counts.
-        product: Of the gates, as `gated` takes it.
-        scale: Of its norm.
-        shift: Of its norm.
-        deter: The deter before.
+        by_latent: Gradient of the next deter through the latent of the same step.
+        by_others: Gradient of the next deter through other readers, such as losses.
+        directly: Gradient through the following step, without its product.
+        beside: Gradient of the input of the following step's product, whose last columns belong to deter.
+        decay: Share of `directly` and `beside` that passes.
+        product: Product of the gates, as `update_deter` takes it.
+        scale: Scale of the norm.
+        shift: Shift of the norm.
+        deter: The previous deter.
     """
     gradient = by_latent if by_others is None else by_latent + by_others
     if directly is not None and beside is not None:
@@ -111,14 +111,16 @@ def gated_back(
     return _norm_input_back(of_scaled * scale, normed, rstd), of_scaled, gradient * (1.0 - update_gate)
 
 
-def drawn(raw: Tensor, noise: Tensor | None, action: Tensor | None) -> tuple[Tensor, Tensor, Tensor, Tensor | None]:
-    """A latent, or without noise its mean; mean and std, (rows, latent) each; the latent beside the next action."""
+def sample_latent(
+    raw: Tensor, noise: Tensor | None, action: Tensor | None
+) -> tuple[Tensor, Tensor, Tensor, Tensor | None]:
+    """A sample of the latent (its mean without noise), mean, std, and the latent concatenated with the next action."""
     mean, std = gaussian(raw)
     stoch = mean if noise is None else mean + std * noise
     return stoch, mean, std, None if action is None else torch.cat([stoch, action], -1)
 
 
-def drawn_back(
+def sample_latent_back(
     raw: Tensor,
     noise: Tensor | None,
     stoch: Tensor | None,
@@ -127,7 +129,7 @@ def drawn_back(
     joined: Tensor | None,
     decay: float,
 ) -> Tensor:
-    """Gradient of raw, for those of stoch, mean and std, and of stoch by the next step, first columns of `joined`."""
+    """Gradient of raw, given those of stoch, mean and std, and that of stoch in the first columns of `joined`."""
     latent = raw.shape[-1] // 2
     gate = torch.sigmoid(raw[:, latent:] / 2.0)
     of_stoch = torch.zeros_like(gate) if stoch is None else stoch
@@ -139,15 +141,15 @@ def drawn_back(
     return torch.cat([of_mean, of_std * gate * (1.0 - gate)], -1)
 
 
-def felt(raw: Tensor, noise: Tensor, deter: Tensor) -> tuple[Tensor, Tensor]:
-    """A latent (rows, latent), and the features that it makes with deter."""
+def sample_features(raw: Tensor, noise: Tensor, deter: Tensor) -> tuple[Tensor, Tensor]:
+    """A sample of the latent, (rows, latent), and the features (rows, deter + latent)."""
     mean, std = gaussian(raw)
     stoch = mean + std * noise
     return stoch, torch.cat([deter, stoch], -1)
 
 
-def acted(raw: Tensor, noise: Tensor, stoch: Tensor) -> Tensor:
-    """The latent beside an actor's sample, for what the actor's last layer returned (rows, 2 action)."""
+def append_action(raw: Tensor, noise: Tensor, stoch: Tensor) -> Tensor:
+    """The latent concatenated with an action sample, for the output of the actor's last layer (rows, 2 action)."""
     return torch.cat([stoch, sample_action(*action_distribution(raw), noise)], -1)
 
 

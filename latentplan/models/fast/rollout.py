@@ -1,9 +1,9 @@
-"""Following many action sequences by the mean of the prior: the planner's hot path.
+"""Rollouts of many action sequences along the mean of the prior, with weights that are converted once.
 
-Equals `WorldModel.step` taken again and again, with the same arithmetic arranged for speed: weights are turned and cast
-once, the prior's std is left out, and rows go through in blocks that stay in the cache. Where the processor multiplies
-bfloat16, a compiled call does all of it (`compiled`); elsewhere torch does, with what stands between the products fused
-(`library`). Where gradients are asked for nothing is written in place, so that plans can be refined by them.
+The result equals repeated calls of `Backend.step` up to rounding. Weights are transposed and cast once, the prior's std
+is not computed, and rows are processed in blocks that fit the cache. Processors with bfloat16 products run one compiled
+call (`compiled`); others run torch with compiled kernels for the elementwise parts (`library`). If gradients are
+required nothing is written in place.
 """
 
 from __future__ import annotations
@@ -15,19 +15,19 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from latentplan.models.dynamics import Rssm, State
-from latentplan.models.fast import compiled as fused
+from latentplan.models.fast import compiled
 from latentplan.models.fast.library import Norm, expectation, gates, norm_silu
 from latentplan.models.heads import Actor, Mlp, NormedLinear, ScalarHead, action_distribution
 
-ROWS_PER_THREAD = 1024  # what one step makes of more rows no longer fits a core's cache
-BIN_MULTIPLE = 16  # float32 products with another number of columns take half as long again
+ROWS_PER_THREAD = 1024  # results of one step for more rows do not fit a core's cache
+BIN_MULTIPLE = 16  # float32 products with other numbers of columns take 1.5 times as long
 
 
-Trunk = tuple[tuple[Tensor, Norm], ...]  # of an Mlp: a product and a norm for each hidden layer
+Trunk = tuple[tuple[Tensor, Norm], ...]  # of an Mlp: weight and norm of each hidden layer
 
 
 class Weights(NamedTuple):
-    """Recurrence, reward head and actor, laid out for products from the left: (in, out)."""
+    """Weights of dynamics, reward head and actor, transposed to (in, out)."""
 
     action: Tensor
     stoch: Tensor
@@ -45,26 +45,28 @@ class Weights(NamedTuple):
     actor: Trunk
     actor_output: Tensor
     actor_shift: Tensor
-    packed: fused.Packed | None = None
+    packed: compiled.Packed | None = None
 
 
 @torch.no_grad()
-def lay_out(dynamics: Rssm, head: ScalarHead, critic: ScalarHead, actor: Actor, dtype: torch.dtype) -> Weights:
-    """The weights of what imagines, products in `dtype`; gates' norm and the heads' outputs in float32.
+def convert_weights(dynamics: Rssm, head: ScalarHead, critic: ScalarHead, actor: Actor, dtype: torch.dtype) -> Weights:
+    """Converted weights, with products in `dtype`; the norm of the gates and the outputs of heads are float32.
 
     Args:
-        dynamics: What rollouts follow.
-        head: Of the reward.
+        dynamics: The dynamics of the rollouts.
+        head: The reward head.
         critic: The value head, with the same bins.
-        actor: What proposes.
-        dtype: Of the products.
+        actor: The actor that proposes sequences.
+        dtype: Precision of the products.
     """
 
     def turn(weight: Tensor) -> Tensor:
         return weight.to(dtype).t().contiguous()
 
     def norm(layer: nn.LayerNorm) -> Norm:
-        kind = torch.float32 if layer.weight.device.type == "cpu" else dtype  # only there the two may differ
+        kind = (
+            torch.float32 if layer.weight.device.type == "cpu" else dtype
+        )  # on other devices product and norm must have the same dtype
         return layer.weight.to(kind), layer.bias.to(kind)
 
     def trunk(mlp: Mlp) -> Trunk:
@@ -95,19 +97,19 @@ def lay_out(dynamics: Rssm, head: ScalarHead, critic: ScalarHead, actor: Actor, 
         actor_output=actor.mlp.output.weight.t().contiguous(),
         actor_shift=actor.mlp.output.bias.clone(),
     )
-    return weights._replace(packed=fused.pack(weights, (trunk(critic.mlp), *logits(critic))))
+    return weights._replace(packed=compiled.pack(weights, (trunk(critic.mlp), *logits(critic))))
 
 
 def imagine(weights: Weights, state: State, actions: Tensor) -> tuple[Tensor, State]:
     """Rewards float32 (rows, time) along sequences, and the last state, float32.
 
     Args:
-        weights: What `lay_out` gave.
-        state: Where every sequence starts, (rows, ...).
-        actions: In [-1, 1], (rows, time, action).
+        weights: Converted weights from `convert_weights`.
+        state: Start of every sequence, (rows, ...).
+        actions: Actions in [-1, 1], (rows, time, action).
     """
-    if weights.packed is not None and not asks_for_gradients(*state, actions):
-        rewards, *last = fused.rollout(weights.packed, *state, actions)
+    if weights.packed is not None and not requires_gradients(*state, actions):
+        rewards, *last = compiled.rollout(weights.packed, *state, actions)
         return rewards, State(*last)
     block = ROWS_PER_THREAD * torch.get_num_threads() if actions.device.type == "cpu" else len(actions)
     with torch.autocast(actions.device.type, enabled=False):
@@ -117,16 +119,16 @@ def imagine(weights: Weights, state: State, actions: Tensor) -> tuple[Tensor, St
     return rewards, State(deters, stochs)
 
 
-def follow_actor(weights: Weights, state: State, noise: Tensor) -> Tensor:
-    """The actions that the actor takes along the mean of the prior, float32 (rows, time, action).
+def propose(weights: Weights, state: State, noise: Tensor) -> Tensor:
+    """Actions of the actor along the mean of the prior, float32 (rows, time, action).
 
     Args:
-        weights: What `lay_out` gave.
-        state: Where every sequence starts, (rows, ...).
+        weights: Converted weights from `convert_weights`.
+        state: Start of every sequence, (rows, ...).
         noise: Standard normal draws for its samples, zeros for its mode, (rows, time, action).
     """
-    if weights.packed is not None and not asks_for_gradients(*state, noise):
-        return fused.follow(weights.packed, *state, noise)
+    if weights.packed is not None and not requires_gradients(*state, noise):
+        return compiled.propose(weights.packed, *state, noise)
     deter, stoch = state.deter.float(), state.stoch.to(weights.gates.dtype)
     rounded, actions = deter.to(stoch.dtype), []
     with torch.autocast(noise.device.type, enabled=False):
@@ -141,51 +143,51 @@ def follow_actor(weights: Weights, state: State, noise: Tensor) -> Tensor:
     return torch.stack(actions, 1)
 
 
-def asks_for_gradients(*tensors: Tensor) -> bool:
-    """Whether what is computed from these tensors would record how."""
+def requires_gradients(*tensors: Tensor) -> bool:
+    """Whether autograd would record a computation from these tensors."""
     return torch.is_grad_enabled() and any(tensor.requires_grad for tensor in tensors)
 
 
 def _imagine_block(weights: Weights, deter: Tensor, stoch: Tensor, actions: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     dtype = weights.gates.dtype
-    # Few rows take the reward head many steps at a time: one product of a thousand rows costs two of a hundred.
+    # For few rows the reward head reads many steps at once: a product of 1000 rows costs as much as two of 100.
     steps_at_once = max(1, ROWS_PER_THREAD * torch.get_num_threads() // len(actions))
     pushes = actions.transpose(0, 1).to(dtype).contiguous() @ weights.action  # (time, rows, hidden)
     deter, rounded, stoch = deter.float(), deter.to(dtype), stoch.to(dtype)
-    seen, rewards = [], []
+    features, rewards = [], []
     for push in pushes:
         deter, rounded, stoch = _step(weights, deter, rounded, stoch, push)
-        seen.append(torch.cat([rounded, stoch], -1))
-        if len(seen) == steps_at_once:
-            rewards.append(_rewards(weights, seen))
-            seen = []
-    if seen:
-        rewards.append(_rewards(weights, seen))
+        features.append(torch.cat([rounded, stoch], -1))
+        if len(features) == steps_at_once:
+            rewards.append(_rewards(weights, features))
+            features = []
+    if features:
+        rewards.append(_rewards(weights, features))
     return torch.cat(rewards, 1), deter, stoch.float()
 
 
 def _step(
     weights: Weights, deter: Tensor, rounded: Tensor, stoch: Tensor, push: Tensor
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """The next deter, the same rounded to the products' dtype, and the mean of the prior there."""
+    """The next deter, its copy in the products' dtype, and the mean of the prior."""
     deter, rounded = _advance(weights, deter, rounded, stoch, push)
     hidden = _layer(rounded, weights.prior, weights.prior_norm)
     return deter, rounded, torch.addmm(weights.mean_shift, hidden, weights.mean)
 
 
 def _advance(weights: Weights, deter: Tensor, rounded: Tensor, stoch: Tensor, push: Tensor) -> tuple[Tensor, Tensor]:
-    """The next deter (rows, deter), float32 and rounded; `push` (rows, hidden) is the action's share of the input."""
+    """The next deter in float32 and in the products' dtype; `push` (rows, hidden) is the product of the action."""
     hidden = norm_silu(torch.addmm(push, stoch, weights.stoch), weights.input_norm)
     return gates(torch.cat([hidden, rounded], -1) @ weights.gates, weights.gates_norm, deter)
 
 
-def _rewards(weights: Weights, seen: list[Tensor]) -> Tensor:
-    """The reward at each of the features (rows, feature) seen: (rows, len(seen))."""
-    features = torch.cat(seen)
+def _rewards(weights: Weights, per_step: list[Tensor]) -> Tensor:
+    """Rewards (rows, step) at the features of some steps, (rows, feature) each."""
+    features = torch.cat(per_step)
     for weight, norm in weights.head:
         features = _layer(features, weight, norm)
     logits = torch.addmm(weights.logits_shift, features.float(), weights.logits)
-    return expectation(logits, weights.values).unflatten(0, (len(seen), -1)).t()
+    return expectation(logits, weights.values).unflatten(0, (len(per_step), -1)).t()
 
 
 def _layer(features: Tensor, weight: Tensor, norm: Norm) -> Tensor:

@@ -1,4 +1,4 @@
-// What is done to single rows between the matrix products, in float32, for the compiler to make vectors of.
+// Elementwise work on single rows in float32, in loops that the compiler can vectorize.
 
 #ifndef LATENTPLAN_ROWS_H
 #define LATENTPLAN_ROWS_H
@@ -52,7 +52,7 @@ static inline float exponential(float x) {
 static inline float sigmoid(float x) { return 1.0f / (1.0f + exponential(-x)); }
 static inline float hyperbolic_tangent(float x) { return 2.0f * sigmoid(2.0f * x) - 1.0f; }
 
-// A layer norm of one row: its mean, and what its deviations are multiplied with to have a variance of 1.
+// A layer norm of one row: the mean, and the factor that scales deviations to a variance of 1.
 typedef struct {
     const float *row, *scale, *shift;
     float mean, factor;
@@ -72,7 +72,7 @@ static inline float normed(const Norm *norm, long i) {
 
 static inline float silu(float x) { return x * sigmoid(x); }
 
-// The next state of unit i of the recurrence: reset, candidate and update lie side by side in the row.
+// The next state of unit i of the GRU; the row holds reset, candidate and update gates side by side.
 static inline float gated(const Norm *norm, long i, long size, float before) {
     float reset = sigmoid(normed(norm, i));
     float candidate = hyperbolic_tangent(reset * normed(norm, size + i));

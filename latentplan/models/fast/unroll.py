@@ -1,8 +1,8 @@
-"""The recurrence over whole sequences, with its gradient written out, for devices where a launch is what a step costs.
+"""The GRU over whole sequences with written-out gradients, for GPUs, where the number of kernels sets the time.
 
-Autograd runs a kernel for every elementary function of every step, forwards and backwards, and adds up the gradient of
-each weight step by step. Here what lies between two matrix products is one function (`pointwise`), and the gradients
-of weights are taken once, over all steps together: two fifths of the kernels, for a whole update.
+Autograd runs a kernel for every elementary function of every step, forwards and backwards, and accumulates the gradient
+of each weight step by step. Here the work between two matrix products is one function (`pointwise`), and the gradients
+of weights are computed once over all steps. A whole update then needs two fifths of the kernels.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ Parts = Sequence[Tensor | None]
 
 
 class Weights(NamedTuple):
-    """Parameters of a step: what advances the deterministic state, and what reads the latent off it."""
+    """Parameters of a step: of the GRU, and of the layers from deter to the latent (prior or posterior)."""
 
     input: Tensor
     input_scale: Tensor
@@ -41,40 +41,31 @@ class Weights(NamedTuple):
     output_bias: Tensor
 
 
-def pays(tensor: Tensor) -> bool:
-    """Whether this is faster than autograd where a tensor lives. On a CPU it takes as long."""
-    return tensor.is_cuda
-
-
 def observe(
     dynamics: Rssm, embeddings: Tensor, actions: Tensor, deter: Tensor, noise: Tensor
 ) -> tuple[State, Gaussian]:
-    """`Rssm.observe`, as it pays; gradients reach the weights and the embeddings."""
-    if not pays(noise):
-        return dynamics.observe(embeddings, actions, deter, noise)
+    """`Rssm.observe`; gradients reach the weights and the embeddings."""
     deter, *latent = _Unrolled.apply(embeddings, actions, deter, None, noise, *_weights(dynamics, prior=False))
     return State(deter, latent[0]), Gaussian(*latent[1:])
 
 
-def follow(dynamics: Rssm, start: State, actions: Tensor) -> tuple[Tensor, Gaussian]:
-    """`Rssm.follow`, as it pays; here gradients reach the weights alone."""
-    if not pays(actions):
-        return dynamics.follow(start, actions)
+def predict(dynamics: Rssm, start: State, actions: Tensor) -> tuple[Tensor, Gaussian]:
+    """`Rssm.predict`; gradients reach the weights alone."""
     deter, _, *prior = _Unrolled.apply(None, actions, start.deter, start.stoch, None, *_weights(dynamics, prior=True))
     return deter, Gaussian(*prior)
 
 
-def dream(
+def imagine(
     dynamics: Rssm, actor: Actor, start: State, action_noise: Tensor, noise: Tensor, decay: float
 ) -> tuple[Tensor, Tensor]:
-    """Follow samples of an actor and of the prior; gradients reach the actor, along the dynamics.
+    """`Dynamics.imagine` with an actor as the policy; gradients reach the actor through the dynamics.
 
     Args:
-        dynamics: What predicts; its weights get no gradient.
-        actor: Reads its states without a gradient.
+        dynamics: The dynamics; their weights get no gradient.
+        actor: The policy; it reads its states without a gradient.
         start: States, (rows, ...) each, without a gradient.
-        action_noise: Standard normal, (horizon, rows, action).
-        noise: The same for the latent, (horizon, rows, latent).
+        action_noise: Standard normal draws for the actions, (horizon, rows, action).
+        noise: Standard normal draws for the latents, (horizon, rows, latent).
         decay: Share of a state's gradient that a step passes back to the state before.
 
     Returns:
@@ -83,15 +74,15 @@ def dream(
     steps, deter, stoch, features = _Steps(_weights(dynamics, prior=True)), *start, [start.features]
     with torch.no_grad():
         for action_draws, draws in zip(action_noise.unbind(), noise.unbind(), strict=True):
-            joined = run(pointwise.acted, _outputs(actor.mlp, features[-1]), action_draws, stoch)
+            joined = run(pointwise.append_action, _outputs(actor.mlp, features[-1]), action_draws, stoch)
             deter = steps.advance(joined, deter)
-            stoch, seen = run(pointwise.felt, steps.read(deter, None), draws, deter)
+            stoch, seen = run(pointwise.sample_features, steps.read(deter, None), draws, deter)
             features.append(seen)
         stacked = torch.stack(features)
-    # The actor's own gradient is no recurrence: it is asked once more, about all states at once.
+    # The actor's own gradient needs no recurrence: the actor runs once more, on all states at once.
     mean, std = actor(stacked[:-1])
     actions = sample_action(mean, std, action_noise)
-    return _Dreamt.apply(actions, stacked, steps, noise, decay), std
+    return _Imagined.apply(actions, stacked, steps, noise, decay), std
 
 
 def _outputs(mlp: Mlp, features: Tensor) -> Tensor:
@@ -111,35 +102,35 @@ def _weights(dynamics: Rssm, *, prior: bool) -> Weights:
 
 
 class _Steps:
-    """What each step computed, by the place where it did."""
+    """Intermediate results of each step, kept for the gradients."""
 
     def __init__(self, weights: Weights) -> None:
         self.weights = weights
-        self.joined: list[Tensor] = []  # latent and action
-        self.first: list[Tensor] = []  # its product with `input`
-        self.beside: list[Tensor] = []  # what became of that, and deter
-        self.gates: list[Tensor] = []  # the product with `gates`
-        self.before: list[Tensor] = []  # deter
-        self.after: list[Tensor] = []
-        self.second: list[Tensor] = []  # its product with `hidden`
-        self.hidden: list[Tensor] = []
-        self.raw: list[Tensor] = []
+        self.joined: list[Tensor] = []  # latent and action, concatenated
+        self.first: list[Tensor] = []  # product of `joined` with the input weights
+        self.beside: list[Tensor] = []  # hidden layer of the input, concatenated with deter
+        self.gates: list[Tensor] = []  # product of `beside` with the weights of the gates
+        self.before: list[Tensor] = []  # deter before the step
+        self.after: list[Tensor] = []  # deter after the step
+        self.second: list[Tensor] = []  # product of `after` with the hidden weights
+        self.hidden: list[Tensor] = []  # hidden layer between deter and latent
+        self.raw: list[Tensor] = []  # raw mean and std of the latent
 
     def advance(self, joined: Tensor, deter: Tensor) -> Tensor:
-        """The next deter, after latent and action side by side."""
+        """The next deter, for latent and action concatenated."""
         weights = self.weights
         first = joined @ weights.input.T
-        beside = run(pointwise.norm_silu_beside, first, weights.input_scale, weights.input_shift, deter)
+        beside = run(pointwise.norm_silu_with_deter, first, weights.input_scale, weights.input_shift, deter)
         gates = beside @ weights.gates.T
         self.joined.append(joined)
         self.first.append(first)
         self.beside.append(beside)
         self.gates.append(gates)
         self.before.append(deter)
-        return run(pointwise.gated, gates, weights.gates_scale, weights.gates_shift, deter)
+        return run(pointwise.update_deter, gates, weights.gates_scale, weights.gates_shift, deter)
 
     def read(self, deter: Tensor, embedding: Tensor | None) -> Tensor:
-        """Mean and std of the latent at a deter, before they are made what they are."""
+        """Raw mean and std of the latent at a deter, (rows, 2 latent), before `gaussian`."""
         weights = self.weights
         second = deter @ weights.hidden.T if embedding is None else torch.addmm(embedding, deter, weights.hidden.T)
         hidden = run(pointwise.norm_silu, second, weights.hidden_scale, weights.hidden_shift)
@@ -151,22 +142,25 @@ class _Steps:
 
 
 class _Gradients:
-    """The way back through steps, from the last one on; gradients in the order in which they come."""
+    """The backward pass through the steps, from the last to the first."""
 
     def __init__(self, steps: _Steps, noise: Parts, decay: float = 1.0) -> None:
         self.steps, self.noise, self.decay = steps, noise, decay
-        self.later: tuple[Tensor, Tensor] | tuple[None, None] = (None, None)  # what the step after asks of deter
+        self.later: tuple[Tensor, Tensor] | tuple[None, None] = (
+            None,
+            None,
+        )  # gradients of deter through the following step
         self.joined: list[Tensor] = []
-        self.first: list[tuple[Tensor, Tensor]] = []  # of the product, and of what its norm was scaled and shifted to
+        self.first: list[tuple[Tensor, Tensor]] = []  # of the product, and of the scaled norm
         self.gates: list[tuple[Tensor, Tensor]] = []
         self.second: list[tuple[Tensor, Tensor]] = []
         self.raw: list[Tensor] = []
 
     def read(self, time: int, stoch: Tensor | None, mean: Tensor | None, std: Tensor | None) -> Tensor:
-        """Through the latent of a step to its deter; what others ask of stoch, mean and std."""
+        """The gradient of a step's deter through its latent, given outer gradients of stoch, mean and std."""
         steps, weights = self.steps, self.steps.weights
         joined = self.joined[-1] if self.joined else None
-        raw = run(pointwise.drawn_back, steps.raw[time], self.noise[time], stoch, mean, std, joined, self.decay)
+        raw = run(pointwise.sample_latent_back, steps.raw[time], self.noise[time], stoch, mean, std, joined, self.decay)
         second = run(
             pointwise.norm_silu_back,
             raw @ weights.output,
@@ -179,10 +173,10 @@ class _Gradients:
         return second[0] @ weights.hidden
 
     def advance(self, index: int, by_latent: Tensor, deter: Tensor | None) -> None:
-        """Through a step's deter, of which its latent asks `by_latent` and others `deter`, to state and action."""
+        """Backward through a step's GRU, given gradients of its deter through its latent and through other readers."""
         steps, weights = self.steps, self.steps.weights
         gates, normed, directly = run(
-            pointwise.gated_back,
+            pointwise.update_deter_back,
             by_latent,
             deter,
             *self.later,
@@ -200,7 +194,7 @@ class _Gradients:
         self.joined.append(first[0] @ weights.input)
 
     def of_weights(self) -> tuple[Tensor, ...]:
-        """Of all parameters, in their order: over all steps at once."""
+        """Gradients of all parameters, in the order of `Weights`, over all steps at once."""
         steps = self.steps
         return (
             *_through_norm(self.first, steps.joined, steps.first),
@@ -222,7 +216,7 @@ def _through_norm(
 class _Unrolled(torch.autograd.Function):
     """deter, stoch, mean and std of each step, (rows, time, ...) each.
 
-    With embeddings the first step only looks; without them it acts, from deter and stoch.
+    With embeddings the first step only reads its frame; without them it begins with an action, from deter and stoch.
     """
 
     @staticmethod
@@ -235,18 +229,18 @@ class _Unrolled(torch.autograd.Function):
         noise: Tensor | None,
         *parameters: Tensor,
     ) -> tuple[Tensor, ...]:
-        steps, looks = _Steps(Weights(*parameters)), embeddings is not None
-        length = actions.shape[1] + looks
+        steps, has_frames = _Steps(Weights(*parameters)), embeddings is not None
+        length = actions.shape[1] + has_frames
         seen, draws = _slices(embeddings, length), _slices(noise, length)
-        acts = [*actions.unbind(1), None][1 - looks :]
+        acts = [*actions.unbind(1), None][1 - has_frames :]
         joined = None if stoch is None else torch.cat([stoch, actions[:, 0]], -1)
         read = []
         for time in range(length):
             if joined is not None:
                 deter = steps.advance(joined, deter)
-            *latent, joined = run(pointwise.drawn, steps.read(deter, seen[time]), draws[time], acts[time])
+            *latent, joined = run(pointwise.sample_latent, steps.read(deter, seen[time]), draws[time], acts[time])
             read.append(latent)
-        ctx.steps, ctx.draws, ctx.looks = steps, draws, looks
+        ctx.steps, ctx.draws, ctx.has_frames = steps, draws, has_frames
         ctx.set_materialize_grads(False)
         return torch.stack(steps.after, 1), *(torch.stack(part, 1) for part in zip(*read, strict=True))
 
@@ -257,14 +251,14 @@ class _Unrolled(torch.autograd.Function):
         of_deter, *of_latent = (_slices(part, length) for part in outer)
         for time in reversed(range(length)):
             by_latent = gradients.read(time, *(part[time] for part in of_latent))
-            if time >= ctx.looks:
-                gradients.advance(time - ctx.looks, by_latent, of_deter[time])
-        seen = torch.stack([product for product, _ in gradients.second[::-1]], 1) if ctx.looks else None
+            if time >= ctx.has_frames:
+                gradients.advance(time - ctx.has_frames, by_latent, of_deter[time])
+        seen = torch.stack([product for product, _ in gradients.second[::-1]], 1) if ctx.has_frames else None
         return (seen, None, None, None, None, *gradients.of_weights())
 
 
-class _Dreamt(torch.autograd.Function):
-    """The features that were dreamt (horizon + 1, rows, feature), as what they are of actions (horizon, rows, ...)."""
+class _Imagined(torch.autograd.Function):
+    """Imagined features (horizon + 1, rows, feature) as a function of the actions (horizon, rows, action)."""
 
     @staticmethod
     def forward(ctx: Any, actions: Tensor, features: Tensor, steps: _Steps, noise: Tensor, decay: float) -> Tensor:

@@ -1,5 +1,5 @@
-// What is done to single rows between the products of imagine.c, sixteen numbers at a time. Lengths are multiples of 16.
-// Reciprocals are good to 14 bits, which is more than the 8 that the next product reads.
+// Elementwise work on single rows for imagine.c, with vectors of sixteen floats. Lengths are multiples of 16.
+// Reciprocals have a precision of 14 bits; the next product reads 8.
 
 #ifndef LATENTPLAN_VECTORS_H
 #define LATENTPLAN_VECTORS_H
@@ -25,8 +25,8 @@ static inline __m512 wide_normed(const WideNorm *norm, long i) {
     return _mm512_fmadd_ps(centred, _mm512_loadu_ps(norm->scale + i), _mm512_loadu_ps(norm->shift + i));
 }
 
-// 2^x = 2^n 2^f with |f| <= 1/2; the polynomial is Taylor's of degree 5, relative error 3e-6. Where x is infinite f is NaN,
-// which scaling by an infinity turns into what is right.
+// 2^x = 2^n 2^f with |f| <= 1/2; the polynomial is Taylor's of degree 5, relative error 3e-6. For infinite x the
+// fraction f is NaN, and scaling by infinity gives the right limit.
 static inline __m512 power_of_two(__m512 x) {
     __m512 n = _mm512_roundscale_ps(x, _MM_FROUND_TO_NEAREST_INT | _MM_FROUND_NO_EXC), f = _mm512_sub_ps(x, n);
     __m512 p = _mm512_set1_ps(1.33335581e-3f);
@@ -64,7 +64,7 @@ static inline void silu_row(bfloat16 *to, const float *row, const float *scale, 
     }
 }
 
-// The next state of the recurrence, and the same rounded; a row is reset, candidate and update, side by side.
+// The next state of the GRU, and its bfloat16 copy; a row holds reset, candidate and update gates.
 static inline void gate_row(float *deter, bfloat16 *rounded, const float *row, const float *scale, const float *shift,
                             long size) {
     WideNorm norm = wide_norm_of(row, scale, shift, 3 * size);

@@ -1,1 +1,1 @@
-"""How experience is gathered, in this process or beside it."""
+"""Collection of experience, in the learner's process or in another one."""

@@ -1,4 +1,4 @@
-"""Gathering experience: agents act in environments and hand over the rows for replay."""
+"""Collection of experience: agents act in environments, and every frame becomes a row of replay."""
 
 from __future__ import annotations
 
@@ -15,13 +15,15 @@ import torch
 
 from latentplan.agents.actor import ActorAgent
 from latentplan.agents.base import ModelAgent
+from latentplan.agents.modes import make_agent
 from latentplan.agents.planning import PlanningAgent
 from latentplan.agents.random import RandomAgent
 from latentplan.config import Config, derive_seed
 from latentplan.envs import make_env, make_from, make_vector_env, render_info
 from latentplan.evaluation.episodes import episode_seed, run_episodes
 from latentplan.models import WorldModel
-from latentplan.models.symmetry import unturned
+from latentplan.models.fast import accelerate
+from latentplan.models.symmetry import first_turn
 from latentplan.replay.buffer import Rows
 from latentplan.reporting.film import filming_if_possible
 from latentplan.training.collection.rewards import RewardCheck
@@ -38,10 +40,10 @@ class Collected:
     """One round of experience.
 
     Attributes:
-        rows: What each environment saw, in order, one entry per lane.
-        env_frames: Simulator control steps taken.
-        decisions: Actions chosen.
-        episode_returns: Of the episodes that ended in this round.
+        rows: Rows of each environment in the order of time, one entry per lane of the replay.
+        env_frames: Simulator control steps taken in this round.
+        decisions: Actions chosen in this round, over all environments.
+        episode_returns: Returns of the episodes that ended in this round.
     """
 
     rows: list[Rows]
@@ -52,14 +54,14 @@ class Collected:
 
 @dataclass(frozen=True)
 class Description:
-    """What the learner has to know of the environment.
+    """Facts of the environment that the learner needs.
 
     Attributes:
         action_dim: Size of the action.
-        discount: Per decision.
+        discount: Discount per decision.
         render_ms: Milliseconds per rendered frame.
-        renderer: What draws it.
-        labels: Quantities that it tells with each frame, and the typical size of each.
+        renderer: Name and settings of the renderer.
+        labels: Quantities that the environment reports with each frame, and the typical size of each.
     """
 
     action_dim: int
@@ -70,12 +72,15 @@ class Description:
 
 
 class Collector:
-    """Acts in `config.env.num_envs` environments, and evaluates in one of its own.
+    """Acts in `config.env.num_envs` environments to collect experience, and in one more to evaluate.
 
     Args:
         config: Settings of the run.
-        make_user_env: The user's factory, or None for the suite.
-        device: Where the acting model lives.
+        make_user_env: Makes the user's own environment; None makes the suite's task.
+        device: Device of the acting model.
+
+    Raises:
+        UserError: The environment cannot be made, or a goal in `config.collection.goals` cannot be pursued.
     """
 
     def __init__(self, config: Config, make_user_env: EnvFactory | None, device: str) -> None:
@@ -90,25 +95,18 @@ class Collector:
         self._decisions: int | None = getattr(self._eval_env.unwrapped, "decisions_per_episode", None)
         self.discount = discount = config.learning.discount or _discount_for(self._decisions)
         self.labels: dict[str, float] = getattr(self._eval_env.unwrapped, "labels", {})
-        self.model = WorldModel(config.model, action_dim, self.labels).to(device)
+        self.model = accelerate(WorldModel(config.model, action_dim, self.labels).to(device))
         noise, correlation = config.collection.noise_std, config.collection.noise_correlation
-        planners = {
-            (who, noisy): PlanningAgent(
-                self.model, config, discount, noise_std=noise if noisy else 0.0, noise_correlation=correlation
-            )
-            for who in ("planner", "goal")
-            for noisy in (True, False)
-        }
+        planner, for_goals = (
+            PlanningAgent(self.model, config, discount, noise_std=noise, noise_correlation=correlation)
+            for _ in range(2)
+        )
         for goal in config.collection.goals:
-            planners["goal", True].set_objective(goal)  # to be refused now, if at all
-        self._agents: dict[tuple[str, bool], ModelAgent] = {
-            **planners,
-            ("actor", True): ActorAgent(self.model, config, explore=True, noise_correlation=correlation),
-            ("actor", False): ActorAgent(self.model, config),
-        }
-        self._judged: dict[str, ModelAgent] = {
-            "planner": PlanningAgent(self.model, config, discount),
-            "actor": ActorAgent(self.model, config),
+            for_goals.set_objective(goal)  # an expression that cannot be pursued is refused before the run starts
+        actor = ActorAgent(self.model, config, explore=True, noise_correlation=correlation)
+        self._agents: dict[str, ModelAgent] = {"planner": planner, "actor": actor, "goal": for_goals}
+        self._evaluated: dict[str, Any] = {
+            mode: make_agent(mode, self.model, config, discount) for mode in ("planner", "actor")
         }
         self._random = RandomAgent(action_dim)
         self._frames: np.ndarray | None = None
@@ -119,7 +117,7 @@ class Collector:
         self._acting: object = None
 
     def describe(self) -> Description:
-        """What the learner has to know of the environment."""
+        """Facts of the environment that the learner needs; renders a few frames to time them."""
         self._eval_env.reset(seed=0)
         started = time.perf_counter()
         for _ in range(TIMED_FRAMES):
@@ -135,20 +133,21 @@ class Collector:
         behaviour: str,
         decisions: int,
         counter: int,
-        noisy: bool = True,
         goal: str | None = None,
     ) -> Collected:
-        """Take `decisions` decisions in all, with new weights; continues the episodes of the last round.
+        """Collects one round of experience, continuing the episodes of the round before.
 
         Args:
             weights: State of the world model; None acts at random.
-            behaviour: `planner` or `actor`.
-            decisions: Rounded up to a multiple of the number of environments.
-            counter: Number of the round, from which its random stream derives.
-            noisy: Whether it explores, or acts as it is evaluated.
-            goal: What the planner pursues in place of the reward; its plans are not kept for the actor to imitate.
+            behaviour: "planner" or "actor".
+            decisions: Decisions over all environments, rounded up to a multiple of their number.
+            counter: Number of the round; its random streams derive from this number.
+            goal: Expression that the planner pursues instead of the reward; None pursues the reward.
+
+        Raises:
+            UserError: The environment returned a reward that is not finite.
         """
-        agent = self._random if weights is None else self._agents[behaviour if goal is None else "goal", noisy]
+        agent = self._random if weights is None else self._agents[behaviour if goal is None else "goal"]
         if weights is not None:
             self._load(weights)
         if isinstance(agent, PlanningAgent) and goal is not None:
@@ -171,19 +170,22 @@ class Collector:
         weights: dict[str, np.ndarray] | None = None,
         actor: bool = True,
     ) -> dict[str, list[float]]:
-        """Returns of planner and actor on the same starts, without exploration.
+        """Returns of planner and actor, without exploration, in episodes that start alike.
 
         Args:
-            episodes: Episodes of each.
-            film: Where the planner's first episode is filmed, if anywhere; where that fails there is a warning.
-            weights: State of the world model; None keeps that of the last round.
-            actor: Whether the actor plays too; without, only the planner's returns are given.
+            episodes: Episodes of each agent.
+            film: Path for a film of the planner's first episode; a film that cannot be written gives a warning.
+            weights: State of the world model; None keeps the weights of the last round.
+            actor: Whether the actor plays too.
+
+        Returns:
+            One return per episode, under "planner" and, if it played, "actor".
         """
         if weights is not None:
             self._load(weights)
         stream = derive_seed(self.config.run.seed, "evaluation")
         seeds = [episode_seed(stream, index) for index in range(episodes)]
-        planner = self._judged["planner"]
+        planner = self._evaluated["planner"]
         with contextlib.ExitStack() as stack:
             on_step = None
             if film is not None:
@@ -191,12 +193,12 @@ class Collector:
                 on_step = stack.enter_context(filming_if_possible(film, self._eval_env, planner, every=every))
             played = {"planner": run_episodes(self._eval_env, planner, seeds, on_step=on_step)}
         if actor:
-            played["actor"] = run_episodes(self._eval_env, self._judged["actor"], seeds)
+            played["actor"] = run_episodes(self._eval_env, self._evaluated["actor"], seeds)
         return {mode: [episode.total_return for episode in rollouts] for mode, rollouts in played.items()}
 
     def close(self) -> None:
-        """Free simulators and processes."""
-        self.envs.close(timeout=CLOSING_SECONDS)  # without, a step that failed is waited for again, for ever
+        """Ends simulators and their processes."""
+        self.envs.close(timeout=CLOSING_SECONDS)  # without a timeout, close waits forever for a step that failed
         self._eval_env.close()
 
     def _load(self, weights: dict[str, np.ndarray]) -> None:
@@ -219,35 +221,31 @@ class Collector:
         frames, labels, first = self._frames.copy(), self._labels.copy(), self._ended.copy()
         actions = agent.act(frames)
         state = agent.state if isinstance(agent, ModelAgent) else None
-        deter = None if state is None else unturned(state).deter.float().cpu().numpy()
-        plan = None
-        if isinstance(agent, PlanningAgent) and agent.controller.objective is None:
-            plan = agent.planned_action()
+        deter = None if state is None else first_turn(state).deter.float().cpu().numpy()
         self._frames, rewards, terminated, truncated, info = self.envs.step(actions)
         self._check(rewards, first)
         self._ended = terminated | truncated
         self._returns += rewards
         if self.labels:
             self._labels = np.array(info["labels"], np.float32)
-        log.append(frames, deter, actions, rewards, ~terminated, first, labels, np.asarray(info["env_frames"]), plan)
+        log.append(frames, deter, actions, rewards, ~terminated, first, labels, np.asarray(info["env_frames"]))
         for lane in np.flatnonzero(self._ended):
-            frame, row = self._frames[lane].copy(), self._labels[lane].copy()  # both are written over by a restart
+            frame, row = self._frames[lane].copy(), self._labels[lane].copy()  # the restart overwrites both
             log.finish(int(lane), frame, row, float(self._returns[lane]))
 
 
 def _discount_for(decisions: int | None) -> float:
-    """A horizon of a fifth of an episode: 0.96 at 125 decisions, 0.99 at 500."""
+    """Discount whose horizon is a fifth of an episode: 0.96 at 125 decisions, 0.99 at 500."""
     return 1.0 - 5.0 / min(max(decisions or 500, 50), 1000)
 
 
 class _Log:
-    """Rows of every lane while a round lasts."""
+    """Rows of every lane, gathered step by step during one round."""
 
     def __init__(self, lanes: int, action_dim: int, deter_dim: int) -> None:
         self._lanes: list[list[tuple[Any, ...]]] = [[] for _ in range(lanes)]
         self._no_deter = np.zeros((lanes, deter_dim), np.float32)
         self._no_action = np.zeros(action_dim, np.float32)
-        self._no_plan = np.zeros((lanes, 2 * action_dim), np.float32)
         self.returns: list[float] = []
         self.env_frames = 0
 
@@ -261,19 +259,15 @@ class _Log:
         first: np.ndarray,
         labels: np.ndarray,
         env_frames: np.ndarray,
-        plan: np.ndarray | None,
     ) -> None:
         beliefs = self._no_deter if deter is None else deter
-        plans = self._no_plan if plan is None else plan
         for lane, entries in enumerate(self._lanes):
-            row = (frames, beliefs, actions, rewards, continues.astype(np.float32), first, labels, plans)
+            row = (frames, beliefs, actions, rewards, continues.astype(np.float32), first, labels)
             entries.append(tuple(part[lane] for part in row))
         self.env_frames += int(env_frames.sum())
 
     def finish(self, lane: int, frame: np.ndarray, labels: np.ndarray, total_return: float) -> None:
-        self._lanes[lane].append(
-            (frame, self._no_deter[lane], self._no_action, 0.0, 1.0, False, labels, self._no_plan[lane])
-        )
+        self._lanes[lane].append((frame, self._no_deter[lane], self._no_action, 0.0, 1.0, False, labels))
         self.returns.append(total_return)
 
     def rows(self) -> list[Rows]:
@@ -281,7 +275,7 @@ class _Log:
 
 
 def _stack(entries: list[tuple[Any, ...]]) -> Rows:
-    frames, deter, actions, rewards, continues, is_first, labels, plan = zip(*entries, strict=True)
+    frames, deter, actions, rewards, continues, is_first, labels = zip(*entries, strict=True)
     return Rows(
         frames=np.stack(frames),
         deter=np.stack(deter),
@@ -290,5 +284,4 @@ def _stack(entries: list[tuple[Any, ...]]) -> Rows:
         continues=np.asarray(continues, np.float32),
         is_first=np.asarray(is_first, bool),
         labels=np.stack(labels),
-        plan=np.stack(plan),
     )

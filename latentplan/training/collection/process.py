@@ -1,4 +1,4 @@
-"""Where collection runs: in this process, or in another beside the learner."""
+"""Workers: run a `Collector` in this process, or in another process beside the learner."""
 
 from __future__ import annotations
 
@@ -20,57 +20,69 @@ from latentplan.training.resources import collector_threads
 
 
 class LocalWorker:
-    """Calls methods of a `Collector` at once, in this process."""
+    """Calls methods of a `Collector` in this process; `submit` returns when the method is done.
+
+    Args:
+        config: Settings of the run.
+        make_user_env: Makes the user's own environment; None makes the suite's task.
+        device: Device of the acting model.
+    """
 
     def __init__(self, config: Config, make_user_env: EnvFactory | None, device: str) -> None:
         self._collector = Collector(config, make_user_env, device)
         self._results: list[Any] = []
 
     def submit(self, method: str, *arguments: Any) -> None:
-        """Run a method; its result waits for `result`."""
+        """Run a method of the collector, and keep its result for `result`."""
         self._results.append(getattr(self._collector, method)(*arguments))
 
     def result(self) -> Any:
-        """The oldest result not yet taken."""
+        """The oldest result that was not returned before."""
         return self._results.pop(0)
 
     def close(self) -> None:
-        """Free simulators."""
+        """Ends the simulators."""
         self._collector.close()
 
 
 class RemoteWorker:
-    """Calls methods of a `Collector` in a spawned process, on the CPU, while the caller goes on."""
+    """Calls methods of a `Collector` in a spawned process, on the CPU; `submit` returns at once.
+
+    Args:
+        config: Settings of the run.
+        make_user_env: Makes the user's own environment; None makes the suite's task.
+        threads: CPU threads of the process.
+    """
 
     def __init__(self, config: Config, make_user_env: EnvFactory | None, threads: int = 1) -> None:
         context = multiprocessing.get_context("spawn")
-        self._connection, theirs = context.Pipe()
-        arguments = (theirs, make_user_env and CloudpickleWrapper(make_user_env), config, threads)
+        self._connection, child_end = context.Pipe()
+        arguments = (child_end, make_user_env and CloudpickleWrapper(make_user_env), config, threads)
         self._process = context.Process(target=_serve, args=arguments, daemon=config.env.num_envs == 1)
         with single_threaded_children():
             self._process.start()
-        theirs.close()
-        # A thread waits on the pipe, so that neither side ever blocks on the other's full buffer.
+        child_end.close()
+        # A thread waits on the pipe, so that neither process blocks while the buffer of the other is full.
         self._caller = ThreadPoolExecutor(max_workers=1)
         self._futures: deque[Future[tuple[str, Any]]] = deque()
 
     def submit(self, method: str, *arguments: Any) -> None:
-        """Ask for a method; its result arrives through `result`, in order."""
+        """Ask the process to run a method; `result` returns the results in the order of the requests."""
         self._futures.append(self._caller.submit(self._call, method, arguments))
 
     def result(self) -> Any:
-        """The oldest result not yet taken; waits for it.
+        """The oldest result that was not returned before; waits until it is there.
 
         Raises:
-            UserError: What the method raised for the user.
-            RuntimeError: The method failed, or its process ended.
+            UserError: The method raised this error.
+            RuntimeError: The method failed with another error, or the process ended.
         """
         try:
             kind, value = self._futures.popleft().result()
         except (EOFError, OSError):
             self._process.join(timeout=5.0)
             code = self._process.exitcode
-            raise RuntimeError(f"the process that collects has ended unexpectedly (exit code {code})") from None
+            raise RuntimeError(f"the collection process ended unexpectedly (exit code {code})") from None
         if kind == "user_error":
             raise UserError(value)
         if kind == "error":
@@ -78,7 +90,7 @@ class RemoteWorker:
         return value
 
     def close(self) -> None:
-        """End the process, whatever it is doing."""
+        """Ends the process, also while a method runs."""
         if self._process.is_alive():
             self._process.terminate()
         self._process.join(CLOSING_SECONDS)
@@ -98,7 +110,7 @@ Worker = LocalWorker | RemoteWorker
 
 
 def make_worker(config: Config, make_user_env: EnvFactory | None, device: torch.device) -> Worker:
-    """The worker that `collection.overlap` asks for, of a learner on a device."""
+    """The worker that `collection.overlap` selects; a local worker acts on the learner's device."""
     if config.collection.overlap:
         return RemoteWorker(config, make_user_env, collector_threads(device))
     return LocalWorker(config, make_user_env, str(device))
@@ -107,8 +119,8 @@ def make_worker(config: Config, make_user_env: EnvFactory | None, device: torch.
 def _serve(connection: Connection, factory: EnvFactory | None, config: Config, threads: int) -> None:
     import signal
 
-    signal.signal(signal.SIGTERM, lambda *_: sys.exit())  # as an exit, so that the environments' processes end too
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches the whole group; the learner decides what follows
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit())  # an ordinary exit also ends the environments' processes
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches the whole group; only the learner reacts
     torch.set_num_threads(threads)
     collector: Collector | None = None
     while True:

@@ -1,4 +1,4 @@
-"""What rewards can be learned from."""
+"""A check of the rewards that an environment returns."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ from latentplan.models.heads import LARGEST_SCALAR
 
 
 class RewardCheck:
-    """Refuses rewards that are no numbers, and warns once of those that add up to more than the heads can tell apart.
+    """Refuses rewards that are not finite, and warns once when discounted sums leave the range of the reward heads.
 
     Args:
-        num_envs: Environments that give rewards.
-        discount: Per decision.
+        num_envs: Number of environments.
+        discount: Discount per decision.
     """
 
     def __init__(self, num_envs: int, discount: float) -> None:
@@ -24,18 +24,26 @@ class RewardCheck:
         self._has_warned = False
 
     def __call__(self, rewards: np.ndarray, is_first: np.ndarray) -> None:
-        """Look at rewards (env,), of which some are an episode's first.
+        """Check one step's rewards.
+
+        Args:
+            rewards: Rewards of one step, (env,).
+            is_first: Whether the step is the first of an episode, (env,).
 
         Raises:
-            UserError: One of them is not finite, as replay holds it.
+            UserError: A reward is not finite in float32, in which replay stores it.
         """
         with np.errstate(over="ignore"):
             is_finite = np.isfinite(np.asarray(rewards, np.float32))
         if not is_finite.all():
-            raise UserError(f"the environment gave rewards that are not finite: {rewards.tolist()}")
+            raise UserError(f"the environment returned rewards that are not finite: {rewards.tolist()}")
         self._sums = rewards + self.discount * np.where(is_first, 0.0, self._sums)
         largest = float(np.abs(self._sums).max())
         if largest > LARGEST_SCALAR and not self._has_warned:
             self._has_warned = True
-            said = f"rewards add up to {largest:.0f}, and returns beyond {LARGEST_SCALAR:.0f} are not told apart"
-            warnings.warn(f"{said}: scale them", RuntimeWarning, stacklevel=2)
+            warnings.warn(
+                f"discounted rewards add up to {largest:.0f}, but the value head represents returns up to "
+                f"{LARGEST_SCALAR:.0f} only: scale the rewards down",
+                RuntimeWarning,
+                stacklevel=2,
+            )

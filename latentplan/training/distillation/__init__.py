@@ -1,1 +1,1 @@
-"""Teaching a trained agent's actor what its planner does."""
+"""Distillation of a trained agent's planner into its actor."""

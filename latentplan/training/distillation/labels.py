@@ -1,4 +1,4 @@
-"""What a planner does at beliefs: labels in large batches, and a store of them that is kept fresh."""
+"""Labels for distillation: the planner's first action at many beliefs, and a store of beliefs with their labels."""
 
 from __future__ import annotations
 
@@ -21,18 +21,21 @@ def plan_actions(
     rows_per_call: int,
     report: Callable[[int], None],
 ) -> Gaussian:
-    """Mean and std of the planner's first action at beliefs (rows, ...), (rows, action) each, by fresh searches.
+    """Mean and std of the planner's first action at every belief, by searches without a warm start.
 
     Args:
-        planner: What searches.
-        model: What it searches in.
-        states: Where to plan.
-        generator: Of the sampling noise.
-        rows_per_call: Beliefs planned at once.
-        report: Called after each of these with the number of beliefs done.
+        planner: The search.
+        model: The world model in which the planner searches.
+        states: Beliefs, (rows, ...).
+        generator: Source of the sampling noise.
+        rows_per_call: Beliefs planned in one batch.
+        report: Called after each batch with the number of beliefs planned so far.
+
+    Returns:
+        Mean and std, (rows, action) each.
 
     Raises:
-        FloatingPointError: A search found nothing finite.
+        FloatingPointError: A search found no finite return.
     """
     parts = []
     for rows in zip(*(part.split(rows_per_call) for part in states), strict=True):
@@ -45,10 +48,10 @@ def plan_actions(
 
 
 def first_actions(plan: Plan, min_std: float) -> Gaussian:
-    """Mean and std of a plan's first actions, (batch, action) each; std at least `min_std`.
+    """Mean and std of a plan's first actions, (batch, action) each; the std is at least `min_std`.
 
     Raises:
-        FloatingPointError: The search found nothing finite somewhere.
+        FloatingPointError: The search found no finite return at some state.
     """
     mean, std = plan.action_distribution(min_std)
     num_failed = int(torch.isnan(mean).any(-1).sum())
@@ -58,13 +61,13 @@ def first_actions(plan: Plan, min_std: float) -> Gaussian:
 
 
 class Demonstrations:
-    """Beliefs, the planner's first action at each, and the round in which it was planned; float32, in main memory."""
+    """Beliefs, the planner's first action at each, and the round of that label; float32, in main memory."""
 
     def __init__(self) -> None:
         self.columns: dict[str, Tensor] = {}
 
     def __len__(self) -> int:
-        """Beliefs held."""
+        """Number of beliefs."""
         return len(self.columns["round"]) if self.columns else 0
 
     def add(self, states: State, actions: Gaussian, round_index: int) -> None:
@@ -77,7 +80,7 @@ class Demonstrations:
             self.columns[name] = torch.cat([*held, value.detach().cpu()])
 
     def oldest(self, count: int) -> Tensor:
-        """Where the `count` beliefs whose labels are oldest lie, (count,)."""
+        """Rows of the `count` beliefs with the oldest labels, (count,)."""
         return self.columns["round"].argsort(stable=True)[:count]
 
     def states(self, rows: Tensor) -> State:
@@ -89,15 +92,15 @@ class Demonstrations:
         return Gaussian(self.columns["mean"][rows], self.columns["std"][rows])
 
     def replace(self, rows: Tensor, actions: Gaussian, round_index: int) -> None:
-        """Exchange the labels at rows (count,) for newer ones."""
+        """Replace the labels at rows (count,), planned in round `round_index`."""
         self.columns["mean"][rows] = actions.mean.float().cpu()
         self.columns["std"][rows] = actions.std.float().cpu()
         self.columns["round"][rows] = round_index
 
     def state_dict(self) -> dict[str, Any]:
-        """Everything held."""
+        """All columns by name."""
         return dict(self.columns)
 
     def load_state_dict(self, columns: dict[str, Any]) -> None:
-        """Hold what `state_dict` gave."""
+        """Load columns that `state_dict` returned."""
         self.columns = dict(columns)

@@ -1,16 +1,22 @@
-"""The planner taught to the actor: rounds of driving, labelling and learning (DAgger, Ross et al. 2011, section 3).
+"""Distillation: the actor learns to act as the planner does, in rounds (DAgger, Ross et al. 2011, section 3).
 
-The world model, the value and all else stay as they are. A round has three stages: `drive` (episodes, whose every
-belief is labelled with the planner's first action), `learn` (from all that was ever labelled) and `judge`. A run is
-saved after each stage, and each stage draws from random streams of its own, so that an interrupted run loses at most
-one stage and goes on as if nothing had happened.
+Only the actor changes; the world model and the value head stay as they are. A round has three stages:
+
+1. collect: episodes are played, and the planner labels every belief with its first action;
+2. train: the actor learns from all labels so far;
+3. select: the actor is evaluated, and kept if it is the best so far.
+
+The state is saved after each stage, and each stage draws from its own random streams. An interrupted distillation
+therefore repeats at most one stage, and ends with the same agent as an uninterrupted one.
 """
 
 from __future__ import annotations
 
 import copy
+import math
 import time
-from dataclasses import asdict, replace
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -24,18 +30,21 @@ from latentplan.agents.planning import PlanningAgent
 from latentplan.config import USER_DOMAIN, DistillConfig, PlannerConfig, UserError, derive_seed, to_dict
 from latentplan.envs import make_env, make_from
 from latentplan.evaluation.episodes import OnStep, Step, episode_seed, iterate_episodes
+from latentplan.evaluation.statistics import confidence_interval
 from latentplan.models import Gaussian, State
+from latentplan.replay.buffer import read_saved
 from latentplan.training.collection.collector import EnvFactory
 from latentplan.training.console import StatusLine
-from latentplan.training.distillation.comparison import Comparison, describe_mean
 from latentplan.training.distillation.labels import Demonstrations, first_actions, plan_actions
-from latentplan.training.distillation.standing import START, STATE_FILE, Standing, load_distillation, save_distillation
 from latentplan.training.distillation.student import Student
-from latentplan.training.folder import claim, refuse_used
-from latentplan.training.state import INTERRUPTED
+from latentplan.training.folder import DISTILLATION_FILE, lock_folder, refuse_used
+from latentplan.training.state import INTERRUPTED, save_whole
 from latentplan.training.train import Result
 
-STAGES = ("drive", "learn", "judge")
+NUM_STAGES = 3  # per round: collect, train, select
+NO_ROUND = -1  # stands for the actor with which the distillation began
+# Names of random streams, from which the starts of episodes derive: another name gives other results.
+COLLECTED, SELECTING, TEST = "drive", "choose", "judge"
 
 
 def distill(
@@ -47,24 +56,24 @@ def distill(
     device: str = "cpu",
     make_env: EnvFactory | None = None,
 ) -> Result:
-    """Teach a trained agent's actor what its planner does.
+    """Teaches a trained agent's actor to act as its planner does.
 
     Args:
-        checkpoint: The agent, or a run that holds one.
-        folder: Where the distilled agent goes, and what it takes to resume.
-        settings: Of the distillation.
-        planner: Settings of the search that labels; None takes the agent's own. A deadline is lifted: nothing waits.
-        device: `cpu` or `cuda`.
-        make_env: The user's environment, as given to `train`; None takes the suite's task it was trained on.
+        checkpoint: Folder of the agent, or of a run with an agent.
+        folder: Folder for the distilled agent and the saved state.
+        settings: Settings of the distillation; None takes the defaults.
+        planner: Settings of the search that labels beliefs; None takes the agent's own. A deadline is ignored.
+        device: "cpu" or "cuda".
+        make_env: Makes the user's environment, as for `train`; None makes the suite's task of the agent.
 
     Returns:
-        Where the agent lies, and mean returns on the same starts: `before`, `after`, `planner`, `planner_after`.
+        The folder, and mean returns on the same test starts: `before`, `after`, `planner`, `planner_after`.
 
     Raises:
         UserError: The checkpoint, the folder or a setting cannot be used.
     """
     folder = Path(folder)
-    refuse_used(folder, str(STATE_FILE), "--out")
+    refuse_used(folder, str(DISTILLATION_FILE), "--out")
     source = resolve_checkpoint(checkpoint)
     return _Distillation(source, folder, settings or DistillConfig(), planner, device, make_env).run()
 
@@ -77,21 +86,21 @@ def resume_distillation(
     device: str = "cpu",
     make_env: EnvFactory | None = None,
 ) -> Result:
-    """Continue a distillation where it was last saved.
+    """Continues a distillation from its last save.
 
     Args:
-        folder: Its folder.
-        rounds: New number of rounds in all; None keeps the old one.
-        minutes: New budget of minutes in all; None keeps the old one.
-        device: `cpu` or `cuda`.
-        make_env: As given to `distill`.
+        folder: Folder of the distillation.
+        rounds: New total number of rounds; None keeps the old number.
+        minutes: New total budget of minutes; None keeps the old budget.
+        device: "cpu" or "cuda".
+        make_env: Makes the user's environment, as for `distill`.
 
     Raises:
-        UserError: The folder holds no distillation, or the agent it began with has changed.
+        UserError: The folder holds no distillation, or the agent that it started from has changed.
     """
-    saved = load_distillation(Path(folder))
+    saved = _load_distillation(Path(folder))
     if read_info(saved["source"])["sha256"] != saved["sha256"]:
-        raise UserError(f"{saved['source']} is not the agent that the distillation in {folder} began with")
+        raise UserError(f"{saved['source']} is not the agent from which the distillation in {folder} started")
     settings = DistillConfig(**saved["settings"])
     settings = replace(settings, rounds=rounds or settings.rounds, minutes=minutes or settings.minutes)
     planner = PlannerConfig(**saved["planner"])
@@ -100,7 +109,94 @@ def resume_distillation(
     return run.run()
 
 
+@dataclass
+class DistillationState:
+    """Progress and results of a distillation.
+
+    Attributes:
+        stage: Stages done, three per round.
+        minutes: Wall-clock minutes spent, over all processes.
+        decisions: Decisions collected.
+        loss: Mean imitation loss over the updates of the last round, in nats.
+        best_return: Mean return of the best actor on the selection starts.
+        best_round: The round that made the best actor, from 0; -1 for the actor before distillation.
+        before: Returns of the actor before distillation on the test starts.
+        planner: Returns of the planner on the test starts; empty until the first evaluation is done.
+    """
+
+    stage: int = 0
+    minutes: float = 0.0
+    decisions: int = 0
+    loss: float = float("nan")
+    best_return: float = float("-inf")
+    best_round: int = NO_ROUND
+    before: list[float] = field(default_factory=list)
+    planner: list[float] = field(default_factory=list)
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """Returns before and after a distillation, on the same test starts, which took no part in the selection.
+
+    Attributes:
+        before: Returns of the actor before distillation.
+        planner: Returns of the planner with that actor's proposals.
+        after: Returns of the selected actor; None if no round improved on the actor before distillation.
+        planner_after: Returns of the planner with the selected actor's proposals; None like `after`.
+    """
+
+    before: Sequence[float]
+    planner: Sequence[float]
+    after: Sequence[float] | None = None
+    planner_after: Sequence[float] | None = None
+
+    @property
+    def is_better(self) -> bool:
+        """Whether the selected actor gains return, and gains more than the planner loses."""
+        if self.after is None or self.planner_after is None:
+            return False
+        gain = np.mean(self.after) - np.mean(self.before)
+        return bool(gain > 0.0 and gain + np.mean(self.planner_after) - np.mean(self.planner) > 0.0)
+
+    def describe(self, chosen_round: int) -> list[str]:
+        """Lines with the mean returns, their differences, and which actor is kept.
+
+        Args:
+            chosen_round: Number of the round that made the selected actor, from 1.
+        """
+        played = {
+            "actor before": self.before,
+            "actor after": self.after,
+            "planner before": self.planner,
+            "planner after": self.planner_after,
+        }
+        lines = [f"on the same {len(self.before)} test starts for all, which took no part in the selection:"]
+        lines += [f"{name:<16}{describe_mean(returns)}" for name, returns in played.items() if returns is not None]
+        if self.after is None or self.planner_after is None:
+            return [*lines, "no round improved on the actor before: the actor before is kept, unchanged"]
+        gains = _differences(self.after, self.before)
+        differences = {
+            "actor, after - before": gains,
+            "planner, after - before": _differences(self.planner_after, self.planner),
+            "after, actor - planner": _differences(self.after, self.planner_after),
+        }
+        lines += [f"{name:<24}{describe_mean(values, signed=True)}" for name, values in differences.items()]
+        if np.mean(gains) <= 0.0:
+            verdict = (
+                f"the actor of round {chosen_round} was better on the selection starts, but not on the test starts"
+            )
+            return [*lines, f"{verdict}: the actor before is kept, unchanged"]
+        if not self.is_better:
+            return [*lines, "the planner loses more than the actor gains: the actor before is kept, unchanged"]
+        lines.append(f"kept: the actor of round {chosen_round}")
+        if confidence_interval(gains)[0] <= 0.0:
+            lines.append("the 95 % interval of the actor's gain contains 0: more --evaluation-episodes would narrow it")
+        return lines
+
+
 class _Distillation:
+    """One distillation: its agents, environment, labels, student and state."""
+
     def __init__(
         self,
         source: Path,
@@ -113,31 +209,33 @@ class _Distillation:
         self.source, self.folder, self.settings = source, folder, settings
         self.model, self.config, self.info = load_model(source, device)
         if self.model.goal_dim:
-            raise UserError(f"{source} has learned goals, which build on its actor: distill before scripts/goals.py")
+            raise UserError(
+                f"{source} has learned goals with its present actor: run scripts/distill.py before scripts/goals.py"
+            )
         self.model.requires_grad_(False)
         self.planner_config = replace(planner or self.config.planner, deadline_ms=None)
         self.planning = PlanningAgent(self.model, self.config, self.info["discount"], planner=self.planner_config)
         self.acting = ActorAgent(self.model, self.config)
         build = make_env if make_user_env is None else make_from(make_user_env)
         self.env = build(self.config.env, 0)
-        self.standing, self.demonstrations = Standing(), Demonstrations()
+        self.state, self.demonstrations = DistillationState(), Demonstrations()
         self.student = Student(self.model.actor, settings)
-        self.start = self.best = copy.deepcopy(self.model.actor.state_dict())
+        self.initial = self.best = copy.deepcopy(self.model.actor.state_dict())
         self.line = StatusLine()
         self._started = time.monotonic()
         self._earlier_minutes = 0.0
 
     def run(self) -> Result:
-        """Go through what is left of the rounds, then compare; an interrupted run says how to go on."""
-        standing = self.standing
+        """Run the remaining rounds and save the better agent; when interrupted, print how to resume."""
+        state = self.state
         try:
-            with claim(self.folder), self.line:
-                if not standing.planner:
-                    self._begin()
+            with lock_folder(self.folder), self.line:
+                if not state.planner:
+                    self._evaluate_initial()
                 while not self._is_spent():
-                    round_index, stage = divmod(standing.stage, len(STAGES))
-                    getattr(self, f"_{STAGES[stage]}")(round_index)
-                    standing.stage += 1
+                    round_index, stage = divmod(state.stage, NUM_STAGES)
+                    (self._collect, self._train, self._select)[stage](round_index)
+                    state.stage += 1
                     self._save()
                 return Result(self.folder, 0, self._finish())
         except KeyboardInterrupt:
@@ -150,28 +248,28 @@ class _Distillation:
             self.env.close()
 
     def load(self, saved: dict[str, Any]) -> None:
-        """Take up what `_save` wrote."""
-        self.standing = Standing(**saved["standing"])
-        self._earlier_minutes = self.standing.minutes
+        """Load what `_save` saved."""
+        self.state = DistillationState(**saved["state" if "state" in saved else "standing"])  # "standing" before 0.2.0
+        self._earlier_minutes = self.state.minutes
         self.demonstrations.load_state_dict(saved["demonstrations"])
         self.student.load_state_dict(saved["student"])
         self.best = saved["best"]
         self.model.actor.load_state_dict(self.student.weights())
 
-    def _begin(self) -> None:
-        """What the actor and the planner earn to begin with."""
-        self._save()  # from here on there is something to resume
-        standing = self.standing
-        standing.before = self._play(self.acting, "judge", "the actor")
-        standing.best_return = float(np.mean(self._play(self.acting, "choose", "the actor")))
-        standing.planner = self._play(self.planning, "judge", "the planner")
-        self.line.print(f"actor    {describe_mean(standing.before)}\nplanner  {describe_mean(standing.planner)}")
-        if np.mean(standing.planner) <= np.mean(standing.before):
-            self.line.print("the planner earns no more than its pupil: an improvement is not to be expected")
+    def _evaluate_initial(self) -> None:
+        """Evaluate the actor and the planner before the first round."""
+        self._save()  # an interruption from here on can be resumed
+        state = self.state
+        state.before = self._play(self.acting, TEST, "the actor")
+        state.best_return = float(np.mean(self._play(self.acting, SELECTING, "the actor")))
+        state.planner = self._play(self.planning, TEST, "the planner")
+        self.line.print(f"actor    {describe_mean(state.before)}\nplanner  {describe_mean(state.planner)}")
+        if np.mean(state.planner) <= np.mean(state.before):
+            self.line.print("the planner earns no more than the actor: an improvement is not to be expected")
         self._save()
 
-    def _drive(self, round_index: int) -> None:
-        """Play episodes, and store the beliefs on the way with what the planner would do there."""
+    def _collect(self, round_index: int) -> None:
+        """Play episodes, and store their beliefs with the planner's first actions; renew the oldest labels."""
         settings = self.settings
         agent: ModelAgent = self.planning if round_index < settings.planner_rounds else self.acting
         seed = derive_seed(settings.seed, "label", round_index)
@@ -179,14 +277,14 @@ class _Distillation:
         states: list[State] = []
         plans: list[Gaussian] = []
 
-        def remember(step: Step) -> None:
+        def store_belief(step: Step) -> None:
             if step.action is not None and agent.state is not None:
                 states.append(agent.state)
                 plan = self.planning.controller.plan
                 if agent is self.planning and plan is not None:
                     plans.append(first_actions(plan, self.planner_config.min_std))
 
-        self._play(agent, "drive", "driving", round_index, settings.episodes, remember)
+        self._play(agent, COLLECTED, "collecting", round_index, settings.episodes, store_belief)
         num_stale = int(settings.relabel_share * len(self.demonstrations))
         if num_stale:
             stale = self.demonstrations.oldest(num_stale)
@@ -195,52 +293,54 @@ class _Distillation:
         visited = State(*(torch.cat(part) for part in zip(*states, strict=True)))
         planned = Gaussian(*(torch.cat(part) for part in zip(*plans, strict=True))) if plans else None
         self.demonstrations.add(visited, planned or self._plan(visited, generator), round_index)
-        self.standing.decisions += len(states)
+        self.state.decisions += len(states)
 
-    def _learn(self, round_index: int) -> None:
-        """Let the student learn from everything stored, and act from now on."""
+    def _train(self, round_index: int) -> None:
+        """Train the student on all labels, and act with its weights from now on."""
 
         def show(done: int, loss: float) -> None:
             self._show(f"learning {done} of {self.settings.updates} | loss {loss:.3f}")
 
-        self.standing.loss = self.student.learn(self.demonstrations, round_index, show)
+        self.state.loss = self.student.learn(self.demonstrations, round_index, show)
         self.model.actor.load_state_dict(self.student.weights())
 
-    def _judge(self, round_index: int) -> None:
-        """Keep the actor if it is the best so far on the starts that choose."""
-        standing = self.standing
-        returns = self._play(self.acting, "choose", "judging")
+    def _select(self, round_index: int) -> None:
+        """Keep the actor if it is the best so far on the selection starts."""
+        state = self.state
+        returns = self._play(self.acting, SELECTING, "evaluating")
         mean = float(np.mean(returns))
-        if mean > standing.best_return:
-            standing.best_return, standing.best_round = mean, round_index
+        if mean > state.best_return:
+            state.best_return, state.best_round = mean, round_index
             self.best = copy.deepcopy(self.model.actor.state_dict())
         self.line.print(
-            f"round {round_index + 1:>2}  {len(self.demonstrations):>7,} beliefs  loss {standing.loss:7.3f} nats  "
-            f"actor {describe_mean(returns)}{'  best' if standing.best_round == round_index else ''}"
+            f"round {round_index + 1:>2}  {len(self.demonstrations):>7,} beliefs  loss {state.loss:7.3f} nats  "
+            f"actor {describe_mean(returns)}{'  best' if state.best_round == round_index else ''}"
         )
 
     def _finish(self) -> dict[str, float]:
-        """Judge the best actor on starts that chose nothing, and keep it only if it is better there too."""
-        standing = self.standing
-        found = Comparison(standing.before, standing.planner)
-        if standing.best_round != START:
+        """Evaluate the best actor on the test starts, and save the agent with it only if it is better there too."""
+        state = self.state
+        found = Comparison(state.before, state.planner)
+        if state.best_round != NO_ROUND:
             self.model.actor.load_state_dict(self.best)
-            after = self._play(self.acting, "judge", "judging the best actor")
-            found = replace(found, after=after, planner_after=self._play(self.planning, "judge", "the planner with it"))
-        self.model.actor.load_state_dict(self.best if found.is_better else self.start)
+            after = self._play(self.acting, TEST, "evaluating the best actor")
+            found = replace(
+                found, after=after, planner_after=self._play(self.planning, TEST, "the planner with the best actor")
+            )
+        self.model.actor.load_state_dict(self.best if found.is_better else self.initial)
         kept = found if found.is_better else Comparison(found.before, found.planner, found.before, found.planner)
         returns = asdict(kept)
         facts = {
-            "rounds": standing.stage // len(STAGES),
-            "decisions": standing.decisions,
-            "kept_round": standing.best_round + 1 if found.is_better else None,
+            "rounds": state.stage // NUM_STAGES,
+            "decisions": state.decisions,
+            "kept_round": state.best_round + 1 if found.is_better else None,
             **{f"returns_{name}": values for name, values in returns.items()},
             "settings": to_dict(self.settings),
             "planner": to_dict(self.planner_config),
             "from_sha256": self.info["sha256"],
         }
         save_checkpoint(self.folder, self.model, self.config, self.info | {"distilled": facts})
-        for line in [*found.describe(standing.best_round + 1), f"agent: {self.folder}"]:
+        for line in [*found.describe(state.best_round + 1), f"agent: {self.folder}"]:
             self.line.print(line)
         return {name: float(np.mean(values)) for name, values in returns.items()}
 
@@ -248,55 +348,81 @@ class _Distillation:
         self,
         agent: ModelAgent,
         starts: str,
-        what: str,
+        activity: str,
         counter: int = 0,
         num_episodes: int | None = None,
         on_step: OnStep | None = None,
     ) -> list[float]:
-        """Returns of episodes from the starts of a name and counter."""
+        """Returns of episodes whose starts derive from a stream's name and a counter."""
         num_episodes = num_episodes or self.settings.evaluation_episodes
         stream = derive_seed(self.settings.seed, starts, counter)
         seeds = [episode_seed(stream, index) for index in range(num_episodes)]
         returns: list[float] = []
-        self._show(f"{what}: episode 1 of {num_episodes}")
+        self._show(f"{activity}: episode 1 of {num_episodes}")
         for episode in iterate_episodes(self.env, agent, seeds, on_step=on_step):
             returns.append(episode.total_return)
-            self._show(f"{what}: episode {min(len(returns) + 1, num_episodes)} of {num_episodes}")
+            self._show(f"{activity}: episode {min(len(returns) + 1, num_episodes)} of {num_episodes}")
         return returns
 
     def _plan(self, states: State, generator: torch.Generator) -> Gaussian:
         """The planner's first actions at beliefs (rows, ...)."""
-        here = State(*(part.to(self.model.device) for part in states))
-        total, rows = len(here.deter), self.settings.plan_batch
+        on_device = State(*(part.to(self.model.device) for part in states))
+        total, rows = len(on_device.deter), self.settings.plan_batch
 
         def show(done: int) -> None:
             self._show(f"planning at {done:,} of {total:,} beliefs")
 
-        return plan_actions(self.planning.controller.planner, self.planning.imagined, here, generator, rows, show)
+        return plan_actions(self.planning.controller.planner, self.planning.imagined, on_device, generator, rows, show)
 
     def _save(self) -> None:
-        self.standing.minutes = self._minutes()
+        self.state.minutes = self._minutes()
         saved = {
             "source": str(self.source.resolve()),
             "sha256": self.info["sha256"],
             "settings": to_dict(self.settings),
             "planner": to_dict(self.planner_config),
-            "standing": asdict(self.standing),
+            "state": asdict(self.state),
             "demonstrations": self.demonstrations.state_dict(),
             "student": self.student.state_dict(),
             "best": self.best,
         }
-        save_distillation(self.folder, saved)
+        save_whole(saved, self.folder / DISTILLATION_FILE)
 
     def _is_spent(self) -> bool:
-        """Whether no round may begin; one that has begun is finished."""
-        round_index, stage = divmod(self.standing.stage, len(STAGES))
+        """Whether the budget allows no further round; a round that has begun is finished."""
+        round_index, stage = divmod(self.state.stage, NUM_STAGES)
         late = self.settings.minutes is not None and self._minutes() >= self.settings.minutes
         return stage == 0 and (late or round_index >= self.settings.rounds)
 
     def _minutes(self) -> float:
         return self._earlier_minutes + (time.monotonic() - self._started) / 60.0
 
-    def _show(self, what: str) -> None:
-        round_index = min(self.standing.stage // len(STAGES) + 1, self.settings.rounds)
-        self.line.update(f"round {round_index} of {self.settings.rounds} | {what} | {self._minutes():.1f} min")
+    def _show(self, activity: str) -> None:
+        round_index = min(self.state.stage // NUM_STAGES + 1, self.settings.rounds)
+        self.line.update(f"round {round_index} of {self.settings.rounds} | {activity} | {self._minutes():.1f} min")
+
+
+def _load_distillation(folder: Path) -> dict[str, Any]:
+    """The distillation saved in a folder.
+
+    Raises:
+        UserError: The folder holds no distillation, or a damaged one.
+    """
+    path = folder / DISTILLATION_FILE
+    if not path.is_file():
+        raise UserError(f"nothing to resume in {folder}: {path} is missing")
+    saved: dict[str, Any] = read_saved(path)
+    return saved
+
+
+def describe_mean(returns: Sequence[float], *, signed: bool = False) -> str:
+    """The mean of returns with its 95 % interval, as text; `signed` writes a plus sign, for differences."""
+    low, high = confidence_interval(returns)
+    sign = "+" if signed else ""
+    if math.isnan(low):
+        return f"{np.mean(returns):{sign}8.1f}"
+    return f"{np.mean(returns):{sign}8.1f}  (95 % interval {low:{sign}.1f} to {high:{sign}.1f})"
+
+
+def _differences(late: Sequence[float], early: Sequence[float]) -> list[float]:
+    return [one - other for one, other in zip(late, early, strict=True)]

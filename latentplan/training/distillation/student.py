@@ -1,4 +1,4 @@
-"""The actor as a pupil of the planner: its own copy of the weights, its optimizer, and its lessons."""
+"""The student of a distillation: a copy of the actor that learns from the planner's labels."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ from latentplan.training.learner.losses import imitation_loss
 
 
 class Student:
-    """Learns to act as demonstrated.
+    """A copy of an actor with its own optimizer, which learns to act as the planner.
 
     Args:
-        actor: Where it begins; stays as it is.
-        settings: Of the distillation.
+        actor: Copied; the original does not change.
+        settings: Settings of the distillation.
     """
 
     def __init__(self, actor: Actor, settings: DistillConfig) -> None:
@@ -29,12 +29,12 @@ class Student:
         self.optimizer = torch.optim.Adam(self.actor.parameters(), lr=settings.learning_rate, eps=1e-6)
 
     def learn(self, demonstrations: Demonstrations, round_index: int, report: Callable[[int, float], None]) -> float:
-        """Descend on the imitation loss over everything demonstrated.
+        """Minimise the imitation loss over beliefs drawn uniformly.
 
         Args:
-            demonstrations: What is learned from, drawn uniformly.
-            round_index: From which the random stream derives.
-            report: Called after each update with the number of updates done and the loss.
+            demonstrations: Beliefs with the planner's first actions.
+            round_index: Number of the round, from which the random stream derives.
+            report: Called after each update with the number of updates done and the loss in nats.
 
         Returns:
             The mean loss over the updates, in nats.
@@ -48,7 +48,7 @@ class Student:
             rows = torch.randint(len(demonstrations), (settings.batch_size,), generator=generator)
             features = demonstrations.states(rows).features.to(device)
             mean, std = (part.to(device) for part in demonstrations.actions(rows))
-            if features.ndim == 3:  # every turn of a belief learns what was planned for all
+            if features.ndim == 3:  # (batch, turn, feature): all turns of a belief share one label
                 mean, std = (part[:, None].expand(-1, features.shape[1], -1) for part in (mean, std))
             loss = imitation_loss(self.actor, features, mean, std).mean()
             if not torch.isfinite(loss):
@@ -61,14 +61,14 @@ class Student:
         return total / settings.updates
 
     def weights(self) -> dict[str, Tensor]:
-        """What was learned, in the precision of checkpoints: what is judged is then what is kept."""
+        """The weights, rounded to the float16 of checkpoints so that evaluations measure the saved agent."""
         return {name: value.detach().half().float() for name, value in self.actor.state_dict().items()}
 
     def state_dict(self) -> dict[str, Any]:
-        """Weights and optimizer."""
+        """The states of actor and optimizer."""
         return {"actor": self.actor.state_dict(), "optimizer": self.optimizer.state_dict()}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Take up what `state_dict` gave."""
+        """Load what `state_dict` returned."""
         self.actor.load_state_dict(state["actor"])
         self.optimizer.load_state_dict(state["optimizer"])

@@ -1,1 +1,1 @@
-"""Teaching a trained agent to pursue goals that are named later."""
+"""Goal conditioning: a trained agent learns to pursue goals that are named after training."""

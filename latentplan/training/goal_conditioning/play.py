@@ -1,4 +1,4 @@
-"""Beliefs to learn goals from where no replay is left: an agent plays, for its task and for goals drawn at random."""
+"""A replay for goal learning without the replay of a run: the agent plays for its task and for random goals."""
 
 from __future__ import annotations
 
@@ -15,43 +15,45 @@ from latentplan.replay.buffer import Replay
 from latentplan.training.collection.collector import Collector
 from latentplan.training.goal_conditioning.learner import BoxSource
 
-ROUND = 125  # decisions
+ROUND_DECISIONS = 125
 
 
 def play(config: Config, model: WorldModel, decisions: int, seed: int, report: Callable[[int], None]) -> Replay:
-    """What an agent sees that explores for its task, and in every other round pursues a box drawn at random.
+    """Plays with an agent: rounds of exploration for its task alternate with rounds for a random box.
+
+    The actor plays the first kind of round, the planner the second.
 
     Args:
-        config: Settings of the agent; its exploration noise is what it explores with.
-        model: The agent's, with quantities.
-        decisions: How many are played.
-        seed: Of every random stream.
-        report: Called after each round with the decisions so far.
+        config: Settings of the agent, with its exploration noise.
+        model: World model of the agent, which predicts quantities.
+        decisions: Decisions to play, rounded up to whole rounds of 125.
+        seed: Seed of every random stream.
+        report: Called after each round with the number of decisions so far.
 
     Returns:
-        A replay of about so many rows.
+        A replay with one row per decision, and one more per episode.
     """
     alone = replace(config, env=replace(config.env, num_envs=1), run=replace(config.run, seed=seed))
-    size = 2 * (decisions + ROUND)  # an episode has a row more than decisions
+    size = 2 * (decisions + ROUND_DECISIONS)  # an episode has one row more than decisions
     replay = Replay(size, model.action_dim, model.config.deter_dim, 1, torch.device("cpu"), len(model.labels))
     collector = Collector(alone, None, "cpu")
     heads = [name for name in model.state_dict() if name.startswith("goal_heads.")]
     weights = {name: value.cpu().numpy() for name, value in model.state_dict().items() if name not in heads}
     generator = torch.Generator().manual_seed(derive_seed(seed, "play"))
     try:
-        for counter in range(-(-decisions // ROUND)):
+        for counter in range(-(-decisions // ROUND_DECISIONS)):
             goal = _draw_goal(model, replay, generator) if counter % 2 else None
             behaviour = "actor" if goal is None else "planner"
-            collected = collector.collect(weights, behaviour, ROUND, counter, goal=goal)
+            collected = collector.collect(weights, behaviour, ROUND_DECISIONS, counter, goal=goal)
             replay.add(0, collected.rows[0])
-            report((counter + 1) * ROUND)
+            report((counter + 1) * ROUND_DECISIONS)
     finally:
         collector.close()
     return replay
 
 
 def describe_box(names: Sequence[str], low: Sequence[float], high: Sequence[float]) -> str:
-    """The expression that asks for a box, given by its ends."""
+    """The objective expression of a box, such as `speed > 1.0 and speed < 2.0`, from the ends of its intervals."""
     clauses = []
     for name, least, most in zip(names, low, high, strict=True):
         if least == most:
@@ -63,7 +65,8 @@ def describe_box(names: Sequence[str], low: Sequence[float], high: Sequence[floa
 
 
 def _draw_goal(model: WorldModel, replay: Replay, generator: torch.Generator) -> str:
+    """An expression for a random box around the quantities observed so far."""
     rows = np.flatnonzero(replay.episode.reshape(-1) >= 0)
-    met = replay.labels[torch.from_numpy(rows)][:, : len(model.goal_names)]
-    low, high, _ = BoxSource(met, model.goal_scales.cpu(), generator).draw(1, generator)
+    observed = replay.labels[torch.from_numpy(rows)][:, : len(model.goal_names)]
+    low, high, _ = BoxSource(observed, model.goal_scales.cpu(), generator).draw(1, generator)
     return describe_box(model.goal_names, low[0].tolist(), high[0].tolist())

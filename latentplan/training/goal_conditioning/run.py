@@ -1,4 +1,4 @@
-"""A run that learns goals: from a trained agent and what it has seen to an agent that knows goals as well."""
+"""Goal conditioning of a trained agent: from its folder and its replay to an agent that also pursues goals."""
 
 from __future__ import annotations
 
@@ -19,70 +19,71 @@ from latentplan.config import USER_DOMAIN, Config, GoalsConfig, UserError, deriv
 from latentplan.models import WorldModel
 from latentplan.replay.buffer import Replay, read_saved
 from latentplan.training.console import StatusLine
-from latentplan.training.folder import GOALS_FILE, claim, refuse_used
+from latentplan.training.folder import GOALS_FILE, lock_folder, refuse_used
 from latentplan.training.goal_conditioning.learner import GoalLearner
 from latentplan.training.goal_conditioning.play import play
-from latentplan.training.state import INTERRUPTED
+from latentplan.training.state import INTERRUPTED, save_whole
 from latentplan.training.train import Result
 
 SAVE_SECONDS = 300.0
-PLAYED = "played.json"  # beside a replay: by which agent, and how
+PLAYED_FILE = "played.json"  # beside a played replay: which agent played it, and with which settings
 
 
 def learn_goals(
     checkpoint: Path | str, folder: Path | str, settings: GoalsConfig | None = None, *, device: str = "cpu"
 ) -> Result:
-    """Teach a trained agent to pursue goals that are named later.
+    """Teaches a trained agent to pursue goals that are named after training.
 
     Args:
-        checkpoint: Folder of a run, whose replay tells where to begin, or of an agent, which then plays a while.
-        folder: Where the agent goes, and what it takes to resume.
-        settings: Of the learning.
-        device: `cpu` or `cuda`.
+        checkpoint: Folder of a run, whose replay gives the beliefs to start from, or of an agent without a replay,
+            which then plays first.
+        folder: Folder for the new agent and the saved state.
+        settings: Settings of the learning; None takes the defaults.
+        device: "cpu" or "cuda".
 
     Returns:
-        Where the agent lies, and `worth`: see `GoalLearner.update`.
+        The folder, and `worth`, a running mean over updates: see `GoalLearner.update`.
 
     Raises:
         UserError: The agent, its replay or the folder cannot be used.
     """
     folder = Path(folder)
     refuse_used(folder, GOALS_FILE, "--out")
-    with claim(folder):
+    with lock_folder(folder):
         return _learn(Path(checkpoint), folder, settings or GoalsConfig(), device, None)
 
 
 def resume_goals(
     folder: Path | str, *, updates: int | None = None, minutes: float | None = None, device: str = "cpu"
 ) -> Result:
-    """Go on where `learn_goals` was last saved.
+    """Continues `learn_goals` from its last save.
 
     Args:
-        folder: Where its agent goes.
-        updates: New number of updates in all; None keeps the old one.
-        minutes: New budget of minutes in all; None keeps the old one.
-        device: `cpu` or `cuda`.
+        folder: Folder that was given to `learn_goals`.
+        updates: New total number of updates; None keeps the old number.
+        minutes: New total budget of minutes; None keeps the old budget.
+        device: "cpu" or "cuda".
 
     Raises:
-        UserError: The folder holds nothing to resume, or the agent it began with has changed.
+        UserError: The folder holds nothing to resume, or the agent that the learning started from has changed.
     """
     path = Path(folder) / GOALS_FILE
     if not path.exists():
         raise UserError(f"nothing to resume in {folder}: {path} is missing")
-    with claim(Path(folder)):
+    with lock_folder(Path(folder)):
         saved = read_saved(path, keys=("run", "source", "sha256", "settings", "minutes", "learner"))
         if read_info(saved["source"])["sha256"] != saved["sha256"]:
-            raise UserError(f"{saved['source']} is not the agent that {folder} began with")
+            raise UserError(f"{saved['source']} is not the agent from which {folder} started")
         settings = GoalsConfig(**saved["settings"])
         settings = replace(settings, updates=updates or settings.updates, minutes=minutes or settings.minutes)
         return _learn(Path(saved["run"]), Path(folder), settings, device, saved)
 
 
 def load_replay(path: Path, model: WorldModel) -> Replay:
-    """The replay in a folder, whole, in main memory.
+    """Loads the whole replay in a folder into main memory.
 
     Raises:
-        UserError: It is damaged, or of another kind of agent.
+        UserError: The replay is damaged, or does not fit the model.
     """
     num_lanes, lane_size = read_saved(path / "rows.pt", keys=("episode",))["episode"].shape
     sizes = (model.action_dim, model.config.deter_dim, num_lanes, torch.device("cpu"), len(model.labels))
@@ -91,22 +92,22 @@ def load_replay(path: Path, model: WorldModel) -> Replay:
     return replay
 
 
-def _begin(
+def _load_or_play(
     agent: Path, sha256: str, folder: Path, model: WorldModel, config: Config, settings: GoalsConfig, line: StatusLine
 ) -> Replay:
-    """What the agent has seen: the replay of its run, or what it saw when it played, which a folder keeps."""
-    collected, played, note = agent / "resume" / "replay", folder / "replay", folder / "replay" / PLAYED
+    """The replay of the agent's run if there is one, else a replay that the agent plays and the folder keeps."""
+    collected, played, note = agent / "resume" / "replay", folder / "replay", folder / "replay" / PLAYED_FILE
     if (collected / "rows.pt").exists():
         return load_replay(collected, model)
-    by_whom = {"sha256": sha256, "seed": settings.seed, "play_decisions": settings.play_decisions}
-    if (folder / GOALS_FILE).exists() or (note.exists() and note.read_text() == json.dumps(by_whom)):
-        line.print(f"what was played before is in {played}")
+    origin = {"sha256": sha256, "seed": settings.seed, "play_decisions": settings.play_decisions}
+    if (folder / GOALS_FILE).exists() or (note.exists() and note.read_text() == json.dumps(origin)):
+        line.print(f"using the replay that was played before, in {played}")
         return load_replay(played, model)
     if config.env.domain == USER_DOMAIN:
         raise UserError(f"{agent} has no replay, and its environment is your own: give the folder of its run")
     if (played / "rows.pt").exists() and not note.exists():
-        raise UserError(f"{played} holds a replay of something else: choose another --out")
-    line.print(f"no replay in {agent}: playing {settings.play_decisions:,} decisions to begin from")
+        raise UserError(f"{played} holds a replay of another agent: choose another --out")
+    line.print(f"no replay in {agent}: playing {settings.play_decisions:,} decisions first")
 
     def report(done: int) -> None:
         line.update(f"played {done:,} of {settings.play_decisions:,} decisions")
@@ -114,7 +115,7 @@ def _begin(
     replay = play(config, model, settings.play_decisions, settings.seed, report)
     note.unlink(missing_ok=True)
     replay.save(played)
-    note.write_text(json.dumps(by_whom))
+    note.write_text(json.dumps(origin))
     return replay
 
 
@@ -126,9 +127,9 @@ def _learn(run: Path, folder: Path, settings: GoalsConfig, device: str, saved: d
     model.requires_grad_(False)
     line = StatusLine()
     try:
-        replay = _begin(run, info["sha256"], folder, model, config, settings, line)
+        replay = _load_or_play(run, info["sha256"], folder, model, config, settings, line)
     except KeyboardInterrupt:
-        line.print("stopped before there was anything to learn from: nothing is kept")
+        line.print("stopped while playing, before the first update: nothing is saved")
         return Result(folder, INTERRUPTED, {})
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(derive_seed(settings.seed, "heads"))
@@ -150,11 +151,10 @@ def _learn(run: Path, folder: Path, settings: GoalsConfig, device: str, saved: d
         save_checkpoint(folder, model, config, info | {"goals": facts | {"from_sha256": info["sha256"]}})
         about = {"run": str(run.resolve()), "source": str(source.resolve()), "sha256": info["sha256"]}
         state = {"settings": to_dict(settings), "minutes": minutes(), "learner": learner.state_dict()}
-        torch.save(about | state, folder / f"{GOALS_FILE}.part")
-        (folder / f"{GOALS_FILE}.part").replace(folder / GOALS_FILE)
+        save_whole(about | state, folder / GOALS_FILE)
 
-    with line, _asked_to_stop() as is_asked:
-        while learner.updates < settings.updates and not (is_asked() or minutes() >= (settings.minutes or math.inf)):
+    with line, _stop_on_signals() as should_stop:
+        while learner.updates < settings.updates and not (should_stop() or minutes() >= (settings.minutes or math.inf)):
             parts = learner.update()
             worth = parts["worth"] if math.isnan(worth) else 0.99 * worth + 0.01 * parts["worth"]
             line.update(
@@ -165,7 +165,7 @@ def _learn(run: Path, folder: Path, settings: GoalsConfig, device: str, saved: d
                 save()
                 last_save = time.monotonic()
         save()
-        if is_asked():
+        if should_stop():
             line.print(f"stopped; to go on: python scripts/goals.py --resume {folder}")
             return Result(folder, INTERRUPTED, {})
         line.print(f"agent: {folder}")
@@ -173,18 +173,22 @@ def _learn(run: Path, folder: Path, settings: GoalsConfig, device: str, saved: d
 
 
 @contextlib.contextmanager
-def _asked_to_stop() -> Iterator[Callable[[], bool]]:
-    """Takes over Ctrl-C and requests to end: the update in work is finished first; asked again, it ends at once."""
-    asked: list[int] = []
+def _stop_on_signals() -> Iterator[Callable[[], bool]]:
+    """Turns the first SIGINT or SIGTERM into a flag, so that the running update is finished; a second one interrupts.
 
-    def note(number: int, frame: Any) -> None:
-        if asked:
+    Yields:
+        A function that tells whether a signal has arrived.
+    """
+    received: list[int] = []
+
+    def receive(number: int, frame: Any) -> None:
+        if received:
             raise KeyboardInterrupt
-        asked.append(number)
+        received.append(number)
 
-    previous = {number: signal.signal(number, note) for number in (signal.SIGINT, signal.SIGTERM)}
+    previous = {number: signal.signal(number, receive) for number in (signal.SIGINT, signal.SIGTERM)}
     try:
-        yield lambda: bool(asked)
+        yield lambda: bool(received)
     finally:
         for number, handler in previous.items():
             signal.signal(number, handler)

@@ -1,1 +1,1 @@
-"""What one update learns: losses, optimizers, and the module that applies them."""
+"""The learner: losses, optimizers, and the module that updates world model and behaviour."""

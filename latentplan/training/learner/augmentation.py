@@ -1,4 +1,4 @@
-"""Replayed frames, moved a little or turned so that few pictures teach more."""
+"""Augmentation of replayed frames: random shifts and quarter turns."""
 
 from __future__ import annotations
 
@@ -9,14 +9,14 @@ from latentplan.replay.buffer import Batch
 
 
 def random_shift(frames: Tensor, pixels: int, generator: torch.Generator) -> Tensor:
-    """Move each sequence by its own whole number of pixels, the border repeated (Yarats et al. 2021, section 3.1).
+    """Sequences shifted by whole pixels, with repeated borders (Yarats et al. 2021, section 3.1).
 
-    All frames of a sequence move together, so that what moves within it stays true.
+    Each sequence has one shift for all its frames, so that motion within the sequence is unchanged.
 
     Args:
         frames: (batch, time, height, width, channel).
-        pixels: Largest move up, down, left or right; 0 moves nothing.
-        generator: Where the moves are drawn from.
+        pixels: Largest shift up, down, left or right; 0 shifts nothing.
+        generator: Source of the shifts.
 
     Returns:
         Frames of the same shape.
@@ -28,7 +28,7 @@ def random_shift(frames: Tensor, pixels: int, generator: torch.Generator) -> Ten
 
 
 def shift_by_slices(frames: Tensor, offsets: Tensor, pixels: int) -> Tensor:
-    """Frames moved by `pixels` less offsets (batch, 2), in [0, 2 pixels]: copies of slices, the quickest on a CPU."""
+    """Frames shifted by `pixels` minus offsets (batch, 2) in [0, 2 * pixels], by copying slices: fastest on a CPU."""
     height, width = frames.shape[2:4]
     for axis in (2, 3):
         before, after = frames.narrow(axis, 0, 1), frames.narrow(axis, -1, 1)
@@ -41,7 +41,7 @@ def shift_by_slices(frames: Tensor, offsets: Tensor, pixels: int) -> Tensor:
 
 
 def shift_by_index(frames: Tensor, offsets: Tensor, pixels: int) -> Tensor:
-    """The same, reading nothing back from the device."""
+    """The result of `shift_by_slices` without reading values back to the host, as a CUDA graph requires."""
     for axis, offset in ((2, offsets[:, 0]), (3, offsets[:, 1])):
         size = frames.shape[axis]
         places = torch.arange(size, device=frames.device) + (offset[:, None] - pixels)
@@ -51,17 +51,17 @@ def shift_by_index(frames: Tensor, offsets: Tensor, pixels: int) -> Tensor:
 
 
 def quarter_turns(batch: Batch, share: float, generator: torch.Generator) -> tuple[Batch, Tensor]:
-    """Turn the pictures of some sequences by a quarter, a half or three quarters, and forget what came before them.
+    """Some sequences turned by one, two or three quarter turns, for bodies whose task is the same from every side.
 
-    For bodies seen from above, to which every side is the same: what is learned of one place holds for four.
+    A turned sequence starts from a belief of zeros, because its stored belief is about the unturned frames.
 
     Args:
-        batch: Sequences; their pictures are square.
-        share: Of the sequences that are turned, each as a whole, in [0, 1].
-        generator: Where they are drawn from.
+        batch: Sequences with square frames.
+        share: Share of the sequences that are turned, each as a whole, in [0, 1].
+        generator: Source of the turns.
 
     Returns:
-        The batch, with a belief of zeros where it is turned, and which sequences are as they were, bool (batch,).
+        The batch, and which sequences are not turned, bool (batch,).
     """
     size, device = len(batch.frames), batch.frames.device
     if share == 0.0:
@@ -73,12 +73,12 @@ def quarter_turns(batch: Batch, share: float, generator: torch.Generator) -> tup
 
 
 def turn_by_slices(frames: Tensor, amounts: Tensor) -> Tensor:
-    """Frames turned by quarters (batch,), in [0, 3]: the quickest on a CPU."""
+    """Frames turned by quarter turns (batch,) in [0, 3], sequence by sequence: fastest on a CPU."""
     turned = [torch.rot90(each, amount, (1, 2)) for each, amount in zip(frames, amounts.tolist(), strict=True)]
     return torch.stack(turned)
 
 
 def turn_by_index(frames: Tensor, amounts: Tensor) -> Tensor:
-    """The same, reading nothing back from the device."""
+    """The result of `turn_by_slices` without reading values back to the host, as a CUDA graph requires."""
     turned = torch.stack([torch.rot90(frames, amount, (2, 3)) for amount in range(4)])
     return turned[amounts, torch.arange(len(frames), device=frames.device)]

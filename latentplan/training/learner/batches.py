@@ -1,4 +1,4 @@
-"""Batches from replay, served to Lightning."""
+"""Batches of replayed sequences for Lightning."""
 
 from __future__ import annotations
 
@@ -17,15 +17,15 @@ from latentplan.training.learner.module import Learner
 
 
 class ReplayBatches(IterableDataset[Batch | Tensor]):
-    """The updates of one epoch: reads replay, so that nothing is fetched past a collection.
+    """The batches of one epoch, each drawn from replay when Lightning asks for it.
 
-    Sequences, or no more than the rows where they live, for a learner that gathers them itself.
+    A plain learner gets sequences; a `GraphedLearner`, which gathers sequences itself, gets rows (batch, time + 1).
 
     Args:
-        replay: Where sequences are drawn from.
+        replay: Source of the sequences.
         config: Settings of the run.
-        curriculum: What their rewards are.
-        learner: Whose updates they are: an epoch after a resumption draws other sequences than the one before.
+        curriculum: Chooses the rewards of the sequences.
+        learner: Receives the batches; its number of updates seeds the draws, so that a resumed run draws new ones.
     """
 
     def __init__(self, replay: Replay, config: Config, curriculum: Curriculum, learner: Learner) -> None:
@@ -37,8 +37,10 @@ class ReplayBatches(IterableDataset[Batch | Tensor]):
         return self.length
 
     def __iter__(self) -> Iterator[Batch | Tensor]:
-        """Draw the batches of this epoch, each when it is asked for."""
-        if self.curriculum.state.interrupted and not self.replay.written.any():  # there is nothing to draw from
+        """Draws the batches of this epoch one by one."""
+        if (
+            self.curriculum.state.interrupted and not self.replay.written.any()
+        ):  # the run stopped before it collected anything
             return
         learning = self.config.learning
         rng = np.random.default_rng(derive_seed(self.config.run.seed, "batches", self.learner.updates))
@@ -49,12 +51,16 @@ class ReplayBatches(IterableDataset[Batch | Tensor]):
 
 
 class ReplayData(lightning.LightningDataModule):
-    """Serves `ReplayBatches` unchanged: they are batches already, on the right device."""
+    """Serves `ReplayBatches` unchanged, since they are batches on the right device already.
+
+    Args:
+        batches: The batches of every epoch.
+    """
 
     def __init__(self, batches: ReplayBatches) -> None:
         super().__init__()
         self.batches = batches
 
     def train_dataloader(self) -> DataLoader[Batch | Tensor]:
-        """A loader that neither collates nor prefetches."""
+        """A loader without collation, worker processes or prefetching."""
         return DataLoader(self.batches, batch_size=None, num_workers=0)

@@ -1,7 +1,7 @@
-"""What is learned first: another reward, on the way to the run's own.
+"""Curriculum: replayed rewards of another task come first, and the run's own reward afterwards.
 
-The simulator tells with every frame what each task of the domain pays there, and the quantities that rewards can be
-made of, so one stream of experience serves all.
+The simulator labels every frame with the rewards of all tasks of the domain and with named quantities, so that the same
+experience serves every reward.
 """
 
 from __future__ import annotations
@@ -26,21 +26,20 @@ if TYPE_CHECKING:
 
 
 class Curriculum(lightning.Callback):
-    """Replaces replayed rewards by those of another task or expression until so many frames have been collected.
+    """Replaces replayed rewards by those of `learning.curriculum_task` for `learning.curriculum_frames` frames.
 
-    When they have, the value begins anew: where the agent no longer goes, an old value would stay high, and lure it.
+    The value head is then reset: old values of states that the agent no longer visits would stay high and attract it.
 
     Args:
-        config: Settings of the run: what comes first, and for how many simulator frames. Nothing is replaced when that
-            is the run's own task, or its own objective where it has one.
-        labels: The quantities that come with each frame, in their order, and their scales.
+        config: Settings of the run. Nothing is replaced if the curriculum's task is the run's own task or objective.
+        labels: Quantities that label each frame, in the order of their columns, and their scales.
         state: Clocks of the run.
 
     Attributes:
-        note: What there is to say of it, to be appended to the run's task; empty without another task.
+        note: Text about the curriculum for the run's task line; empty without another task.
 
     Raises:
-        UserError: The simulator does not tell what that task pays, and it is no expression of what is told.
+        UserError: `learning.curriculum_task` is neither a task nor an expression over the labels.
     """
 
     def __init__(self, config: Config, labels: Mapping[str, float], state: RunState) -> None:
@@ -55,7 +54,7 @@ class Curriculum(lightning.Callback):
             self.note = f"; first {first}, for {self._frames:,} frames"
 
     def __call__(self, batch: Batch) -> Batch:
-        """The batch as it is to be learned from now."""
+        """The batch with the rewards that are due at the present number of frames."""
         if not self._terms or self._is_over():
             return batch
         values = {name: batch.labels[..., column] for name, column in self._columns.items()}
@@ -63,9 +62,9 @@ class Curriculum(lightning.Callback):
         return batch._replace(rewards=summed_reward(torch.as_tensor(paid).expand(batch.labels.shape[:2]), self._repeat))
 
     def on_train_epoch_start(self, trainer: lightning.Trainer, learner: Learner) -> None:  # type: ignore[override]
-        """Have the value begun anew in the first epoch that learns the run's own reward."""
+        """Reset the value head in the first epoch that learns the run's own reward."""
         if self._terms and self._is_over() and not self.state.curriculum_over:
-            learner.forget_values()
+            learner.reset_value_head()
             self.state.curriculum_over = True
 
     def _is_over(self) -> bool:
@@ -73,7 +72,7 @@ class Curriculum(lightning.Callback):
 
 
 def _read(text: str, labels: Mapping[str, float]) -> tuple[tuple[float, Node], ...]:
-    """The weighted terms of a task's name, or of an expression over quantities."""
+    """Weighted terms of the reward, from a task's name or from an expression over quantities."""
     if TASK_PREFIX + text in labels:
         return ((1.0, Name(TASK_PREFIX + text)),)
     try:
@@ -81,20 +80,20 @@ def _read(text: str, labels: Mapping[str, float]) -> tuple[tuple[float, Node], .
     except UserError as error:
         tasks = [name.removeprefix(TASK_PREFIX) for name in labels if name.startswith(TASK_PREFIX)]
         raise UserError(
-            f"learning.curriculum_task {text!r} is unknown; this body's simulator tells what these tasks pay: "
+            f"learning.curriculum_task {text!r} is unknown; tasks with known rewards in this domain: "
             f"{', '.join(tasks) or 'none'}; as an expression: {error}"
         ) from None
 
 
 def summed_reward(values: Tensor, action_repeat: int) -> Tensor:
-    """What a decision earns, from what one control step pays at the frames before and after it.
+    """Reward per decision, from the reward per control step at the frames before and after the decision.
 
     Args:
-        values: Reward of a control step at each frame, (batch, time + 1).
-        action_repeat: Control steps per decision; what those between two frames pay is interpolated.
+        values: Reward of one control step at each frame, (batch, time + 1).
+        action_repeat: Control steps per decision; rewards between two frames are interpolated linearly.
 
     Returns:
-        Their sum over each decision, (batch, time).
+        Sum of the control steps' rewards over each decision, (batch, time).
     """
     before, after = values[:, :-1], values[:, 1:]
     return before * (action_repeat - 1) / 2 + after * (action_repeat + 1) / 2

@@ -1,4 +1,4 @@
-"""The learner on a GPU: its whole update as one CUDA graph."""
+"""The learner on a GPU: one update recorded as one CUDA graph."""
 
 from __future__ import annotations
 
@@ -12,32 +12,32 @@ from torch import Tensor
 from latentplan.config import LearningConfig, derive_seed
 from latentplan.models import WorldModel
 from latentplan.replay.buffer import Batch, Replay
-from latentplan.training.learner.module import Learner, refreshed
+from latentplan.training.learner.module import Learner, is_refreshed
 from latentplan.training.learner.optimization import descend_if_finite
 
 if TYPE_CHECKING:
     from latentplan.config import Config
     from latentplan.training.learner.curriculum import Curriculum
 
-WARM_UP_UPDATES = 3  # before the recording: libraries choose their kernels, and optimizers make their state
+WARM_UP_UPDATES = 3  # before the recording, while libraries choose kernels and optimizers create their state
 
 
 class GraphedLearner(Learner):
-    """Learns what `Learner` does, in one thread and one CUDA graph: recorded once, replayed for other sequences.
+    """Learns as `Learner` does, in one thread and one CUDA graph that is recorded once and then replayed.
 
-    `training_step` takes rows of replay, (batch, time + 1), instead of a batch. Gathering, augmentation, both losses,
-    clipping, both optimizers, the slow target, averages and the refreshed beliefs are all in the graph, which
-    reads nothing back to the host. So it cannot raise: an update whose gradient is not finite changes no weights, and
-    `catch_up` says so. On a CPU nothing is recorded; the same update is run as it is.
+    `training_step` takes rows of replay, (batch, time + 1), instead of a batch. The graph gathers and augments the
+    sequences, computes both losses, steps both optimizers, updates the slow target and the averages, and stores the new
+    beliefs. The graph reads nothing back to the host, so an update cannot raise: a gradient that is not finite changes
+    no weights, and `catch_up` reports the skipped update. On a CPU the same update runs without a recording.
 
     Args:
-        model: What is learned.
-        config: Losses and optimizers.
-        discount: Per decision.
-        replay: On the model's device.
-        seed: Of the noise of posterior, prior and actor samples.
-        prepare: What becomes of gathered sequences before they are learned from; recorded as it is then, so that it may
-            change where values are forgotten and nowhere else.
+        model: The world model with actor and value head.
+        config: Settings of losses and optimizers.
+        discount: Discount per decision.
+        replay: The replay, on the model's device.
+        seed: Seed of the noise in posterior, prior and actor samples.
+        prepare: Applied to gathered sequences; recorded in the graph, so its effect may change only together with
+            `reset_value_head`, which starts a new recording.
     """
 
     skipped: Tensor
@@ -59,10 +59,10 @@ class GraphedLearner(Learner):
         self._graph: torch.cuda.CUDAGraph | None = None
         self._outputs: dict[str, Tensor] = {}
         self._written = [*self.model.parameters(), *self.averaged.parameters()]
-        self._run_before, self._since_told = 0, 0
+        self._run_before, self._since_report = 0, 0
 
     def training_step(self, rows: Tensor, batch_index: int) -> None:  # type: ignore[override]
-        """One update of the world model and of behaviour from the sequences at rows of replay (batch, time + 1)."""
+        """Update world model and behaviour from the sequences at rows of replay, (batch, time + 1)."""
         if self._generator is None:
             self._generator = torch.Generator(self.device)
         self._rows.copy_(rows)
@@ -72,55 +72,53 @@ class GraphedLearner(Learner):
         self._generator.manual_seed(derive_seed(self.seed, "update", self.updates))
         if self._graph is not None:
             self._graph.replay()
-            # What keeps copies of weights until they change sees it by this count, which a graph leaves alone.
+            # Caches of weights watch the version counter, which a replayed graph does not increment.
             torch.autograd.graph.increment_version(self._written)
         elif self.device.type == "cuda":
             self._run_aside()
         else:
             self._outputs = self.update(self._generator)
         self.updates += 1
-        self._since_told += 1
+        self._since_report += 1
         self.metrics |= self._outputs
 
     def update(self, generator: torch.Generator) -> dict[str, Tensor]:
-        """What is recorded; the parts of the losses and the norms of the gradients, by name."""
+        """The recorded update; returns losses and gradient norms by name."""
         batch = self.prepare(self.replay.gather(self._rows))
-        learned, batch, unturned = self._learn_model(batch, generator)
+        learned, batch, is_unturned = self._learn_model(batch, generator)
         is_finite = torch.isfinite(learned.parts["model_grad_norm"])
-        self.replay.refresh(batch.rows, learned.states.deter, refreshed(batch, unturned & is_finite))
+        self.replay.refresh(batch.rows, learned.states.deter, is_refreshed(batch, is_unturned & is_finite))
         self.snapshot.refresh()
         parts = learned.parts | self._learn_behaviour(learned, batch, generator)
         self.skipped += ~(is_finite & torch.isfinite(parts["behaviour_grad_norm"]))
         return parts
 
     def catch_up(self) -> None:
-        """Say what was skipped since the last time; behaviour is up to date.
+        """Warn of updates skipped since the last call; behaviour needs no further update.
 
         Raises:
-            FloatingPointError: No update since then had finite gradients.
+            FloatingPointError: Every update since the last call was skipped.
         """
-        updates, skipped = self._since_told, int(self.skipped)
-        self._since_told = 0
+        updates, skipped = self._since_report, int(self.skipped)
+        self._since_report = 0
         self.skipped.zero_()
         if skipped == 0:
             return
-        told = (
-            f"{skipped} of the last {updates} updates, up to update {self.updates}, had gradients that are not finite"
-        )
+        report = f"gradients were not finite in {skipped} of the last {updates} updates, up to update {self.updates}"
         if skipped == updates:
-            raise FloatingPointError(told)
-        warnings.warn(f"{told}: they were skipped", RuntimeWarning, stacklevel=2)
+            raise FloatingPointError(report)
+        warnings.warn(f"{report}: these updates were skipped", RuntimeWarning, stacklevel=2)
 
-    def forget_values(self) -> None:
-        """As `Learner` does; what has been recorded holds the state of the optimizer that is forgotten."""
-        super().forget_values()
+    def reset_value_head(self) -> None:
+        """Reset as `Learner` does, and record anew, because the recorded graph uses the old optimizer state."""
+        super().reset_value_head()
         self._graph, self._run_before = None, 0
 
     def _descend(self, optimizer: torch.optim.Optimizer, loss: Tensor) -> Tensor:
         return descend_if_finite(optimizer, loss, self.config.max_grad_norm)
 
     def _run_aside(self) -> None:
-        """An update in a stream of its own, as recording wants those before it to be."""
+        """Run one update in a side stream, which CUDA requires of the updates before a recording."""
         assert self._generator is not None
         stream, own = torch.cuda.current_stream(self.device), torch.cuda.Stream(self.device)
         own.wait_stream(stream)
@@ -138,14 +136,14 @@ class GraphedLearner(Learner):
 
 
 def make_learner(model: WorldModel, config: Config, discount: float, replay: Replay, curriculum: Curriculum) -> Learner:
-    """The learner that a run's settings ask for.
+    """The learner that the settings select: graphed on a GPU with `learning.cuda_graph`, else plain.
 
     Args:
-        model: What is learned, where it stays.
+        model: The world model, on its device.
         config: Settings of the run.
-        discount: Per decision.
-        replay: Of the run.
-        curriculum: What rewards are learned.
+        discount: Discount per decision.
+        replay: Replay of the run.
+        curriculum: Chooses the rewards to learn.
     """
     settings, seed = config.learning, derive_seed(config.run.seed, "learner")
     if settings.cuda_graph and model.device.type == "cuda":

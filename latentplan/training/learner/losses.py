@@ -1,8 +1,11 @@
-"""What is learned: the world model from replay, and behaviour in its imagination."""
+"""The losses: of the world model on replayed sequences, and of behaviour on imagined rollouts.
+
+A loss is one function, registered under the name of its column in metrics.csv and with the setting of `LearningConfig`
+that weighs it. A new loss needs nothing else than its function here and its setting in `config/learning.py`.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import NamedTuple
 
 import torch
@@ -11,10 +14,10 @@ from torch import Tensor
 
 from latentplan.config import LearningConfig
 from latentplan.models import Gaussian, State, WorldModel, kl_divergence
-from latentplan.models.fast import pointwise, unroll
-from latentplan.models.heads import MAX_ACTION_STD, MIN_ACTION_STD, Actor, ScalarHead, sample_action
+from latentplan.models.heads import MAX_ACTION_STD, MIN_ACTION_STD, Actor, ScalarHead
 from latentplan.replay.buffer import Batch
 from latentplan.training.learner.augmentation import random_shift
+from latentplan.training.learner.registry import BEHAVIOUR_LOSSES, WORLD_MODEL_LOSSES, register, weighted_sum
 
 HALF_LOG_2_PI_E = 1.4189385  # entropy of a Gaussian is log std + this, in nats
 
@@ -23,10 +26,10 @@ class Imagination(NamedTuple):
     """Imagined rollouts under the actor.
 
     Attributes:
-        features: Of the states, the start first, (horizon + 1, rows, feature).
+        features: Features of the states, the start first, (horizon + 1, rows, feature).
         rewards: rewards[t] arrives with features[t + 1], (horizon, rows).
-        continues: Probability that the episode goes on at features[t + 1], (horizon, rows).
-        entropies: Of the action taken at features[t], in nats, (horizon, rows).
+        continues: Probability that the episode continues after features[t + 1], (horizon, rows).
+        entropies: Entropy in nats of the action taken at features[t], (horizon, rows).
     """
 
     features: Tensor
@@ -35,14 +38,84 @@ class Imagination(NamedTuple):
     entropies: Tensor
 
 
-class Learned(NamedTuple):
-    """What a pass over a batch came to.
+class Prediction(NamedTuple):
+    """Predictions of the world model over a batch of sequences; every world-model loss is a function of them.
 
     Attributes:
-        loss: Of the world model, a scalar.
+        model: The world model.
+        batch: The sequences.
+        config: Settings of learning.
+        features: Features of posterior states, (batch, time + 1, feature).
+        posterior: Distribution of the latent given the frame, (batch, time + 1, latent).
+        prior: Distribution of the latent before the frame, (batch, time + 1, latent).
+        patches: Decoded pictures, one row per frame, batch-major.
+        reward_logits: Predicted rewards, (batch, time, bin).
+        continue_logits: Predicted continuation, (batch, time).
+        open_loop: Features predicted from actions alone, (batch, reached, feature); see `_predict_open_loop`.
+        open_loop_reward_logits: Rewards predicted from these features, (batch, reached, bin).
+        open_loop_divergence: Mean KL of the open-loop priors to the posteriors, in nats, a scalar.
+        is_seen: 1 for frames up to the end of the episode, 0 beyond, (batch, time + 1).
+    """
+
+    model: WorldModel
+    batch: Batch
+    config: LearningConfig
+    features: Tensor
+    posterior: Gaussian
+    prior: Gaussian
+    patches: Tensor
+    reward_logits: Tensor
+    continue_logits: Tensor
+    open_loop: Tensor
+    open_loop_reward_logits: Tensor
+    open_loop_divergence: Tensor
+    is_seen: Tensor
+
+
+class Replayed(NamedTuple):
+    """Replayed states with the returns that followed them.
+
+    Attributes:
+        features: Features of states, (rows, batch, feature).
+        returns: Lambda-returns from these states on, (rows, batch).
+        weights: Weights of these states, with mean 1; 0 beyond the end of an episode, (rows, batch).
+    """
+
+    features: Tensor
+    returns: Tensor
+    weights: Tensor
+
+
+class Behaviour(NamedTuple):
+    """Imagined rollouts and replayed states with their returns; every behaviour loss is a function of them.
+
+    Attributes:
+        model: The world model, with the actor and the value head that learn.
+        config: Settings of learning.
+        imagined: Imagined rollouts.
+        returns: Lambda-returns of the imagined states but the last, (horizon, rows).
+        reach: Probability that a rollout has not ended before each of these states, (horizon, rows).
+        return_scale: Spread of the returns, by which the actor's loss divides them, a scalar.
+        replayed: Replayed states with their returns.
+    """
+
+    model: WorldModel
+    config: LearningConfig
+    imagined: Imagination
+    returns: Tensor
+    reach: Tensor
+    return_scale: Tensor
+    replayed: Replayed
+
+
+class Learned(NamedTuple):
+    """Results of a pass over a batch.
+
+    Attributes:
+        loss: Loss of the world model, a scalar.
         states: Posterior states, (batch, time + 1, ...), detached.
-        open_loop: Features predicted without looking for the frames 1 to n, (batch, n, feature), detached.
-        parts: The parts of the loss by name, detached.
+        open_loop: Features of frames 1 to n, predicted from actions alone, (batch, n, feature), detached.
+        parts: The recorded losses by name, detached.
     """
 
     loss: Tensor
@@ -52,12 +125,10 @@ class Learned(NamedTuple):
 
 
 def world_model_loss(model: WorldModel, batch: Batch, config: LearningConfig, generator: torch.Generator) -> Learned:
-    """Reconstruction, reward, continuation and balanced KL over a batch of sequences, and open-loop predictions.
+    """The loss of the world model over a batch of sequences, and its posterior and open-loop states.
 
-    What lies beyond a terminal state (see `Batch.within`) counts for nothing.
-
-    With `random_shift` the encoder sees moved frames while the decoder paints them unmoved, so that the latent need not
-    hold by how much.
+    Rows beyond a terminal state (see `Batch.within`) have no weight. With `random_shift` the encoder reads shifted
+    frames but the decoder reconstructs the unshifted ones, so that the latent need not hold the shift.
     """
     size, frames_per_sequence = batch.frames.shape[:2]
     moved = random_shift(batch.frames, config.random_shift, generator)
@@ -66,102 +137,127 @@ def world_model_loss(model: WorldModel, batch: Batch, config: LearningConfig, ge
     noise = torch.randn(
         size, frames_per_sequence, model.config.latent_dim, generator=generator, device=batch.frames.device
     )
-    states, posterior = unroll.observe(model.dynamics, embeddings, batch.actions, batch.deter, noise)
+    states, posterior = model.backend.observe(model, embeddings, batch.actions, batch.deter, noise)
     features = states.features
     overshooting, open_loop = _predict_open_loop(model, batch, states, posterior, config)
-    reached = open_loop.shape[1]
     with model.trunk_precision(cache=False):
         prior = model.dynamics.prior(states.deter)
         patches = model.decoder(features.flatten(0, 1))
         reward_logits = model.reward_head(features[:, 1:])
         open_loop_logits = model.reward_head(open_loop)
         continue_logits = model.continue_head(features[:, 1:]).squeeze(-1)
-    within = batch.within
-    ahead, seen = within[:, :reached], torch.cat([torch.ones_like(within[:, :1]), within], 1)
-    probe = batch.rewards.new_zeros(())
-    if model.labels:
-        probe = mean_within(_probe_errors(model, features, batch.labels), seen)
-        probe = probe + mean_within(_probe_errors(model, open_loop, batch.labels[:, 1 : reached + 1]), ahead)
-    binary_loss = torch.nn.functional.binary_cross_entropy_with_logits
-    parts = {
-        "reconstruction": mean_within(model.decoder.loss(patches, batch.frames.flatten(0, 1)), seen.flatten()),
-        "reward": mean_within(model.reward_head.loss(reward_logits, batch.rewards), within),
-        "open_loop_reward": mean_within(model.reward_head.loss(open_loop_logits, batch.rewards[:, :reached]), ahead),
-        "continue": mean_within(binary_loss(continue_logits, batch.continues, reduction="none"), within),
-        "dynamics": mean_within(_free_kl(_detached(posterior), prior, config.free_nats), seen),
-        "representation": mean_within(_free_kl(posterior, _detached(prior), config.free_nats), seen),
-        "overshooting": overshooting,
-        "probe": probe,
-    }
-    scales = {
-        "reconstruction": config.reconstruction_scale,
-        "reward": config.reward_scale,
-        "open_loop_reward": config.reward_scale,
-        "continue": 1.0,
-        "dynamics": config.dynamics_scale,
-        "representation": config.representation_scale,
-        "overshooting": config.overshooting_scale,
-        "probe": 1.0,
-    }
-    loss = torch.stack([scales[name] * part for name, part in parts.items()]).sum()
-    detached = {name: part.detach() for name, part in parts.items()}
-    return Learned(loss, State(*(part.detach() for part in states)), open_loop.detach(), detached)
+    prediction = Prediction(
+        model=model,
+        batch=batch,
+        config=config,
+        features=features,
+        posterior=posterior,
+        prior=prior,
+        patches=patches,
+        reward_logits=reward_logits,
+        continue_logits=continue_logits,
+        open_loop=open_loop,
+        open_loop_reward_logits=open_loop_logits,
+        open_loop_divergence=overshooting,
+        is_seen=torch.cat([torch.ones_like(batch.within[:, :1]), batch.within], 1),
+    )
+    loss, parts = weighted_sum(WORLD_MODEL_LOSSES, prediction, config)
+    return Learned(loss, State(*(part.detach() for part in states)), open_loop.detach(), parts)
+
+
+@register(WORLD_MODEL_LOSSES, "reconstruction", "reconstruction_scale")
+def _reconstruction(predicted: Prediction) -> Tensor:
+    """Squared error of the decoded picture, summed over the picture."""
+    errors = predicted.model.decoder.loss(predicted.patches, predicted.batch.frames.flatten(0, 1))
+    return mean_within(errors, predicted.is_seen.flatten())
+
+
+@register(WORLD_MODEL_LOSSES, "reward", "reward_scale")
+def _reward(predicted: Prediction) -> Tensor:
+    """Cross-entropy of the reward predicted from the posterior state, in nats."""
+    batch = predicted.batch
+    return mean_within(predicted.model.reward_head.loss(predicted.reward_logits, batch.rewards), batch.within)
+
+
+@register(WORLD_MODEL_LOSSES, "open_loop_reward", "reward_scale")
+def _open_loop_reward(predicted: Prediction) -> Tensor:
+    """Cross-entropy of the reward predicted from actions alone, as a planner predicts it, in nats."""
+    batch, reached = predicted.batch, predicted.open_loop.shape[1]
+    errors = predicted.model.reward_head.loss(predicted.open_loop_reward_logits, batch.rewards[:, :reached])
+    return mean_within(errors, batch.within[:, :reached])
+
+
+@register(WORLD_MODEL_LOSSES, "continue")
+def _continuation(predicted: Prediction) -> Tensor:
+    """Binary cross-entropy of the continuation of the episode, in nats."""
+    batch, binary_loss = predicted.batch, torch.nn.functional.binary_cross_entropy_with_logits
+    return mean_within(binary_loss(predicted.continue_logits, batch.continues, reduction="none"), batch.within)
+
+
+@register(WORLD_MODEL_LOSSES, "dynamics", "dynamics_scale")
+def _dynamics(predicted: Prediction) -> Tensor:
+    """KL balancing (Hafner et al. 2023): this half pulls the prior to the posterior, above the free nats."""
+    divergence = _free_kl(_detached(predicted.posterior), predicted.prior, predicted.config.free_nats)
+    return mean_within(divergence, predicted.is_seen)
+
+
+@register(WORLD_MODEL_LOSSES, "representation", "representation_scale")
+def _representation(predicted: Prediction) -> Tensor:
+    """KL balancing (Hafner et al. 2023): this half pulls the posterior to the prior, above the free nats."""
+    divergence = _free_kl(predicted.posterior, _detached(predicted.prior), predicted.config.free_nats)
+    return mean_within(divergence, predicted.is_seen)
+
+
+@register(WORLD_MODEL_LOSSES, "overshooting", "overshooting_scale")
+def _overshooting(predicted: Prediction) -> Tensor:
+    """Latent overshooting (Hafner et al. 2019, section 4): pulls open-loop priors to the posteriors."""
+    return predicted.open_loop_divergence
+
+
+@register(WORLD_MODEL_LOSSES, "probe")
+def _probe(predicted: Prediction) -> Tensor:
+    """Squared errors of labelled quantities read from posterior and open-loop features, in typical sizes."""
+    model, batch, reached = predicted.model, predicted.batch, predicted.open_loop.shape[1]
+    if not model.labels:
+        return batch.rewards.new_zeros(())
+    errors = mean_within(_probe_errors(model, predicted.features, batch.labels), predicted.is_seen)
+    open_loop_errors = _probe_errors(model, predicted.open_loop, batch.labels[:, 1 : reached + 1])
+    return errors + mean_within(open_loop_errors, batch.within[:, :reached])
+
+
+@register(BEHAVIOUR_LOSSES, "actor")
+def _actor(behaviour: Behaviour) -> Tensor:
+    """Minus the normalised return and the weighted entropy; the gradient flows through the dynamics."""
+    entropies = behaviour.config.entropy_scale * behaviour.imagined.entropies
+    return -(behaviour.reach * (behaviour.returns / behaviour.return_scale + entropies)).mean()
+
+
+@register(BEHAVIOUR_LOSSES, "value")
+def _value(behaviour: Behaviour) -> Tensor:
+    """Cross-entropy of the value head to returns of imagined rollouts, in nats."""
+    with behaviour.model.trunk_precision(cache=False):
+        features = behaviour.imagined.features[:-1]
+        return value_loss(behaviour.model.value_head, features, behaviour.returns, behaviour.reach)
+
+
+@register(BEHAVIOUR_LOSSES, "replayed_value", "replay_value_scale", is_recorded=False)
+def _replayed_value(behaviour: Behaviour) -> Tensor:
+    """Cross-entropy of the value head to returns of replayed sequences, in nats."""
+    with behaviour.model.trunk_precision(cache=False):
+        return value_loss(behaviour.model.value_head, *behaviour.replayed)
 
 
 def imagine(
     model: WorldModel, start: State, horizon: int, generator: torch.Generator, decay: float = 1.0
 ) -> Imagination:
-    """Roll the actor out in the model for `horizon` steps from rows of states; gradients and decay as in `roll_out`."""
-    if unroll.pays(start.deter):
-        action_noise, noise = _draws(model, horizon, len(start.deter), generator)
-        stacked, std = unroll.dream(model.dynamics, model.actor, start, action_noise, noise, decay)
-        entropies = _entropy(std)
-    else:
-        stacked, entropies = roll_out(model, model.actor, start, horizon, generator, decay)
+    """Roll the actor out in the model for `horizon` steps from rows of states; see `Dynamics.imagine`."""
+    stacked, std = model.backend.imagine(model, start, *draw_noise(model, horizon, len(start.deter), generator), decay)
     rewards = model.reward_head.mean(model.reward_head(stacked[1:]))
     continues = torch.sigmoid(model.continue_head(stacked[1:])).squeeze(-1)
-    return Imagination(stacked, rewards, continues, entropies)
+    return Imagination(stacked, rewards, continues, entropy(std))
 
 
-def roll_out(
-    model: WorldModel,
-    policy: Callable[[Tensor], tuple[Tensor, Tensor]],
-    start: State,
-    horizon: int,
-    generator: torch.Generator,
-    decay: float = 1.0,
-) -> tuple[Tensor, Tensor]:
-    """Follow samples of a policy and of the prior, with gradients through the dynamics.
-
-    The policy reads its state without a gradient, so that each action is credited along the dynamics alone
-    (Hafner et al. 2020, section 3).
-
-    Args:
-        model: What imagines.
-        policy: Mean and std of the action, (rows, action) each, for features (rows, feature).
-        start: Rows of states.
-        horizon: Steps.
-        generator: Of the samples.
-        decay: Share of a state's gradient that a step passes back to the state before, in [0, 1]. Where bodies touch,
-            gradients grow from step to step until they say nothing (Schrittwieser et al. 2020, appendix G, halve them).
-
-    Returns:
-        Features, the start first, (horizon + 1, rows, feature); entropies of the actions, in nats, (horizon, rows).
-    """
-    state, features, stds = start, [start.features], []
-    action_noise, noise = _draws(model, horizon, len(start.deter), generator)
-    for step in range(horizon):
-        mean, std = policy(features[-1].detach())
-        action = sample_action(mean, std, action_noise[step])
-        stds.append(std)
-        deter = model.dynamics.advance(State(*(_decayed(part, decay) for part in state)), action)
-        prior = model.dynamics.prior(deter)
-        state = State(deter, torch.addcmul(prior.mean, prior.std, noise[step]))
-        features.append(state.features)
-    return torch.stack(features), _entropy(torch.stack(stds))
-
-
-def _draws(model: WorldModel, horizon: int, rows: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:
+def draw_noise(model: WorldModel, horizon: int, rows: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:
     """Standard normal, for actions and latents, (horizon, rows, ...) each."""
     sizes = [model.action_dim, model.config.latent_dim]
     draws = torch.randn(horizon, rows, sum(sizes), generator=generator, device=model.device)
@@ -169,7 +265,7 @@ def _draws(model: WorldModel, horizon: int, rows: int, generator: torch.Generato
     return action_noise, noise
 
 
-def _entropy(std: Tensor) -> Tensor:
+def entropy(std: Tensor) -> Tensor:
     """Of Gaussian actions with a std (..., action), in nats, (...)."""
     return (std.log() + HALF_LOG_2_PI_E).sum(-1)
 
@@ -186,11 +282,6 @@ def lambda_return(rewards: Tensor, discounts: Tensor, values: Tensor, lambda_: f
     Returns:
         The return from state t on, (time, ...).
     """
-    returns: Tensor = pointwise.run(_lambda_return, rewards, discounts, values, lambda_)
-    return returns
-
-
-def _lambda_return(rewards: Tensor, discounts: Tensor, values: Tensor, lambda_: float) -> Tensor:
     following, returns = values[-1], []
     steps = zip(rewards.unbind(), discounts.unbind(), values.unbind(), strict=True)
     for reward, discount, value in reversed(list(steps)):
@@ -207,16 +298,16 @@ def value_loss(head: ScalarHead, features: Tensor, returns: Tensor, weights: Ten
 
 
 def imitation_loss(actor: Actor, features: Tensor, mean: Tensor, std: Tensor) -> Tensor:
-    """KL(planner || actor) in nats, summed over the action: (...).
+    """KL(planner || actor) in nats, summed over the action, (...).
 
-    This direction makes the actor cover what the planner would do. A std that the actor cannot have becomes the nearest
-    that it can: asked for less than its floor, it would push its output out to where the gradient vanishes.
+    This direction of the KL makes the actor cover the planner's actions. The planner's std is clamped into the range of
+    the actor's std: a target below that range would push the actor's output to where its gradient vanishes.
 
     Args:
-        actor: What learns; no gradient reaches further than its own weights.
-        features: Of the beliefs, (..., feature).
-        mean: Of the planner's first action, in [-1, 1], (..., action).
-        std: Of the planner's first action, (..., action).
+        actor: The actor that learns; only its own weights get a gradient.
+        features: Features of beliefs, (..., feature).
+        mean: Mean of the planner's first action, in [-1, 1], (..., action).
+        std: Std of the planner's first action, (..., action).
     """
     planned = Gaussian(mean, std.clamp(MIN_ACTION_STD, MAX_ACTION_STD))
     return kl_divergence(planned, Gaussian(*actor(features.detach())))
@@ -225,10 +316,10 @@ def imitation_loss(actor: Actor, features: Tensor, mean: Tensor, std: Tensor) ->
 def _predict_open_loop(
     model: WorldModel, batch: Batch, states: State, posterior: Gaussian, config: LearningConfig
 ) -> tuple[Tensor, Tensor]:
-    """KL and features of open-loop predictions, which are what a planner looks at (latent overshooting).
+    """KL and features of open-loop predictions: from actions alone, as a planner predicts.
 
-    From every `overshooting_horizon`-th posterior the true actions are followed by the mean of the prior, as a planner
-    does; each prior on the way is pulled to the posterior that saw the frame (Hafner et al. 2019, section 4).
+    Each prediction starts from every `overshooting_horizon`-th posterior and applies the true actions, with the mean of
+    the prior as the latent. The KL compares each prior with the posterior of the same frame.
     """
     length = batch.actions.shape[1]
     horizon = min(config.overshooting_horizon, length)
@@ -237,7 +328,7 @@ def _predict_open_loop(
         return sequence.unfold(1, horizon, horizon).movedim(-1, 2).flatten(0, 1)
 
     starts = [part[:, :-1].detach()[:, ::horizon][:, : length // horizon].flatten(0, 1) for part in states]
-    deter, prior = unroll.follow(model.dynamics, State(*starts), windows(batch.actions))
+    deter, prior = model.backend.predict(model, State(*starts), windows(batch.actions))
     seen = Gaussian(*(windows(part[:, 1:].detach()) for part in posterior))
     divergence = mean_within(_free_kl(seen, prior, config.free_nats), windows(batch.within))
     features = State(deter, prior.mean).features
@@ -247,12 +338,12 @@ def _predict_open_loop(
 
 
 def mean_within(values: Tensor, within: Tensor) -> Tensor:
-    """The mean of those values that count: within is 1 for these and 0 for others, of the same shape."""
+    """Mean of the values at which `within`, of the same shape, is 1 rather than 0; 0 if there is none."""
     return (values * within).sum() / within.sum().clamp_min(1.0)
 
 
 def _probe_errors(model: WorldModel, features: Tensor, labels: Tensor) -> Tensor:
-    """Squared errors of what is read off the latent, in typical sizes, (...); the latent learns nothing from them."""
+    """Mean squared error of the quantities read from features, in typical sizes, (...); features get no gradient."""
     with model.trunk_precision(cache=False):
         predicted = model.probe(features.detach())
     return ((predicted - labels) / model.label_scales).square().mean(-1)
@@ -260,11 +351,6 @@ def _probe_errors(model: WorldModel, features: Tensor, labels: Tensor) -> Tensor
 
 def _free_kl(left: Gaussian, right: Gaussian, free_nats: float) -> Tensor:
     return kl_divergence(left, right).clamp_min(free_nats)
-
-
-def _decayed(values: Tensor, share: float) -> Tensor:
-    """The same values, of whose gradient a share goes on."""
-    return values if share == 1.0 else values.detach().lerp(values, share)
 
 
 def _detached(gaussian: Gaussian) -> Gaussian:

@@ -1,43 +1,50 @@
-"""Steps that all learners share."""
+"""Optimizer steps and running averages that all learners share."""
 
 from __future__ import annotations
 
 import ctypes
 import os
-from collections.abc import Iterable
+from collections.abc import Sequence
 from typing import Any
 
 import torch
 from torch import Tensor
 
+from latentplan.models.backend import Backend
+
 RETURN_RANGE_RATE = 0.01
-AVERAGED_SHARE = 0.1  # of all updates, that the average is over at most
+AVERAGED_SHARE = 0.1  # the average covers at most this share of all updates
 _M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD = -1, -3  # names of <malloc.h>
 _KEPT_BYTES = {_M_TRIM_THRESHOLD: 2**31 - 1, _M_MMAP_THRESHOLD: 32 * 2**20}
 
 
 def descend(optimizer: torch.optim.Optimizer, loss: Tensor, max_norm: float, update: int) -> Tensor:
-    """One step down a loss, its gradient clipped; the norm that it had before.
+    """Makes one optimizer step on a loss with a clipped gradient.
+
+    Returns:
+        The norm of the gradient before clipping.
 
     Raises:
-        FloatingPointError: The gradient is not finite, at this update.
+        FloatingPointError: The gradient is not finite; the message names `update`.
     """
     norm = _clipped_gradient(optimizer, loss, max_norm)
     if not torch.isfinite(norm):
-        told = f"the gradient is not finite at update {update} (loss {loss.item()})"
-        raise FloatingPointError(f"{told}: lower the learning rate, or go on from the last save")
+        raise FloatingPointError(
+            f"the gradient is not finite at update {update} (loss {loss.item()}): "
+            "lower the learning rate, or resume from the last save"
+        )
     optimizer.step()
     return norm
 
 
 def descend_if_finite(optimizer: torch.optim.Optimizer, loss: Tensor, max_norm: float) -> Tensor:
-    """`descend` of a fused optimizer that reads nothing back: a gradient that is not finite changes nothing.
+    """Makes one step of a fused optimizer without reading values back; a gradient that is not finite changes nothing.
 
     Returns:
-        The norm that the gradient had before it was clipped; whether it is finite tells whether the step was taken.
+        The norm of the gradient before clipping; the step was made if and only if the norm is finite.
     """
     norm = _clipped_gradient(optimizer, loss, max_norm)
-    optimizer.found_inf = (~torch.isfinite(norm)).float()  # type: ignore[attr-defined]  # asks it to leave this step out
+    optimizer.found_inf = (~torch.isfinite(norm)).float()  # type: ignore[attr-defined]  # 1 skips the step
     optimizer.step()
     return norm
 
@@ -49,10 +56,10 @@ def _clipped_gradient(optimizer: torch.optim.Optimizer, loss: Tensor, max_norm: 
     return torch.nn.utils.clip_grad_norm_(parameters, max_norm)
 
 
-def take_up(optimizer: torch.optim.Optimizer, saved: dict[str, Any]) -> None:
-    """Give an optimizer the state that was saved of another one; whether a graph may record it stays its own matter.
+def load_optimizer_state(optimizer: torch.optim.Optimizer, saved: dict[str, Any]) -> None:
+    """Loads a saved state into an optimizer, but keeps the optimizer's own `capturable` flag.
 
-    That depends on the device, and a run may go on on another.
+    The flag depends on the device, and a run may resume on another device.
     """
     capturable = [group["capturable"] for group in optimizer.param_groups]
     optimizer.load_state_dict(saved)
@@ -61,29 +68,11 @@ def take_up(optimizer: torch.optim.Optimizer, saved: dict[str, Any]) -> None:
 
 
 @torch.no_grad()
-def follow(slow: Iterable[Tensor], fast: Iterable[Tensor], rate: float | Tensor) -> None:
-    """Move the parameters of a slow copy towards those that learn, by a share in [0, 1] of what is between them."""
-    behind, ahead = list(slow), list(fast)
-    if behind[0].is_cuda:
-        follow_together(behind, ahead, rate)
-        return
-    for one, other in zip(behind, ahead, strict=True):
-        one.lerp_(other, rate)
-
-
-@torch.no_grad()
-def follow_together(slow: list[Tensor], fast: list[Tensor], rate: float | Tensor) -> None:
-    """`follow` in a few kernels for all parameters, up to rounding."""
-    steps = torch._foreach_sub(fast, slow)
-    torch._foreach_mul_(steps, rate)
-    torch._foreach_add_(slow, steps)
-
-
-@torch.no_grad()
-def average(running: Iterable[Tensor], latest: Iterable[Tensor], count: Tensor, rate: float) -> None:
+def average(backend: Backend, running: Sequence[Tensor], latest: Sequence[Tensor], count: Tensor, rate: float) -> None:
     """Take the latest parameters into a running average over about the last tenth of all, and no more than 1 / rate.
 
     Args:
+        backend: Computes the average.
         running: The average.
         latest: The parameters as they are now.
         count: How many there have been before, a scalar; grows by one. On the parameters' device, so that a CUDA graph
@@ -91,15 +80,16 @@ def average(running: Iterable[Tensor], latest: Iterable[Tensor], count: Tensor, 
         rate: The least weight of the latest; with 1 there is no averaging.
     """
     count += 1.0
-    follow(running, latest, (1.0 / (AVERAGED_SHARE * count)).clamp(rate, 1.0))
+    backend.move_towards(running, latest, (1.0 / (AVERAGED_SHARE * count)).clamp(rate, 1.0))
 
 
 def return_scale(range_so_far: Tensor, returns: Tensor) -> Tensor:
-    """Spread of returns between their 5th and 95th percentile, at least 1; `range_so_far` follows it, smoothed from 0.
+    """Running spread of returns between their 5th and 95th percentile, at least 1 (Hafner et al. 2023, eq. 7).
 
-    It stays where it is when the spread is not finite; the loss of such returns is not finite either.
-
-    Hafner et al. 2023, eq. 7.
+    Args:
+        range_so_far: Running spread, a scalar that starts at 0; updated in place. A spread that is not finite leaves it
+            unchanged; the loss of such returns is not finite either.
+        returns: Returns, of any shape.
     """
     flat = returns.flatten()
     spread = torch.quantile(flat, 0.95) - torch.quantile(flat, 0.05)
@@ -108,10 +98,10 @@ def return_scale(range_so_far: Tensor, returns: Tensor) -> Tensor:
 
 
 def keep_freed_memory() -> bool:
-    """Ask the C library to keep the memory that this process frees, for the next update; False where it cannot.
+    """Makes the C library keep freed memory for the next update; returns whether the library could do so.
 
-    Every update allocates the same large tensors. By default glibc hands such blocks back to the system at once, which
-    then clears each page again before its next use (mallopt(3): M_MMAP_THRESHOLD, M_TRIM_THRESHOLD).
+    Every update allocates the same large tensors. By default glibc returns such blocks to the system at once, and the
+    system clears every page before its next use (mallopt(3): M_MMAP_THRESHOLD, M_TRIM_THRESHOLD).
     """
     mallopt = getattr(ctypes.CDLL(None), "mallopt", None) if os.name == "posix" else None
     return mallopt is not None and all(mallopt(option, size) == 1 for option, size in _KEPT_BYTES.items())

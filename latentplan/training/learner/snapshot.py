@@ -1,4 +1,4 @@
-"""A frozen copy of the world model, for behaviour to dream in while the model itself goes on learning."""
+"""A frozen copy of the world model, in which behaviour imagines while the model itself learns."""
 
 from __future__ import annotations
 
@@ -12,13 +12,16 @@ from latentplan.models.heads import Mlp
 
 
 class Snapshot:
-    """The world model as it was after some update, with the actor and the value that go on learning in it.
+    """A copy of a world model with frozen dynamics, reward and continue heads, and the same actor and value head.
 
-    The weights of the trunk's products are kept in the model's `trunk_dtype`, which is what autocast would make of them
-    at every use; norms and the last layers of heads stay in float32.
+    Weights of matrix products are stored in the model's `trunk_dtype`, to which autocast would convert them at every
+    use. Norms and the last layers of heads stay in float32.
 
     Args:
-        model: What is copied; the snapshot shares its actor and its value head.
+        model: The world model to copy.
+
+    Attributes:
+        model: The frozen copy.
     """
 
     def __init__(self, model: WorldModel) -> None:
@@ -37,6 +40,6 @@ class Snapshot:
 
     @torch.no_grad()
     def refresh(self) -> None:
-        """Take over the weights that the model has now."""
+        """Copy the present weights of the model."""
         frozen, original = zip(*self._pairs, strict=True)
         torch._foreach_copy_(list(frozen), list(original))

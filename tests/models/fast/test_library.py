@@ -1,5 +1,4 @@
-import subprocess
-import sys
+"""Compiled kernels compute what torch computes, and torch computes where they are missing."""
 
 import pytest
 import torch
@@ -7,9 +6,14 @@ import torch
 from latentplan.models.fast import library as kernels
 
 DTYPES = [torch.bfloat16, torch.float32]
-ROWS, SIZE = 37, 45  # neither is a multiple of what a vector holds
-COMPILED = kernels.load()
-compiled = pytest.mark.skipif(COMPILED is None, reason="no C compiler")
+ROWS, SIZE = 37, 45  # neither is a multiple of a vector's length
+
+
+@pytest.fixture
+def compiled():
+    """Skips a test where the kernels cannot be compiled."""
+    if kernels.load() is None:
+        pytest.skip("no C compiler")
 
 
 def draw(*shape, dtype=torch.float32, seed=0):
@@ -20,8 +24,8 @@ def norm(size):
     return 1.0 + 0.3 * draw(size, seed=1), 0.3 * draw(size, seed=2)
 
 
-def asked(name, dtype):
-    """One call of each kernel: what it makes of the same input whenever it is asked."""
+def make_call(name, dtype):
+    """A function that calls a kernel with the same input every time, for some rows."""
     if name == "norm_silu":
         return lambda row=slice(None): (kernels.norm_silu(4.0 * draw(ROWS, SIZE, dtype=dtype)[row] + 1.0, norm(SIZE)),)
     if name == "gates":
@@ -34,28 +38,30 @@ def asked(name, dtype):
 CASES = [(name, dtype) for name in ("norm_silu", "gates") for dtype in DTYPES] + [("expectation", torch.float32)]
 
 
-@compiled
+@pytest.mark.usefixtures("compiled")
 @pytest.mark.parametrize(("name", "dtype"), CASES)
-def test_the_compiled_kernel_does_what_torch_does(name, dtype, monkeypatch):
-    ask = asked(name, dtype)
-    fused = ask()
+def test_compiled_kernel_equals_torch(name, dtype, monkeypatch):
+    call = make_call(name, dtype)
+    fused = call()
     monkeypatch.setattr(kernels, "load", lambda: None)
-    for left, right in zip(fused, ask(), strict=True):
+    for left, right in zip(fused, call(), strict=True):
         assert left.dtype == right.dtype and left.shape == right.shape
         precision = 2e-2 if left.dtype == torch.bfloat16 else 2e-5
         assert torch.allclose(left.float(), right.float(), rtol=precision, atol=precision)
 
 
 @pytest.mark.parametrize(("name", "dtype"), CASES)
-def test_rows_do_not_depend_on_each_other(name, dtype):
-    ask = asked(name, dtype)
-    for whole, part in zip(ask(), ask(slice(5, 6)), strict=True):
+def test_kernel_computes_each_row_independently(name, dtype):
+    call = make_call(name, dtype)
+    for whole, part in zip(call(), call(slice(5, 6)), strict=True):
         # Torch takes the end of a tensor another way than its middle, which shows in the last bit.
-        assert torch.equal(whole[5:6], part) if COMPILED else torch.allclose(whole[5:6], part, rtol=1e-2, atol=1e-6)
+        assert (
+            torch.equal(whole[5:6], part) if kernels.load() else torch.allclose(whole[5:6], part, rtol=1e-2, atol=1e-6)
+        )
 
 
 @pytest.mark.parametrize("dtype", DTYPES)
-def test_nan_stays_nan_and_stays_in_its_row(dtype):
+def test_kernel_keeps_nan_in_its_row(dtype):
     product, wide, logits = draw(3, SIZE, dtype=dtype), draw(3, 3 * SIZE, dtype=dtype), draw(3, SIZE)
     for rows in (product, wide, logits):
         rows[1, 7] = float("nan")
@@ -69,21 +75,21 @@ def test_nan_stays_nan_and_stays_in_its_row(dtype):
         assert result[[0, 2]].isfinite().all()
 
 
-def test_extreme_inputs_saturate():
+def test_kernel_saturates_for_extreme_inputs():
     far = torch.tensor([[3e38, -3e38, 0.0], [200.0, -200.0, 0.0]])
     assert kernels.expectation(far, torch.tensor([1.0, 2.0, 3.0])).tolist() == [1.0, 1.0]
     following, _ = kernels.gates(draw(4, 6) * 1e4, (torch.full((6,), 1e4), torch.zeros(6)), draw(4, 2))
     assert following.isfinite().all()
 
 
-def test_only_float32_logits_reach_the_compiled_expectation():
+def test_expectation_uses_torch_for_bfloat16_logits():
     logits, values = draw(3, 5, dtype=torch.bfloat16), draw(5, dtype=torch.bfloat16)
     assert torch.equal(kernels.expectation(logits, values), logits.softmax(-1) @ values)
     with pytest.raises(RuntimeError):
         kernels.expectation(logits, values.float())  # as torch has it; the kernel would read beyond the end
 
 
-def test_gradients_pass_where_they_are_asked_for():
+def test_kernel_passes_gradients_when_inputs_require_them():
     product, deter = draw(4, 6).requires_grad_(), draw(4, 2).requires_grad_()
     before = product.detach().clone()
     following, _ = kernels.gates(product, norm(6), deter)
@@ -92,28 +98,27 @@ def test_gradients_pass_where_they_are_asked_for():
     assert torch.equal(product, before)
 
 
-@compiled
-def test_a_machine_without_a_compiler_or_with_a_broken_one_goes_on_in_torch(tmp_path):
-    program = "from latentplan.models.fast import library; print(library.load())"
-    for settings in ({"CC": "false"}, {"CC": "/nowhere/cc"}, {"LATENTPLAN_KERNELS": "0"}):
-        environment = {"XDG_CACHE_HOME": str(tmp_path), "PYTHONPATH": ".", **settings}
-        done = subprocess.run([sys.executable, "-c", program], env=environment, capture_output=True, text=True)
-        assert done.stdout.strip() == "None", done.stderr
-
-
-@compiled
-def test_without_a_home_torch_does_it(monkeypatch):
-    def nobodys():
-        raise RuntimeError("Could not determine home directory.")
-
-    monkeypatch.delenv("XDG_CACHE_HOME", raising=False)
-    monkeypatch.setattr(kernels.Path, "home", nobodys)
+@pytest.mark.parametrize("settings", [{"CC": "false"}, {"CC": "/nowhere/cc"}, {"LATENTPLAN_KERNELS": "0"}])
+def test_load_returns_none_without_a_working_compiler(settings, tmp_path, monkeypatch):
+    for name, value in {"XDG_CACHE_HOME": str(tmp_path), **settings}.items():
+        monkeypatch.setenv(name, value)
     assert kernels.load.__wrapped__() is None
 
 
-@compiled
-def test_kernels_are_compiled_once_and_kept(tmp_path, monkeypatch):
+@pytest.mark.usefixtures("compiled")
+def test_load_returns_none_without_a_home_directory(monkeypatch):
+    def unknown_home():
+        raise RuntimeError("Could not determine home directory.")
+
+    monkeypatch.delenv("XDG_CACHE_HOME", raising=False)
+    monkeypatch.setattr(kernels.Path, "home", unknown_home)
+    assert kernels.load.__wrapped__() is None
+
+
+@pytest.mark.usefixtures("compiled")
+def test_compiled_builds_the_library_once_and_keeps_it(tmp_path, monkeypatch):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    monkeypatch.setattr(kernels, "FLAGS", ("-O0", "-fopenmp", "-shared", "-fPIC"))  # compiles quickly
     first = kernels._compiled()
     made = first.stat().st_mtime_ns
     assert kernels._compiled() == first and first.stat().st_mtime_ns == made

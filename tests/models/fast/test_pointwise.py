@@ -6,7 +6,7 @@ import torch
 from latentplan.models.fast import pointwise
 
 
-def test_where_torch_cannot_compile_it_says_so_once_and_goes_on(monkeypatch):
+def test_can_compile_warns_once_when_torch_cannot_compile(monkeypatch):
     def broken(function, **options):
         raise RuntimeError("no C compiler\nand more")
 

@@ -1,4 +1,8 @@
-"""Collection: what replay is handed is what the environment did."""
+"""Collection: rows for replay match what happened in the environment."""
+
+import multiprocessing
+import os
+import signal
 
 import numpy as np
 import pytest
@@ -6,7 +10,7 @@ import torch
 
 from latentplan.config import CollectionConfig, UserError
 from latentplan.models import WorldModel
-from latentplan.training.callbacks import turn
+from latentplan.training.callbacks import choose_behaviour
 from latentplan.training.collection.collector import Collector
 
 
@@ -30,15 +34,15 @@ def make_collector(tiny, dot):
 
 
 def place_of(frames):
-    """Where the dot is, in [-1, 1], from frames (n, 64, 64, 3) of a picture of 16 columns."""
+    """Position of the dot in [-1, 1], from frames (n, 64, 64, 3) of a picture with 16 columns."""
     columns = frames[:, 0, :, 0].astype(float)
     return ((columns * np.arange(64)).sum(1) / columns.sum(1) / 4.0 - 0.375 - 7.5) / 7.0
 
 
-def test_rows_follow_the_dynamics_of_the_environment(make_collector):
+def test_collector_returns_rows_that_obey_the_dynamics_of_the_environment(make_collector):
     collected = make_collector().collect(None, "random", 45, 0)
     (rows,) = collected.rows
-    assert len(rows.frames) == 47  # every frame once, and the last one of two episodes without an action
+    assert len(rows.frames) == 47  # each frame once; the last frames of two episodes have no action
     assert (collected.decisions, collected.env_frames, len(collected.episode_returns)) == (45, 45, 2)
     assert np.flatnonzero(rows.is_first).tolist() == [0, 21, 42]
     place = place_of(rows.frames)
@@ -51,7 +55,7 @@ def test_rows_follow_the_dynamics_of_the_environment(make_collector):
     assert collected.episode_returns == pytest.approx([rows.rewards[:20].sum(), rows.rewards[21:41].sum()], rel=1e-5)
 
 
-def test_rounds_continue_the_episode(make_collector):
+def test_collector_continues_episodes_between_rounds(make_collector):
     whole, parts = make_collector(), make_collector()
     (expected,) = whole.collect(None, "random", 30, 0).rows
     first, second = (parts.collect(None, "random", 15, counter).rows[0] for counter in (0, 1))
@@ -61,7 +65,7 @@ def test_rounds_continue_the_episode(make_collector):
     assert place[1] == pytest.approx(np.clip(place[0] + 0.2 * first.actions[-1, 0], -1, 1), abs=1.0 / 7.0)
 
 
-def test_an_end_of_the_task_is_told_from_the_time_limit(make_collector, dot):
+def test_collector_marks_terminal_states_but_not_time_limits(make_collector, dot):
     class Ending(dot):
         def step(self, action):
             picture, reward, _, truncated, info = super().step(action)
@@ -73,29 +77,29 @@ def test_an_end_of_the_task_is_told_from_the_time_limit(make_collector, dot):
     assert (limited.continues == 1.0).all()
 
 
-def test_episodes_cut_short_restart_and_do_not_count_as_ends_of_the_task(make_collector):
+def test_collector_restarts_shortened_episodes_without_marking_terminal_states(make_collector):
     collector = make_collector(collection={"episode_decisions": 8})
     first, second = (collector.collect(None, "random", count, counter) for counter, count in enumerate((20, 10)))
     (rows,), (later,) = first.rows, second.rows
     assert np.flatnonzero(rows.is_first).tolist() == [0, 9, 18]
-    assert np.flatnonzero(later.is_first).tolist() == [5]  # the third episode goes on through the round's end
+    assert np.flatnonzero(later.is_first).tolist() == [5]  # the third episode continues in the second round
     assert (rows.continues == 1.0).all() and (len(first.episode_returns), len(second.episode_returns)) == (2, 1)
     assert first.episode_returns == pytest.approx([rows.rewards[:8].sum(), rows.rewards[9:17].sum()], rel=1e-5)
 
 
-def test_an_evaluation_goes_on_without_a_film_that_cannot_be_made(make_collector, tmp_path):
+def test_evaluate_warns_when_the_film_cannot_be_written(make_collector, tmp_path):
     with pytest.warns(RuntimeWarning, match="no film at"):
         returns = make_collector().evaluate(2, film=tmp_path / "missing" / "film.webm")
     assert [len(returns[mode]) for mode in ("planner", "actor")] == [2, 2]
 
 
-def test_evaluations_are_whole_where_collection_is_cut_short(make_collector, tiny):
+def test_evaluate_plays_whole_episodes_when_collection_shortens_them(make_collector, tiny):
     weights = weights_of(tiny(""))
     cut, whole = make_collector(collection={"episode_decisions": 8}), make_collector()
     assert cut.evaluate(2, weights=weights) == whole.evaluate(2, weights=weights)
 
 
-def test_beliefs_are_stored_beside_their_frames(make_collector, tiny):
+def test_collector_stores_the_belief_of_each_frame(make_collector, tiny):
     collector = make_collector()
     (rows,) = collector.collect(weights_of(tiny("")), "actor", 25, 0).rows
     assert rows.deter.shape == (26, 16)
@@ -104,9 +108,7 @@ def test_beliefs_are_stored_beside_their_frames(make_collector, tiny):
 
 
 @pytest.mark.parametrize("behaviour", ["planner", "actor"])
-def test_what_is_stored_of_an_agent_that_turns_its_frames_is_the_belief_of_those_stored(
-    make_collector, tiny, behaviour
-):
+def test_collector_stores_the_belief_of_the_unturned_frame_when_the_agent_turns_frames(make_collector, tiny, behaviour):
     turns = {"model": {"turns": 4}, "learning": {"turned_share": 0.5}}
     config, collector = tiny("", **turns), make_collector(**turns)
     (rows,) = collector.collect(weights_of(config), behaviour, 10, 0).rows
@@ -118,7 +120,7 @@ def test_what_is_stored_of_an_agent_that_turns_its_frames_is_the_belief_of_those
 
 
 @pytest.mark.parametrize("behaviour", ["planner", "actor"])
-def test_collection_follows_from_seed_round_and_weights(make_collector, tiny, behaviour):
+def test_collector_repeats_a_round_with_the_same_seed_round_and_weights(make_collector, tiny, behaviour):
     weights = weights_of(tiny(""))
     one, same, other = (make_collector().collect(weights, behaviour, 12, counter).rows[0] for counter in (3, 3, 4))
     assert np.array_equal(one.actions, same.actions) and np.array_equal(one.frames, same.frames)
@@ -126,55 +128,27 @@ def test_collection_follows_from_seed_round_and_weights(make_collector, tiny, be
     assert np.abs(one.actions).max() <= 1.0
 
 
+def test_choose_behaviour_gives_goals_their_share_and_alternates_planner_and_actor():
+    settings = CollectionConfig(behaviour="both", goals=("a", "b"), goal_share=0.2, goals_after=1000)
+    chosen = [choose_behaviour(settings, rounds, 100 * rounds) for rounds in range(60)]
+    assert chosen[:10] == [("planner", None), ("actor", None)] * 5  # no goals before 1,000 frames
+    assert [goal for _, goal in chosen[10:] if goal] == ["a", "b"] * 5
+    assert {behaviour for behaviour, goal in chosen if goal} == {"planner"}
+    others = [behaviour for behaviour, goal in chosen[10:] if goal is None]
+    assert others == ["planner", "actor"] * 20
+
+
 @pytest.mark.parametrize("behaviour", ["planner", "actor"])
-def test_a_round_without_noise_acts_as_agents_are_judged(make_collector, tiny, behaviour):
-    """Noise or none, nothing else differs: the noiseless round is that of an agent that has no noise to add."""
-    weights = weights_of(tiny(""))
-    noiseless, explored = (
-        make_collector().collect(weights, behaviour, 12, 3, noisy).rows[0] for noisy in (False, True)
-    )
-    assert not np.array_equal(noiseless.actions, explored.actions)
-    if behaviour == "planner":
-        (expected,) = make_collector(collection={"noise_std": 0.0}).collect(weights, behaviour, 12, 3).rows
-        assert np.array_equal(noiseless.actions, expected.actions)
-    else:  # the mode of the actor is a function of the frame and the past alone
-        (other,) = make_collector().collect(weights, behaviour, 12, 3, False).rows
-        assert np.array_equal(noiseless.actions, other.actions) and (np.abs(noiseless.actions) < 0.1).all()
+def test_choose_behaviour_keeps_a_single_behaviour(behaviour):
+    settings = CollectionConfig(behaviour=behaviour)
+    assert {choose_behaviour(settings, rounds, 0) for rounds in range(5)} == {(behaviour, None)}
 
 
-def _turns(count, **settings):
-    return [turn(CollectionConfig(**settings), rounds, 100 * rounds)[:2] for rounds in range(count)]
-
-
-def test_goals_take_their_share_in_turn_and_leave_the_rest_as_it_was():
-    settings = CollectionConfig(behaviour="both", noise_share=0.5, goals=("a", "b"), goal_share=0.2, goals_after=1000)
-    turns = [turn(settings, rounds, 100 * rounds) for rounds in range(60)]
-    assert all(goal is None for _, _, goal in turns[:10])
-    pursued = [entry for entry in turns[10:] if entry[2] is not None]
-    assert [goal for _, _, goal in pursued] == ["a", "b"] * 5
-    assert {who for who, _, _ in pursued} == {"planner"} and sum(noisy for _, noisy, _ in pursued) == 5
-    others = [entry[:2] for entry in turns[10:] if entry[2] is None]
-    assert {entry: others.count(entry) for entry in others} == {
-        (who, noisy): 10 for who in ("planner", "actor") for noisy in (True, False)
-    }
-
-
-def test_a_share_of_no_goals_is_refused():
+def test_collection_config_refuses_goals_without_share_and_share_without_goals():
     with pytest.raises(ValueError, match="goal_share needs goals"):
         CollectionConfig(goal_share=0.1)
     with pytest.raises(ValueError, match="need a goal_share"):
         CollectionConfig(goals=("upright",))
-
-
-def test_planner_and_actor_share_the_noise_evenly():
-    assert _turns(4, behaviour="actor") == [("actor", True)] * 4
-    assert _turns(4, behaviour="planner", noise_share=0.0) == [("planner", False)] * 4
-    turns = _turns(40, behaviour="both", noise_share=0.25)
-    assert {name: [who for who, _ in turns].count(name) for name in ("planner", "actor")} == {
-        "planner": 20,
-        "actor": 20,
-    }
-    assert [sum(noisy for who, noisy in turns if who == name) for name in ("planner", "actor")] == [5, 5]
 
 
 @pytest.fixture
@@ -191,62 +165,76 @@ def make_cart(tiny):
         collector.close()
 
 
-def test_a_round_for_a_goal_plans_for_it_and_leaves_nothing_to_imitate(make_cart):
-    goals = ("cart -> 0.8", "cart -> -0.8")
-    both = make_cart(goals=goals, goal_share=0.5, noise_std=0.0)
-    weights = {name: value.numpy().copy() for name, value in both.model.state_dict().items()}
-    plain, *pursued = (
-        make_cart(goals=goals, goal_share=0.5, noise_std=0.0).collect(weights, "planner", 8, 0, True, goal).rows[0]
-        for goal in (None, *goals)
-    )
-    assert (plain.plan != 0.0).any() and all((rows.plan == 0.0).all() for rows in pursued)
-    assert not np.array_equal(plain.actions, pursued[0].actions)
-    assert not np.array_equal(pursued[0].actions, pursued[1].actions)
-    both.collect(weights, "planner", 8, 0, True, goals[0])
-    (after,) = both.collect(weights, "planner", 8, 1).rows
-    assert (after.plan != 0.0).any()
+def test_collector_plans_for_the_goal_of_a_round(make_cart):
+    collector = make_cart(goals=("cart -> 0.8", "cart -> -0.8"), goal_share=0.5, noise_std=0.0)
+    weights = {name: value.numpy().copy() for name, value in collector.model.state_dict().items()}
+    planned_for = []
+    for counter, goal in enumerate((None, "cart -> 0.8", "cart -> -0.8", None)):
+        collector.collect(weights, "planner", 2, counter, goal)
+        planned_for.append(collector._acting.controller.objective)
+    reward, right, left, again = planned_for
+    assert reward is None and again is None
+    assert right is not None and left is not None and right is not left
 
 
 @pytest.mark.parametrize(("goal", "said"), [("cart -> ", "expected"), ("height > 1.0", "height")])
-def test_goals_that_cannot_be_pursued_are_refused_before_anything_is_collected(make_cart, goal, said):
+def test_collector_refuses_goals_that_cannot_be_pursued(make_cart, goal, said):
     with pytest.raises(UserError, match=said):
         make_cart(goals=("cart -> 0.5", goal), goal_share=0.5)
 
 
-def test_judging_neither_explores_nor_disturbs_the_collection(make_collector, tiny):
+def test_evaluate_neither_explores_nor_disturbs_collection(make_collector, tiny):
     weights = weights_of(tiny(""))
-    judged, plain = make_collector(), make_collector()
-    for collector in (judged, plain):
+    evaluated, plain = make_collector(), make_collector()
+    for collector in (evaluated, plain):
         collector.collect(weights, "planner", 7, 0)
-    first, again = judged.evaluate(2), judged.evaluate(2)
+    first, again = evaluated.evaluate(2), evaluated.evaluate(2)
+    assert evaluated.evaluate(2, actor=False) == {"planner": first["planner"]}
     assert first == again and first.keys() == {"planner", "actor"}
     assert all(len(returns) == 2 for returns in first.values())
-    following = [collector.collect(weights, "planner", 7, 1).rows[0] for collector in (judged, plain)]
+    following = [collector.collect(weights, "planner", 7, 1).rows[0] for collector in (evaluated, plain)]
     assert np.array_equal(following[0].actions, following[1].actions)
     assert np.array_equal(following[0].frames, following[1].frames)
 
 
-def test_the_last_frame_of_an_episode_has_labels_of_its_own(make_cart):
+def test_collector_stores_the_labels_of_an_episodes_last_frame(make_cart):
     alone, followed = (make_cart(episode_decisions=5).collect(None, "random", n, 0).rows[0] for n in (5, 10))
     assert followed.is_first[6] and np.array_equal(followed.labels[:6], alone.labels)
     assert not np.array_equal(followed.labels[5], followed.labels[6])
 
 
-def test_several_environments_may_tell_lists_of_any_length(make_collector, dot):
-    class Telling(dot):
+@pytest.fixture(scope="module")
+def two_environments(tiny, dot):
+    """A collector of two environments in processes of their own, with info entries of changing length."""
+
+    class Tracing(dot):
         def step(self, action):
             *rest, _ = super().step(action)
             return *rest, {"trace": np.zeros(self.steps + int(10 * abs(self.place)))}
 
-    (first, second) = make_collector(Telling, env={"num_envs": 2}).collect(None, "random", 12, 0).rows
-    assert len(first.frames) == len(second.frames) == 6
-
-
-def test_a_step_that_failed_is_not_waited_for(make_collector, monkeypatch):
-    monkeypatch.setattr("latentplan.training.collection.collector.CLOSING_SECONDS", 0.2)
-    collector = make_collector(env={"num_envs": 2})
-    collector.collect(None, "random", 4, 0)
-    monkeypatch.setattr(collector.envs, "_add_info", lambda *_: 1 / 0)
-    with pytest.raises(ZeroDivisionError):
-        collector.collect(None, "random", 4, 1)
+    collector = Collector(tiny("", env={"num_envs": 2}), Tracing, "cpu")
+    yield collector
     collector.close()
+
+
+def test_collector_accepts_info_entries_of_changing_length_from_several_environments(two_environments):
+    first, second = two_environments.collect(None, "random", 12, 0).rows
+    assert len(first.frames) == len(second.frames) >= 6
+
+
+def test_environments_in_processes_ignore_interrupts(two_environments):
+    children = multiprocessing.active_children()
+    assert len(children) == 2
+    for child in children:
+        os.kill(child.pid, signal.SIGINT)
+    assert two_environments.collect(None, "random", 6, 0).decisions == 6
+
+
+def test_close_returns_after_a_step_that_failed(two_environments, monkeypatch):
+    """Runs last in this file: the environments are closed after it."""
+    monkeypatch.setattr("latentplan.training.collection.collector.CLOSING_SECONDS", 0.2)
+    two_environments.collect(None, "random", 4, 0)
+    monkeypatch.setattr(two_environments.envs, "_add_info", lambda *_: 1 / 0)
+    with pytest.raises(ZeroDivisionError):
+        two_environments.collect(None, "random", 4, 1)
+    two_environments.close()

@@ -1,8 +1,4 @@
-"""Workers: the same answers in this process and in another, in order, and nothing left behind."""
-
-import multiprocessing
-import os
-import signal
+"""Workers: results in order, from this process and from another one that leaves nothing behind."""
 
 import numpy as np
 import pytest
@@ -11,7 +7,7 @@ from latentplan.config import UserError
 from latentplan.training.collection.process import LocalWorker, RemoteWorker
 
 
-def test_answers_arrive_in_the_order_of_the_questions(tiny, dot):
+def test_local_worker_returns_results_in_the_order_of_requests(tiny, dot):
     worker = LocalWorker(tiny(""), dot, "cpu")
     worker.submit("describe")
     worker.submit("collect", None, "random", 3, 0)
@@ -21,7 +17,7 @@ def test_answers_arrive_in_the_order_of_the_questions(tiny, dot):
     worker.close()
 
 
-def test_several_environments_in_another_process_leave_nothing_behind(tiny, dot, capfd):
+def test_remote_worker_collects_in_several_environments_and_ends_its_process(tiny, dot, capfd):
     config = tiny("", env={"num_envs": 2})
     worker = RemoteWorker(config, dot)
     worker.submit("collect", None, "random", 44, 0)
@@ -35,26 +31,23 @@ def test_several_environments_in_another_process_leave_nothing_behind(tiny, dot,
     assert "Traceback" not in capfd.readouterr().err
 
 
-def test_an_interruption_is_not_for_the_environments(tiny, dot):
-    worker = LocalWorker(tiny("", env={"num_envs": 2}), dot, "cpu")
-    children = multiprocessing.active_children()
-    assert len(children) == 2
-    for child in children:
-        os.kill(child.pid, signal.SIGINT)
-    worker.submit("collect", None, "random", 6, 0)
-    assert worker.result().decisions == 6
-    worker.close()
+def test_remote_worker_raises_user_errors_and_failures_of_the_collector(tiny, dot):
+    class Failing(dot):
+        def step(self, action):
+            raise ZeroDivisionError("the dot is lost")
 
-
-def test_what_the_user_got_wrong_stays_a_user_error(tiny, dot):
-    worker = RemoteWorker(tiny(""), dict)
+    no_environments = [{}]
+    worker = RemoteWorker(tiny(""), lambda: no_environments.pop() if no_environments else Failing())
     worker.submit("describe")
     with pytest.raises(UserError, match=r"must return a gymnasium\.Env, got dict"):
+        worker.result()
+    worker.submit("collect", None, "random", 3, 0)
+    with pytest.raises(RuntimeError, match="the dot is lost"):
         worker.result()
     worker.close()
 
 
-def test_a_dead_process_is_reported(tiny, dot):
+def test_remote_worker_raises_when_its_process_has_died(tiny, dot):
     worker = RemoteWorker(tiny(""), dot)
     worker._process.kill()
     worker.submit("describe")

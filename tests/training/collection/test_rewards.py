@@ -1,4 +1,4 @@
-"""Rewards that cannot be learned from are refused, or told of once."""
+"""RewardCheck refuses rewards that are not finite, and warns of large ones."""
 
 import warnings
 
@@ -12,14 +12,14 @@ NONE = np.array([False])
 
 
 @pytest.mark.parametrize("reward", [np.nan, np.inf, 1e39])
-def test_a_reward_that_replay_cannot_hold_is_refused(reward):
+def test_reward_check_refuses_rewards_that_are_not_finite_in_float32(reward):
     with pytest.raises(UserError, match="not finite"):
         RewardCheck(1, 0.9)(np.array([reward]), NONE)
 
 
-def test_rewards_that_add_up_to_too_much_are_told_of_once():
+def test_reward_check_warns_once_when_discounted_rewards_leave_the_heads_range():
     check = RewardCheck(1, 0.99)
-    with pytest.warns(RuntimeWarning, match="scale them"):
+    with pytest.warns(RuntimeWarning, match="scale the rewards down"):
         for _ in range(300):
             check(np.array([100.0]), NONE)
     with warnings.catch_warnings():
@@ -27,7 +27,7 @@ def test_rewards_that_add_up_to_too_much_are_told_of_once():
         check(np.array([100.0]), NONE)
 
 
-def test_episodes_do_not_add_up():
+def test_reward_check_starts_each_episode_at_zero():
     check = RewardCheck(1, 0.99)
     with warnings.catch_warnings():
         warnings.simplefilter("error")

@@ -1,5 +1,6 @@
-"""Distillation: the actor comes to do what the planner does, and nothing else changes."""
+"""Distillation: the actor learns to act as the planner, and nothing else changes."""
 
+import shutil
 from dataclasses import replace
 
 import numpy as np
@@ -11,23 +12,23 @@ from latentplan.agents.planning import PlanningAgent
 from latentplan.config import DistillConfig, PlannerConfig, UserError
 from latentplan.models import Gaussian, State, WorldModel
 from latentplan.training import distill, resume_distillation
-from latentplan.training.distillation.comparison import Comparison
 from latentplan.training.distillation.labels import Demonstrations, plan_actions
-from latentplan.training.distillation.standing import STATE_FILE
+from latentplan.training.distillation.run import Comparison
 from latentplan.training.distillation.student import Student
-from latentplan.training.folder import claim
+from latentplan.training.folder import DISTILLATION_FILE, lock_folder
 from latentplan.training.state import INTERRUPTED
 
 INFO = {"domain": "user", "task": "push", "env_frames": 7, "discount": 0.9, "metrics": [{"planner": 1.0}]}
 PLANNER = PlannerConfig(
     horizon=2, num_samples=128, num_elites=16, num_iterations=3, num_policy_samples=2, terminal_value=False
 )
-SETTINGS = DistillConfig(rounds=3, episodes=2, updates=60, evaluation_episodes=8, plan_batch=16, learning_rate=3e-3)
+SETTINGS = DistillConfig(rounds=3, episodes=2, updates=60, evaluation_episodes=4, plan_batch=16, learning_rate=3e-3)
+SHORT = DistillConfig(rounds=1, episodes=1, updates=5, evaluation_episodes=2)
 
 
 @pytest.fixture(scope="session")
 def push(dot):
-    """An environment that pays for pushing to the right, which is where the untrained planner below pushes."""
+    """An environment that rewards pushing to the right, as the untrained world model below predicts."""
 
     class Push(dot):
         def step(self, action):
@@ -39,7 +40,7 @@ def push(dot):
 
 @pytest.fixture(scope="session")
 def model(tiny):
-    """A world that rewards the push to the right, and an actor that does nothing."""
+    """An untrained world model that predicts reward for pushing to the right, and an actor that stays at zero."""
     torch.manual_seed(0)
     model = WorldModel(tiny("").model, action_dim=1)
     with torch.no_grad():
@@ -74,19 +75,19 @@ def states_of(model, rows=40, seed=0):
     )
 
 
-def test_an_untrained_actor_recovers_most_of_the_planners_return(finished):
+def test_distill_recovers_most_of_the_planners_return(finished):
     before, after, planner = (finished.summary[name] for name in ("before", "after", "planner"))
     assert finished.exit_code == 0 and planner > before + 3.0
     assert after > before + 0.75 * (planner - before)
 
 
-def test_only_the_actor_changes(finished, checkpoint):
+def test_distill_changes_only_the_actor(finished, checkpoint):
     before, after = weights_of(checkpoint), weights_of(finished.run_dir)
     changed = {name.split(".")[0] for name in before if not torch.equal(before[name], after[name])}
     assert changed == {"actor"}
 
 
-def test_the_result_is_a_checkpoint_that_keeps_what_was_known(finished, checkpoint):
+def test_distill_saves_a_checkpoint_with_the_facts_of_the_agent(finished, checkpoint):
     info, start = read_info(finished.run_dir), read_info(checkpoint)
     assert {name: info[name] for name in INFO} == INFO and info["config"] == start["config"]
     distilled = info["distilled"]
@@ -98,7 +99,7 @@ def test_the_result_is_a_checkpoint_that_keeps_what_was_known(finished, checkpoi
     assert load_agent(finished.run_dir, mode="actor").act(np.zeros((64, 64, 3), np.uint8)).shape == (1,)
 
 
-def test_what_is_reported_is_what_the_saved_actor_earns(finished, push):
+def test_distill_reports_the_returns_of_the_saved_actor(finished, push):
     from latentplan.config import EnvConfig, derive_seed
     from latentplan.envs import make_from
     from latentplan.evaluation.episodes import episode_seed, run_episodes
@@ -110,24 +111,24 @@ def test_what_is_reported_is_what_the_saved_actor_earns(finished, push):
     assert [episode.total_return for episode in episodes] == pytest.approx(returns)
 
 
-def test_an_actor_that_earns_more_than_its_planner_is_kept(checkpoint, push, tmp_path, capsys):
+def test_distill_keeps_an_actor_that_earns_more_than_its_planner(checkpoint, push, tmp_path, capsys):
     class Pull(push):
         def step(self, action):
             picture, reward, *rest = super().step(action)
             return picture, -reward, *rest
 
-    result = distill(checkpoint, tmp_path / "out", SETTINGS, make_env=Pull)
+    result = distill(checkpoint, tmp_path / "out", SHORT, make_env=Pull)
     assert result.summary["planner"] < result.summary["before"] == result.summary["after"]
     before, after = weights_of(checkpoint), weights_of(tmp_path / "out")
     assert all(torch.equal(before[name], after[name]) for name in before)
     assert read_info(tmp_path / "out")["distilled"]["kept_round"] is None
-    out = capsys.readouterr().out
-    assert "an improvement is not to be expected" in out and "that actor is kept, unchanged" in out
+    out = " ".join(capsys.readouterr().out.split())
+    assert "an improvement is not to be expected" in out and "the actor before is kept, unchanged" in out
 
 
-# Steps: 6 episodes of 20 to begin with; then in each round 2 driven and 2 judged.
-@pytest.mark.parametrize("at_step", [50, 180])
-def test_an_interrupted_distillation_ends_as_if_nothing_had_happened(
+# Steps: 12 episodes of 20 before the first round; then in each round 2 collected and 4 selection episodes.
+@pytest.mark.parametrize("at_step", [50, 300])
+def test_resume_distillation_ends_with_the_agent_of_an_uninterrupted_one(
     at_step, finished, checkpoint, push, tmp_path, capsys, interrupting
 ):
     out = tmp_path / "out"
@@ -138,31 +139,44 @@ def test_an_interrupted_distillation_ends_as_if_nothing_had_happened(
     assert gone_on.exit_code == 0 and gone_on.summary == finished.summary
     expected, after = weights_of(finished.run_dir), weights_of(out)
     assert all(torch.equal(expected[name], after[name]) for name in expected)
-    saved, reference = (torch.load(folder / STATE_FILE, weights_only=True) for folder in (out, finished.run_dir))
-    assert saved["standing"]["stage"] == reference["standing"]["stage"] == 9
+    saved, reference = (torch.load(folder / DISTILLATION_FILE, weights_only=True) for folder in (out, finished.run_dir))
+    assert saved["state"]["stage"] == reference["state"]["stage"] == 9
     assert all(torch.equal(saved["demonstrations"][name], part) for name, part in reference["demonstrations"].items())
 
 
-def test_in_an_environment_of_ones_own_it_goes_on_from_python(model, tiny, push, tmp_path, capsys, interrupting):
+def test_distill_names_the_python_call_that_resumes_in_the_users_environment(
+    model, tiny, push, tmp_path, capsys, interrupting
+):
     save_checkpoint(tmp_path / "mine", model, tiny("", env={"domain": "user"}, planner=vars(PLANNER)), INFO)
     distill(tmp_path / "mine", tmp_path / "out", SETTINGS, make_env=interrupting(push, 5).make)
     assert f'resume_distillation("{tmp_path / "out"}", make_env=...)' in "".join(capsys.readouterr().out.split("\n"))
 
 
-def test_more_rounds_may_follow(checkpoint, push, tmp_path):
-    small = DistillConfig(rounds=1, episodes=1, updates=5, evaluation_episodes=2)
-    distill(checkpoint, tmp_path / "out", small, make_env=push)
-    resume_distillation(tmp_path / "out", rounds=2, make_env=push)
-    assert read_info(tmp_path / "out")["distilled"]["rounds"] == 2
+@pytest.fixture(scope="session")
+def spent(checkpoint, push, tmp_path_factory):
+    """A distillation whose minutes were spent before its first round, and whose search had a deadline."""
+    out, hurried = tmp_path_factory.mktemp("spent") / "out", replace(PLANNER, deadline_ms=1e-6)
+    return distill(checkpoint, out, replace(SHORT, minutes=1e-9), planner=hurried, make_env=push)
 
 
-def test_no_round_begins_after_the_minutes_are_spent(checkpoint, push, tmp_path):
-    small = DistillConfig(minutes=1e-9, episodes=1, updates=5, evaluation_episodes=2)
-    assert distill(checkpoint, tmp_path / "out", small, make_env=push).exit_code == 0
-    assert read_info(tmp_path / "out")["distilled"]["rounds"] == 0
+def test_distill_begins_no_round_after_its_minutes(spent):
+    assert spent.exit_code == 0 and read_info(spent.run_dir)["distilled"]["rounds"] == 0
 
 
-def test_folders_that_do_not_fit_are_refused(finished, checkpoint, push, tmp_path):
+def test_distill_lifts_the_deadline_of_the_search(spent):
+    assert read_info(spent.run_dir)["distilled"]["planner"]["deadline_ms"] is None
+
+
+def test_resume_distillation_adds_rounds_also_to_a_state_saved_by_version_0_1(spent, push, tmp_path):
+    folder = shutil.copytree(spent.run_dir, tmp_path / "out")
+    saved = torch.load(folder / DISTILLATION_FILE, weights_only=True)
+    saved["standing"] = saved.pop("state")  # the key of version 0.1
+    torch.save(saved, folder / DISTILLATION_FILE)
+    resume_distillation(folder, rounds=2, minutes=60.0, make_env=push)
+    assert read_info(folder)["distilled"]["rounds"] == 2
+
+
+def test_distill_refuses_folders_in_use_or_damaged(finished, checkpoint, push, tmp_path):
     with pytest.raises(UserError, match="--resume"):
         distill(checkpoint, finished.run_dir, SETTINGS, make_env=push)
     with pytest.raises(UserError, match="already holds an agent: choose another --out"):
@@ -173,7 +187,7 @@ def test_folders_that_do_not_fit_are_refused(finished, checkpoint, push, tmp_pat
         distill(checkpoint, tmp_path / "run", SETTINGS, make_env=push)
     with pytest.raises(UserError, match="nothing to resume"):
         resume_distillation(tmp_path)
-    with claim(tmp_path / "held"), pytest.raises(UserError, match="another process learns"):
+    with lock_folder(tmp_path / "held"), pytest.raises(UserError, match="another process learns"):
         distill(checkpoint, tmp_path / "held", SETTINGS, make_env=push)
     (tmp_path / "resume").mkdir()
     (tmp_path / "resume" / "distill.pt").write_bytes((finished.run_dir / "resume" / "distill.pt").read_bytes()[:-100])
@@ -181,28 +195,21 @@ def test_folders_that_do_not_fit_are_refused(finished, checkpoint, push, tmp_pat
         resume_distillation(tmp_path)
 
 
-def test_an_agent_whose_goals_build_on_its_actor_is_refused(model, tiny, push, tmp_path):
+def test_distill_refuses_an_agent_with_learned_goals(model, tiny, push, tmp_path):
     knows_goals = WorldModel(tiny("").model, action_dim=1, labels={"speed": 1.0}, goal_dim=8)
     save_checkpoint(tmp_path / "agent", knows_goals, tiny(""), INFO)
-    with pytest.raises(UserError, match="distill before"):
+    with pytest.raises(UserError, match=r"distill\.py before"):
         distill(tmp_path / "agent", tmp_path / "out", SETTINGS, make_env=push)
 
 
-def test_a_deadline_of_the_search_is_lifted(checkpoint, push, tmp_path):
-    small = DistillConfig(rounds=1, episodes=1, updates=5, evaluation_episodes=2)
-    hurried = replace(PLANNER, deadline_ms=1e-6)
-    assert distill(checkpoint, tmp_path / "out", small, planner=hurried, make_env=push).exit_code == 0
-    assert read_info(tmp_path / "out")["distilled"]["planner"]["deadline_ms"] is None
-
-
-def test_old_labels_are_planned_again_in_each_round(finished):
-    rounds = torch.load(finished.run_dir / STATE_FILE, weights_only=True)["demonstrations"]["round"]
+def test_distill_plans_the_oldest_labels_again_in_each_round(finished):
+    rounds = torch.load(finished.run_dir / DISTILLATION_FILE, weights_only=True)["demonstrations"]["round"]
     # 40 beliefs a round; a tenth of the 40 and of the 80 there were before is labelled anew in rounds 1 and 2.
     assert len(rounds) == 120
     assert rounds[:40].unique(return_counts=True)[1].tolist() == [40 - 12, 4, 8]
 
 
-def test_the_planner_leaves_its_first_action_behind(model, tiny):
+def test_plan_gives_the_distribution_of_the_first_action(model, tiny):
     agent = PlanningAgent(model, tiny(""), 0.9, planner=PLANNER)
     action = agent.act(np.full((3, 64, 64, 3), 9, np.uint8))
     mean, std = agent.controller.plan.action_distribution(PLANNER.min_std)
@@ -210,7 +217,7 @@ def test_the_planner_leaves_its_first_action_behind(model, tiny):
     assert torch.equal(std, agent.controller.plan.var[:, 0].sqrt().clamp_min(PLANNER.min_std))
 
 
-def test_labels_are_plans_whatever_the_batch(model, tiny):
+def test_plan_actions_returns_the_same_labels_for_any_batch_size(model, tiny):
     planner, states = PlanningAgent(model, tiny(""), 0.9, planner=PLANNER).controller.planner, states_of(model)
     done = []
     whole, parts = (
@@ -222,14 +229,14 @@ def test_labels_are_plans_whatever_the_batch(model, tiny):
     assert (parts.mean - whole.mean).abs().mean() < 0.3  # other noise, the same reward
 
 
-def test_beliefs_without_a_finite_plan_are_an_error(model, tiny):
+def test_plan_actions_raises_when_a_search_finds_no_finite_return(model, tiny):
     planner, states = PlanningAgent(model, tiny(""), 0.9, planner=PLANNER).controller.planner, states_of(model)
     states.deter[3] = float("nan")
     with pytest.raises(FloatingPointError, match="at 1 of 40 states"):
         plan_actions(planner, model, states, torch.Generator(), 40, lambda done: None)
 
 
-def test_a_student_learns_what_is_demonstrated(model):
+def test_student_learns_the_labels(model):
     states = states_of(model, 300)
     wanted = Gaussian(torch.tanh(states.deter[:, :1]), torch.full((300, 1), 0.3))
     demonstrations, losses = Demonstrations(), []
@@ -241,7 +248,7 @@ def test_a_student_learns_what_is_demonstrated(model):
     assert (mean - wanted.mean).abs().mean() < 0.15 and float(std.mean()) == pytest.approx(0.3, abs=0.1)
 
 
-def test_a_student_of_turned_beliefs_learns_the_same_from_every_side(model):
+def test_student_learns_one_label_for_all_turns_of_a_belief(model):
     demonstrations, rows = Demonstrations(), states_of(model, 160)
     sides = State(*(part.unflatten(0, (40, 4)) for part in rows))
     planned = Gaussian(torch.linspace(-0.8, 0.8, 40)[:, None], torch.full((40, 1), 0.1))
@@ -253,7 +260,7 @@ def test_a_student_of_turned_beliefs_learns_the_same_from_every_side(model):
     assert (mean - planned.mean[:, None]).abs().mean() < 0.1
 
 
-def test_labels_that_are_not_finite_stop_learning(model):
+def test_student_raises_when_labels_are_not_finite(model):
     demonstrations = Demonstrations()
     demonstrations.add(states_of(model), Gaussian(torch.full((40, 1), float("nan")), torch.ones(40, 1)), 0)
     with pytest.raises(FloatingPointError, match="not finite"):
@@ -264,15 +271,15 @@ def test_labels_that_are_not_finite_stop_learning(model):
     ("after", "planner_after", "words"),
     [
         (None, None, ["no round improved", "unchanged"]),
-        ([5.0, 6.0, 7.0], [25.0, 20.0, 21.0], ["but not here", "unchanged", "-5.0"]),
+        ([5.0, 6.0, 7.0], [25.0, 20.0, 21.0], ["but not on the test starts", "unchanged", "-5.0"]),
         ([15.0, 16.0, 18.0], [20.0, 19.0, 21.0], ["kept: the actor of round 4"]),
-        ([9.0, 12.0, 16.0], [20.0, 20.0, 21.0], ["kept: the actor of round 4", "holds 0"]),
+        ([9.0, 12.0, 16.0], [20.0, 20.0, 21.0], ["kept: the actor of round 4", "contains 0"]),
         ([15.0, 16.0, 18.0], [10.0, 10.0, 21.0], ["loses more", "unchanged", "+5.3", "-6.7"]),
     ],
 )
-def test_the_verdict_follows_from_paired_returns(after, planner_after, words):
+def test_comparison_keeps_the_actor_that_gains_more_than_the_planner_loses(after, planner_after, words):
     found = Comparison([10.0, 11.0, 12.0], [20.0, 20.0, 21.0], after, planner_after)
     text = "\n".join(found.describe(4))
     assert all(word in text for word in words), text
-    assert ("holds 0" in text) == ("holds 0" in words)
+    assert ("contains 0" in text) == ("contains 0" in words)
     assert found.is_better == ("kept: the actor of round 4" in words)

@@ -1,4 +1,4 @@
-"""Goals are learned in imagination, beside a model that stays as it is."""
+"""Goal conditioning: goal heads learn in imagination, and the rest of the agent stays as it is."""
 
 import math
 import os
@@ -18,8 +18,9 @@ from latentplan.objectives.box import box_degree, box_of
 from latentplan.objectives.parser import parse_objective
 from latentplan.replay.buffer import Replay, Rows
 from latentplan.training import learn_goals, resume_goals
-from latentplan.training.folder import GOALS_FILE, claim
-from latentplan.training.goal_conditioning import learner as goals
+from latentplan.training.folder import GOALS_FILE, lock_folder
+from latentplan.training.goal_conditioning import learner as goal_learner
+from latentplan.training.goal_conditioning import play
 from latentplan.training.goal_conditioning.learner import Boxes, BoxSource, GoalLearner
 from latentplan.training.goal_conditioning.play import describe_box
 from latentplan.training.goal_conditioning.run import load_replay
@@ -33,7 +34,7 @@ ROWS = 60
 
 
 def make_run(folder, config, labels):
-    """A run folder with an agent and a replay of noise."""
+    """Makes a run folder with an untrained agent and a replay of random rows."""
     torch.manual_seed(0)
     model = WorldModel(config.model, 1, labels)
     with torch.no_grad():
@@ -70,33 +71,33 @@ def finished(run, tmp_path_factory):
     return learn_goals(run, tmp_path_factory.mktemp("out") / "agent", SETTINGS)
 
 
-def test_boxes_lie_around_what_was_met():
-    met = torch.randn(500, 3, generator=torch.Generator().manual_seed(1)) * torch.tensor([0.1, 1.0, 3.0])
+def test_box_source_draws_boxes_around_observed_quantities():
+    observed = torch.randn(500, 3, generator=torch.Generator().manual_seed(1)) * torch.tensor([0.1, 1.0, 3.0])
     scales = torch.tensor([0.5, 1.0, 2.0])
-    source = BoxSource(met, scales, torch.Generator().manual_seed(2))
+    source = BoxSource(observed, scales, torch.Generator().manual_seed(2))
     low, high, rows = source.draw(4000, torch.Generator().manual_seed(0))
     assert low.shape == high.shape == (4000, 3) and bool((low <= high).all())
     is_open = torch.isinf(low) & torch.isinf(high)
-    assert not bool(is_open.all(1).any())  # each asks for something
+    assert not bool(is_open.all(1).any())  # every box bounds some quantity
     closed = torch.isfinite(low) & torch.isfinite(high)
     assert bool(((high - low)[closed] <= scales.expand_as(low)[closed] + 1e-5).all())
     shares = [float(part.float().mean()) for part in (is_open, low == high, closed & (low < high))]
     # A third of the intervals is never open on both sides, three tenths of the others are.
     assert shares == pytest.approx([0.2, 0.22, 0.11], abs=0.02)
     point = low == high
-    is_as_met = (low - met[rows]).abs() < 1e-5
-    assert float(is_as_met[point].float().mean()) > 0.8  # in a quarter of the boxes one of the three is moved
+    is_observed = (low - observed[rows]).abs() < 1e-5
+    assert float(is_observed[point].float().mean()) > 0.8  # a quarter of the boxes moves one of three centres
     assert torch.equal(low, source.draw(4000, torch.Generator().manual_seed(0)).low)
 
 
-def test_what_is_rare_is_asked_for_often():
-    met = torch.cat([torch.zeros(9_900, 2), torch.linspace(0.0, 10.0, 100)[:, None].expand(100, 2)])
-    source = BoxSource(met, torch.ones(2), torch.Generator().manual_seed(2))
+def test_box_source_draws_rare_values_often():
+    observed = torch.cat([torch.zeros(9_900, 2), torch.linspace(0.0, 10.0, 100)[:, None].expand(100, 2)])
+    source = BoxSource(observed, torch.ones(2), torch.Generator().manual_seed(2))
     _, _, rows = source.draw(4000, torch.Generator().manual_seed(0))
-    assert float((met[rows][:, 0] > 0.05).float().mean()) > 0.7  # one in a hundred of what was met
+    assert float((observed[rows][:, 0] > 0.05).float().mean()) > 0.7  # 1 % of the observed rows
 
 
-def test_nothing_but_the_heads_changes(run, finished):
+def test_learn_goals_changes_only_the_goal_heads(run, finished):
     before, (after, _, info) = load_model(run)[0], load_model(finished.run_dir)
     assert finished.exit_code == 0 and 0.0 < finished.summary["worth"] < 1.0
     state = after.state_dict()
@@ -105,7 +106,7 @@ def test_nothing_but_the_heads_changes(run, finished):
     assert info["goals"]["updates"] == 6 and info["goals"]["settings"]["starts"] == 12 and info["goal_dim"] == 8
 
 
-def test_a_learning_that_was_cut_off_ends_with_the_same_agent(run, finished, tmp_path):
+def test_resume_goals_ends_with_the_agent_of_an_uninterrupted_learning(run, finished, tmp_path):
     learn_goals(run, tmp_path / "part", GoalsConfig(**vars(SETTINGS) | {"updates": 2}))
     resumed = resume_goals(tmp_path / "part", updates=6)
     weights = [load_model(folder)[0].state_dict() for folder in (finished.run_dir, resumed.run_dir)]
@@ -113,13 +114,13 @@ def test_a_learning_that_was_cut_off_ends_with_the_same_agent(run, finished, tmp
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_who_is_asked_to_stop_finishes_the_update_in_work(run, finished, tmp_path, monkeypatch, number):
+def test_learn_goals_finishes_the_running_update_when_a_signal_arrives(run, finished, tmp_path, monkeypatch, number):
     def interrupted(optimizer, loss, max_norm, update):
         if update == 2:
             os.kill(os.getpid(), number)
         return descend(optimizer, loss, max_norm, update)
 
-    monkeypatch.setattr(goals, "descend", interrupted)
+    monkeypatch.setattr(goal_learner, "descend", interrupted)
     before = signal.getsignal(number)
     result = learn_goals(run, tmp_path / "part", SETTINGS)
     assert result.exit_code == INTERRUPTED and read_info(tmp_path / "part")["goals"]["updates"] == 3
@@ -130,7 +131,7 @@ def test_who_is_asked_to_stop_finishes_the_update_in_work(run, finished, tmp_pat
     assert all(torch.equal(value, weights[1][name]) for name, value in weights[0].items())
 
 
-def test_the_imagined_worth_rises(run):
+def test_goal_learner_raises_the_imagined_worth(run):
     model, config, _ = load_model(run)
     model.requires_grad_(False)
     torch.manual_seed(0)
@@ -144,19 +145,19 @@ def test_the_imagined_worth_rises(run):
     low, high = torch.where(torch.tensor([False, True]), 2.0, ends), -ends  # to be fast, whatever the height
     learner.source.draw = lambda num, generator: Boxes(low, high, torch.arange(num) % ROWS)
 
-    def judge():
+    def mean_degree():
         start, code = State(*(part.repeat(2, 1)[:64] for part in learner.beliefs)), model.goal_heads.encode(low, high)
         with torch.no_grad(), model.trunk_precision():
             features, _ = learner.imagine(start, code, torch.Generator().manual_seed(7))
             return float(box_degree(low, high, model.goal_quantities(features[1:]), model.goal_scales).mean())
 
-    before = judge()
+    before = mean_degree()
     for _ in range(60):
         learner.update()
-    assert judge() > before + 0.002
+    assert mean_degree() > before + 0.002
 
 
-def test_what_is_broken_is_not_learned_from(run):
+def test_goal_learner_raises_when_the_gradient_is_not_finite(run):
     model, config, _ = load_model(run)
     model.requires_grad_(False)
     model.add_goal_heads(8)
@@ -168,7 +169,7 @@ def test_what_is_broken_is_not_learned_from(run):
 
 
 @pytest.mark.parametrize("mode", ["planner", "gated"])
-def test_an_agent_plans_for_a_box_by_what_it_has_learned(finished, mode):
+def test_agent_plans_with_the_goal_value_for_a_box(finished, mode):
     frames = np.random.default_rng(0).integers(0, 256, (3, 64, 64, 3), dtype=np.uint8)
     agent = load_agent(finished.run_dir, mode, goal_horizon=5)
     assert isinstance(agent, GatedAgent if mode == "gated" else PlanningAgent)
@@ -184,14 +185,14 @@ def test_an_agent_plans_for_a_box_by_what_it_has_learned(finished, mode):
     assert agent.controller.objective is None
 
 
-def test_a_search_without_values_plans_without_these_too(finished):
+def test_agent_plans_over_the_goal_horizon_without_terminal_value(finished):
     agent = load_agent(finished.run_dir, terminal_value=False, goal_horizon=5)
     agent.set_objective("speed -> 1.0")
     agent.act(np.zeros((64, 64, 3), np.uint8))
     assert agent.controller.plan.actions.shape[1] == 5
 
 
-def test_what_cannot_be_used_is_refused(run, finished, tiny, tmp_path):
+def test_learn_goals_refuses_folders_and_agents_it_cannot_use(run, finished, tiny, tmp_path):
     def refused(call, *words):
         with pytest.raises(UserError) as caught:
             call()
@@ -201,7 +202,7 @@ def test_what_cannot_be_used_is_refused(run, finished, tiny, tmp_path):
     mine = tiny("", env={"domain": "user"})
     save_checkpoint(tmp_path / "mine", WorldModel(mine.model, 1, LABELS), mine, INFO)
     refused(lambda: learn_goals(tmp_path / "mine", tmp_path / "a"), "no replay", "the folder of its run")
-    with claim(finished.run_dir):
+    with lock_folder(finished.run_dir):
         refused(lambda: resume_goals(finished.run_dir), "another process learns")
     refused(lambda: resume_goals(run), "nothing to resume", GOALS_FILE)
     unnamed = make_run(tmp_path / "unnamed", tiny(""), {})
@@ -216,41 +217,48 @@ def test_what_cannot_be_used_is_refused(run, finished, tiny, tmp_path):
     assert "goals" in read_info(tmp_path / "c")
 
 
-def test_an_agent_without_a_replay_plays_first(tiny, tmp_path):
-    config = tiny("", env={"domain": "cartpole", "task": "swingup", "action_repeat": 50, "render_quality": "fastest"})
-    model = WorldModel(config.model, 1, {quantity.name: quantity.scale for quantity in QUANTITIES["cartpole"]})
+@pytest.fixture
+def cartpole(tiny, monkeypatch):
+    """Settings and quantities of a cartpole agent that plays short rounds."""
+    monkeypatch.setattr(play, "ROUND_DECISIONS", 25)
+    env = {"domain": "cartpole", "task": "swingup", "action_repeat": 50, "render_quality": "fastest"}
+    return tiny("", env=env), {quantity.name: quantity.scale for quantity in QUANTITIES["cartpole"]}
+
+
+def test_learn_goals_plays_first_when_the_agent_has_no_replay(cartpole, tmp_path):
+    config, labels = cartpole
+    model = WorldModel(config.model, 1, labels)
     save_checkpoint(tmp_path / "agent", model, config, INFO | {"domain": "cartpole", "task": "swingup"})
-    settings = GoalsConfig(**vars(SETTINGS) | {"updates": 1, "play_decisions": 500})
+    settings = GoalsConfig(**vars(SETTINGS) | {"updates": 1, "play_decisions": 50})
     learn_goals(tmp_path / "agent", tmp_path / "out", settings)
     replay = load_replay(tmp_path / "out" / "replay", model)
-    assert 500 <= len(replay) <= 550 and float(replay.labels.abs().sum()) > 0.0
+    assert 50 <= len(replay) <= 55 and float(replay.labels.abs().sum()) > 0.0
     resumed = resume_goals(tmp_path / "out", updates=2)
     assert read_info(resumed.run_dir)["goals"]["updates"] == 2
 
 
-def test_what_another_agent_played_is_not_learned_from(tiny, tmp_path, capsys):
-    config = tiny("", env={"domain": "cartpole", "task": "swingup", "action_repeat": 50, "render_quality": "fastest"})
-    labels = {quantity.name: quantity.scale for quantity in QUANTITIES["cartpole"]}
-    settings = GoalsConfig(**vars(SETTINGS) | {"updates": 1, "play_decisions": 300})
+def test_learn_goals_reuses_a_played_replay_only_of_the_same_agent(cartpole, tmp_path, capsys):
+    config, labels = cartpole
+    settings = GoalsConfig(**vars(SETTINGS) | {"updates": 1, "play_decisions": 25})
 
-    def begin(agent):
+    def learn(agent):
         torch.manual_seed(agent)
-        place = tmp_path / f"agent{agent}"
-        save_checkpoint(place, WorldModel(config.model, 1, labels), config, INFO | {"domain": "cartpole"})
-        learn_goals(place, tmp_path / "out", settings)
-        for name in ("info.json", GOALS_FILE):  # as if the machine had gone away before the first save
+        folder = tmp_path / f"agent{agent}"
+        save_checkpoint(folder, WorldModel(config.model, 1, labels), config, INFO | {"domain": "cartpole"})
+        learn_goals(folder, tmp_path / "out", settings)
+        for name in ("info.json", GOALS_FILE):  # as if the process had ended before its first save
             (tmp_path / "out" / name).unlink()
-        return "playing 300 decisions" in capsys.readouterr().out, (tmp_path / "out" / "replay/rows.pt").read_bytes()
+        return "playing 25 decisions" in capsys.readouterr().out, (tmp_path / "out" / "replay/rows.pt").read_bytes()
 
-    first, again, other = begin(0), begin(0), begin(1)
-    (tmp_path / "out" / "replay" / "played.json").unlink()  # so that it may be anything
-    with pytest.raises(UserError, match="holds a replay of something else"):
-        begin(1)
+    first, again, other = learn(0), learn(0), learn(1)
     assert first[0] and not again[0] and other[0]
     assert first[1] == again[1] != other[1]
+    (tmp_path / "out" / "replay" / "played.json").unlink()  # the origin of the replay is now unknown
+    with pytest.raises(UserError, match="holds a replay of another agent"):
+        learn(1)
 
 
-def test_a_box_is_asked_for_in_words():
+def test_describe_box_returns_an_expression_that_parses_to_the_box():
     names, inf = ("height", "speed", "upright"), math.inf
     text = describe_box(names, (-inf, 1.0, 0.2), (inf, 1.0, 0.5))
     box = box_of(parse_objective(text, {name: 1.0 for name in names}), names)

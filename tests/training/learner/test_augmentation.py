@@ -1,4 +1,4 @@
-"""Random shifts and quarter turns: one per sequence, as a whole."""
+"""Random shifts and quarter turns, one per sequence."""
 
 import pytest
 import torch
@@ -16,7 +16,7 @@ from latentplan.training.learner.losses import world_model_loss
 
 
 def _frames() -> torch.Tensor:
-    """Pictures whose pixels tell their own row and column."""
+    """Pictures whose pixels hold their own row and column."""
     rows, columns = torch.meshgrid(torch.arange(64), torch.arange(64), indexing="ij")
     picture = torch.stack([rows, columns, torch.zeros_like(rows)], -1).to(torch.uint8)
     return picture.expand(32, 3, 64, 64, 3)
@@ -26,12 +26,12 @@ def _shifted(pixels: int, seed: int = 0) -> torch.Tensor:
     return random_shift(_frames(), pixels, torch.Generator().manual_seed(seed))
 
 
-def test_no_pixels_change_nothing() -> None:
+def test_random_shift_by_zero_pixels_changes_nothing() -> None:
     assert torch.equal(_shifted(0), _frames())
 
 
 @pytest.mark.parametrize("pixels", [1, 4])
-def test_every_sequence_moves_as_a_whole_and_repeats_its_border(pixels: int) -> None:
+def test_random_shift_moves_whole_sequences_and_repeats_borders(pixels: int) -> None:
     seen = set()
     for sequence in _shifted(pixels):
         down, right = (int(x) for x in sequence[0, 32, 32, :2].int() - torch.tensor([32, 32]))
@@ -48,12 +48,12 @@ def test_every_sequence_moves_as_a_whole_and_repeats_its_border(pixels: int) -> 
     assert len(seen) > 2 * pixels
 
 
-def test_the_moves_are_those_of_the_generator() -> None:
+def test_random_shift_repeats_with_its_generator() -> None:
     assert torch.equal(_shifted(4), _shifted(4))
     assert not torch.equal(_shifted(4), _shifted(4, seed=1))
 
 
-def test_the_encoder_sees_moved_frames_and_the_decoder_paints_them_unmoved(batch, tiny) -> None:
+def test_world_model_loss_encodes_shifted_frames_and_decodes_unshifted_ones(batch, tiny) -> None:
     config = tiny("", learning={"random_shift": 4})
     model = WorldModel(config.model, 1)
     seen, painted = [], []
@@ -70,7 +70,7 @@ def _turned(batch, share, seed=0):
     return quarter_turns(batch, share, torch.Generator().manual_seed(seed))
 
 
-def test_sequences_turn_as_a_whole_and_forget_their_belief(batch):
+def test_quarter_turns_turns_whole_sequences_and_zeroes_their_beliefs(batch):
     batch = batch._replace(deter=torch.ones_like(batch.deter))
     seen = set()
     for seed in range(8):
@@ -89,7 +89,7 @@ def test_sequences_turn_as_a_whole_and_forget_their_belief(batch):
     assert seen == {0, 1, 2, 3}
 
 
-def test_a_share_of_nothing_turns_nothing_and_draws_nothing(batch):
+def test_quarter_turns_with_share_zero_changes_and_draws_nothing(batch):
     generator = torch.Generator().manual_seed(1)
     turned, unturned = quarter_turns(batch, 0.0, generator)
     assert turned is batch and unturned.all()
@@ -97,7 +97,7 @@ def test_a_share_of_nothing_turns_nothing_and_draws_nothing(batch):
     assert not _turned(batch, 1.0)[1].any()
 
 
-def test_what_a_gpu_does_and_what_a_cpu_does_are_the_same(batch):
+def test_augmentations_by_index_equal_augmentations_by_slices(batch):
     frames, generator = batch.frames, torch.Generator().manual_seed(2)
     offsets = torch.randint(9, (len(frames), 2), generator=generator)
     assert torch.equal(shift_by_index(frames, offsets, 4), shift_by_slices(frames, offsets, 4))

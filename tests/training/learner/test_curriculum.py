@@ -1,4 +1,4 @@
-"""Rewards of a sibling task, learned first."""
+"""Curriculum: rewards of another task first, then the run's own."""
 
 import numpy as np
 import pytest
@@ -15,7 +15,7 @@ LABELS = {"height": 0.2, "task.stand": 1.0, "task.walk": 1.0}
 
 
 def first(name, action_repeat=1, frames=100, **env):
-    """The settings of a run whose first 100 frames are for a task."""
+    """Settings of a run with a curriculum of 100 frames for a task or expression."""
     learning = LearningConfig(curriculum_task=name, curriculum_frames=frames)
     return Config(env=EnvConfig(action_repeat=action_repeat, **env), learning=learning)
 
@@ -30,7 +30,7 @@ def labelled(batch):
     return batch._replace(labels=labels)
 
 
-def test_rewards_are_the_sibling_task_s_until_its_frames_are_over(labelled):
+def test_curriculum_gives_the_rewards_of_its_task_until_its_frames_are_over(labelled):
     state = at(0)
     curriculum = Curriculum(first("stand"), LABELS, state)
     for state.env_frames in (0, 99):
@@ -39,20 +39,20 @@ def test_rewards_are_the_sibling_task_s_until_its_frames_are_over(labelled):
     assert curriculum(labelled) is labelled
 
 
-def test_nothing_but_the_rewards_changes(labelled):
+def test_curriculum_changes_only_the_rewards(labelled):
     changed = Curriculum(first("walk", action_repeat=2), LABELS, at(0))(labelled)
     for name in set(labelled._fields) - {"rewards"}:
         assert getattr(changed, name) is getattr(labelled, name)
 
 
-def test_without_another_task_the_batch_is_what_it_was(labelled):
+def test_curriculum_returns_the_same_batch_without_another_task(labelled):
     assert Curriculum(first(None), LABELS, at(0))(labelled) is labelled
     assert Curriculum(first("walk", task="walk"), LABELS, at(0))(labelled) is labelled
     assert Curriculum(first("walk", task="walk"), {}, at(0))(labelled) is labelled
 
 
 @pytest.mark.parametrize("task", ["walk", "stand"])
-def test_an_objective_can_follow_any_task(labelled, task):
+def test_curriculum_may_precede_an_objective(labelled, task):
     state = at(99)
     curriculum = Curriculum(first("walk", task=task, objective="speed -> 2.0"), LABELS, state)
     assert torch.equal(curriculum(labelled).rewards, labelled.labels[:, 1:, 2])
@@ -61,18 +61,18 @@ def test_an_objective_can_follow_any_task(labelled, task):
 
 
 @pytest.mark.parametrize(("labels", "told"), [(LABELS, "stand, walk"), ({}, "none")])
-def test_a_task_that_the_simulator_does_not_tell_of_is_refused(labels, told):
+def test_curriculum_refuses_an_unknown_task(labels, told):
     with pytest.raises(UserError, match=f"curriculum_task 'fly' is unknown; .*: {told}; as an expression: .*fly"):
         Curriculum(first("fly"), labels, at(0))
 
 
 @pytest.mark.parametrize("text", ["return", "height + goal:nowhere.png"])
-def test_a_reward_that_no_quantity_tells_is_refused(text):
+def test_curriculum_refuses_an_expression_over_unlabelled_values(text):
     with pytest.raises(UserError, match="curriculum_task"):
         Curriculum(first(text), LABELS, at(0))
 
 
-def test_an_expression_can_come_first(labelled):
+def test_curriculum_computes_an_expression_over_labels(labelled):
     height, stand, _ = labelled.labels[:, 1:].unbind(-1)
     changed = Curriculum(first("2 * height - task(stand)"), LABELS, at(0))(labelled)
     assert torch.allclose(changed.rewards, 2 * height - stand)
@@ -81,7 +81,7 @@ def test_an_expression_can_come_first(labelled):
     assert torch.allclose(clause.rewards, 0.1 ** missing.square())
 
 
-def test_an_expression_pays_what_it_pays_as_the_objective_of_a_run(labelled):
+def test_curriculum_gives_the_reward_of_the_same_objective(labelled):
     text, scales = "upright - 0.2 * abs(pole_speed) + (upright > 0.5 and pole_speed < 1.0)", quantity_scales("pendulum")
     labels = torch.randn(4, 6, len(scales), generator=torch.Generator().manual_seed(0))
     paid = ObjectiveReward(text, "pendulum")
@@ -92,15 +92,15 @@ def test_an_expression_pays_what_it_pays_as_the_objective_of_a_run(labelled):
 
 
 @pytest.mark.parametrize("action_repeat", [1, 2, 4, 8])
-def test_a_reward_that_changes_evenly_is_summed_exactly(action_repeat):
+def test_summed_reward_is_exact_for_linear_rewards(action_repeat):
     steps = torch.arange(3 * action_repeat + 1.0)
     expected = steps[1:].reshape(3, action_repeat).sum(-1)
     assert torch.allclose(summed_reward(steps[None, ::action_repeat], action_repeat), expected[None])
 
 
 @pytest.mark.parametrize(("action_repeat", "error"), [(1, 1e-6), (2, 0.04)])
-def test_it_comes_to_what_the_task_pays(action_repeat, error):
-    """The labels of an episode of one task, summed for that same task, give its rewards: exactly without repeats."""
+def test_summed_reward_of_labels_matches_the_rewards_of_the_task(action_repeat, error):
+    """Labels of an episode, summed for its own task, give the episode's rewards; exactly with an action repeat of 1."""
     env = make_env(EnvConfig("walker", "walk", action_repeat, render_quality="fastest"), seed=0)
     rng = np.random.default_rng(0)
     try:
@@ -118,37 +118,37 @@ def test_it_comes_to_what_the_task_pays(action_repeat, error):
 
 
 class Learner:
-    """Counts how often it forgets."""
+    """Counts resets of the value head."""
 
-    forgotten = 0
+    num_resets = 0
 
-    def forget_values(self):
-        self.forgotten += 1
+    def reset_value_head(self):
+        self.num_resets += 1
 
 
 @pytest.mark.parametrize(("task", "frames", "times"), [("stand", 100, 1), ("stand", 0, 0), (None, 100, 0)])
-def test_values_of_another_reward_are_forgotten_once_also_by_a_run_that_is_resumed(task, frames, times):
+def test_curriculum_resets_the_value_head_once_also_when_resumed(task, frames, times):
     learner, state = Learner(), at(99)
     curriculum = Curriculum(first(task, frames=frames), LABELS, state)
     curriculum.on_train_epoch_start(None, learner)
-    assert learner.forgotten == 0
+    assert learner.num_resets == 0
     state.env_frames = 101
     curriculum.on_train_epoch_start(None, learner)
     resumed = Curriculum(first(task, frames=frames), LABELS, RunState(**state.to_dict()))
     for each in (curriculum, resumed):
         each.on_train_epoch_start(None, learner)
-    assert learner.forgotten == times
+    assert learner.num_resets == times
 
 
-def test_an_objective_that_is_what_would_come_first_is_learned_from_the_start(labelled):
+def test_curriculum_is_skipped_when_its_task_is_the_objective(labelled):
     learner, state = Learner(), at(0)
     curriculum = Curriculum(first("height", objective="height"), LABELS, state)
     assert curriculum(labelled) is labelled and curriculum.note == ""
     state.env_frames = 101
     curriculum.on_train_epoch_start(None, learner)
-    assert learner.forgotten == 0
+    assert learner.num_resets == 0
 
 
-def test_a_run_says_what_comes_first():
+def test_note_describes_the_curriculum():
     assert Curriculum(first("stand", frames=40_000), LABELS, at(0)).note == "; first stand, for 40,000 frames"
     assert Curriculum(first("stand", frames=0), LABELS, at(0)).note == ""

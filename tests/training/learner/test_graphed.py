@@ -1,4 +1,4 @@
-"""The whole update of a GPU: the same as one after the other, with nothing read back."""
+"""The graphed update: the results of the plain learner, with nothing read back to the host."""
 
 import copy
 
@@ -13,14 +13,14 @@ from latentplan.replay.buffer import Replay, Rows
 from latentplan.training.learner import augmentation
 from latentplan.training.learner.graphed import WARM_UP_UPDATES, GraphedLearner
 from latentplan.training.learner.module import Learner
-from latentplan.training.learner.optimization import take_up
+from latentplan.training.learner.optimization import load_optimizer_state
 
-SETTINGS = {"turned_share": 0.5, "random_shift": 2, "imitation_scale": 0.1}
+SETTINGS = {"turned_share": 0.5, "random_shift": 2}
 LABELS = {"height": 0.5, "task.stand": 0.5}
 
 
 class OwnOptimizers:
-    """Holds the optimizers, so that it updates without a Trainer."""
+    """Gives a learner its own optimizers, so that it updates without a Trainer."""
 
     def optimizers(self, use_pl_optimizer=True):
         self.__dict__.setdefault("own", self.configure_optimizers())
@@ -28,15 +28,15 @@ class OwnOptimizers:
 
 
 class Plain(OwnOptimizers, Learner):
-    """One after the other, from batches."""
+    """The plain learner, which takes batches."""
 
 
 class Graphed(OwnOptimizers, GraphedLearner):
-    """All at once, from rows."""
+    """The graphed learner, which takes rows."""
 
 
 def prepared(batch):
-    """Rewards that are not the stored ones."""
+    """The batch with other rewards than the stored ones."""
     return batch._replace(rewards=batch.rewards + 1.0)
 
 
@@ -51,7 +51,6 @@ def filled(device):
         continues=np.ones(40, np.float32),
         is_first=np.arange(40) % 20 == 0,
         labels=rng.normal(size=(40, 2)).astype(np.float32),
-        plan=rng.uniform(0.1, 0.5, (40, 2)).astype(np.float32),
     )
     replay.add(0, rows)
     return replay
@@ -79,7 +78,7 @@ def assert_same(left, right):
     assert torch.equal(left.replay.deter, right.replay.deter)
 
 
-def test_it_learns_what_the_two_halves_learn_one_after_the_other(tiny):
+def test_graphed_learner_learns_as_the_plain_learner_in_turn(tiny):
     plain, whole = learner_of(Plain, tiny), graphed(tiny)
     for rows in draws(plain.replay, 5):
         plain.training_step(prepared(plain.replay.gather(rows)), 0)
@@ -91,7 +90,7 @@ def test_it_learns_what_the_two_halves_learn_one_after_the_other(tiny):
     assert all(torch.equal(whole.metrics[name], value) for name, value in plain.metrics.items())
 
 
-def test_what_is_not_finite_changes_no_weights_and_is_told(tiny):
+def test_graphed_learner_skips_and_reports_gradients_that_are_not_finite(tiny):
     whole = graphed(tiny)
     good, bad = draws(whole.replay, 2)
     whole.training_step(good, 0)
@@ -103,7 +102,9 @@ def test_what_is_not_finite_changes_no_weights_and_is_told(tiny):
     assert weights and all(torch.equal(before[name], value) for name, value in weights.items())
     assert all(value.isfinite().all() for value in whole.state_dict().values())
     assert torch.equal(whole.replay.deter, beliefs)
-    with pytest.warns(RuntimeWarning, match="1 of the last 2 updates, up to update 2, .* were skipped"):
+    with pytest.warns(
+        RuntimeWarning, match="not finite in 1 of the last 2 updates, up to update 2: these updates were skipped"
+    ):
         whole.catch_up()
     whole.replay.rewards.copy_(rewards)
     whole.training_step(good, 0)
@@ -116,9 +117,9 @@ def test_what_is_not_finite_changes_no_weights_and_is_told(tiny):
 
 
 class NothingRead(TorchDispatchMode):
-    """Refuses what a graph cannot record: values that the host reads, and results whose size depends on values.
+    """Refuses operations that a graph cannot record: reads by the host, and results whose size depends on values.
 
-    Not what `torch.quantile` reads of its own argument: torch 2.11 does on a CPU, and no torch on a GPU.
+    The check inside `torch.quantile` is allowed: torch 2.11 reads its argument on a CPU, but not on a GPU.
     """
 
     in_quantile = False
@@ -137,7 +138,7 @@ class NothingRead(TorchDispatchMode):
 
 @pytest.fixture
 def watched(tiny, monkeypatch):
-    """A learner whose pictures move as they do on a GPU, after an update."""
+    """A learner after one update, with the GPU's versions of the augmentations."""
     for name in ("shift", "turn"):
         monkeypatch.setattr(augmentation, f"{name}_by_slices", getattr(augmentation, f"{name}_by_index"))
     quantile = torch.quantile
@@ -155,14 +156,14 @@ def watched(tiny, monkeypatch):
     return learner
 
 
-def test_nothing_is_read_back_from_the_gpu(watched):
+def test_graphed_update_reads_no_value_back(watched):
     with NothingRead():
         outputs = watched.update(torch.Generator())
-    assert {"reconstruction", "probe", "actor", "imitation", "model_grad_norm", "behaviour_grad_norm"} <= set(outputs)
+    assert {"reconstruction", "probe", "actor", "value", "model_grad_norm", "behaviour_grad_norm"} <= set(outputs)
 
 
 @pytest.mark.parametrize("part", ["descent", "number", "choice"])
-def test_a_reading_would_be_found(watched, monkeypatch, part):
+def test_graphed_update_test_detects_a_read(watched, monkeypatch, part):
     if part == "descent":
         monkeypatch.setattr(Graphed, "_descend", Learner._descend)
     elif part == "number":
@@ -177,20 +178,20 @@ def test_a_reading_would_be_found(watched, monkeypatch, part):
         watched.update(torch.Generator())
 
 
-def test_a_graph_needs_replay_where_it_runs():
+def test_config_refuses_a_cuda_graph_without_replay_on_the_device():
     with pytest.raises(UserError, match="cuda_graph needs replay.on_device"):
         Config(learning=LearningConfig(cuda_graph=True))
     Config(learning=LearningConfig(cuda_graph=True), replay=ReplayConfig(on_device=True))
 
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
-def test_what_is_replayed_is_what_is_run(tiny):
-    """Recorded once and again, where values begin anew, the graph learns what the same update learns without it."""
+def test_replayed_graph_learns_as_the_plain_learner_on_a_gpu(tiny):
+    """The value head is reset half-way, so that the graph is recorded twice."""
     plain, whole = learner_of(Plain, tiny, "cuda"), graphed(tiny, "cuda")
     for number, rows in enumerate(draws(plain.replay, 4 * WARM_UP_UPDATES)):
         if number == 2 * WARM_UP_UPDATES:
-            plain.forget_values()
-            whole.forget_values()
+            plain.reset_value_head()
+            whole.reset_value_head()
         plain.training_step(prepared(plain.replay.gather(rows)), 0)
         plain.catch_up()
         whole.training_step(rows, 0)
@@ -199,13 +200,13 @@ def test_what_is_replayed_is_what_is_run(tiny):
         torch.testing.assert_close(one, two, rtol=1e-3, atol=1e-4, msg=name)
 
 
-def test_an_optimizer_goes_on_on_another_device_as_that_device_wants_it():
+def test_load_optimizer_state_keeps_the_capturable_flag_of_the_device():
     weight = torch.nn.Parameter(torch.ones(2))
-    saved, goes_on = (torch.optim.Adam([weight], lr=1e-3, fused=True) for _ in range(2))
+    saved, resumed = (torch.optim.Adam([weight], lr=1e-3, fused=True) for _ in range(2))
     weight.grad = torch.ones(2)
     saved.step()
     state = saved.state_dict()
     state["param_groups"][0]["capturable"] = True
-    take_up(goes_on, state)
-    assert goes_on.param_groups[0]["capturable"] is False
-    assert torch.equal(goes_on.state[weight]["exp_avg"], saved.state[weight]["exp_avg"])
+    load_optimizer_state(resumed, state)
+    assert resumed.param_groups[0]["capturable"] is False
+    assert torch.equal(resumed.state[weight]["exp_avg"], saved.state[weight]["exp_avg"])

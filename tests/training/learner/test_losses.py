@@ -1,10 +1,10 @@
-"""What is learned, and what must not be learned from it."""
+"""The losses: their values, their gradients, and the scales that weigh them."""
 
 import pytest
 import torch
 
 from latentplan.models import Gaussian, State, WorldModel, kl_divergence
-from latentplan.training.learner.losses import imagine, imitation_loss, lambda_return, roll_out, world_model_loss
+from latentplan.training.learner.losses import draw_noise, imagine, imitation_loss, lambda_return, world_model_loss
 from latentplan.training.learner.optimization import return_scale
 
 
@@ -13,7 +13,7 @@ def stream():
 
 
 def returns_by_hand(rewards, discounts, values, lambda_):
-    """G_t = r_t + d_t ((1 - lambda) v_t+1 + lambda G_t+1), from the last value on."""
+    """G_t = r_t + d_t ((1 - lambda) v_t+1 + lambda G_t+1), starting from the last value."""
 
     def from_step(time):
         following = values[-1] if time == len(rewards) - 1 else from_step(time + 1)
@@ -29,23 +29,23 @@ def path():
 
 
 @pytest.mark.parametrize("lambda_", [0.0, 0.5, 0.95, 1.0])
-def test_lambda_returns_obey_their_recursion(path, lambda_):
+def test_lambda_return_obeys_its_recursion(path, lambda_):
     assert torch.allclose(lambda_return(*path, lambda_), returns_by_hand(*path, lambda_))
 
 
-def test_lambda_zero_looks_one_step_ahead(path):
+def test_lambda_return_is_the_one_step_target_when_lambda_is_zero(path):
     rewards, discounts, values = path
     assert torch.allclose(lambda_return(*path, 0.0), rewards + discounts * values)
 
 
-def test_lambda_one_is_the_whole_return(path):
+def test_lambda_return_is_the_whole_return_when_lambda_is_one(path):
     rewards, discounts, values = path
     reach = torch.cat([torch.ones(1, 4), discounts]).cumprod(0)
     whole = (reach[:-1] * rewards).sum(0) + reach[-1] * values[-1]
     assert torch.allclose(lambda_return(*path, 1.0)[0], whole)
 
 
-def test_nothing_counts_beyond_an_end(path):
+def test_lambda_return_ignores_steps_beyond_an_end(path):
     rewards, discounts, values = path
     discounts[2] = 0.0
     before = lambda_return(rewards, discounts, values, 0.9)
@@ -53,7 +53,7 @@ def test_nothing_counts_beyond_an_end(path):
     assert torch.equal(lambda_return(rewards, discounts, values, 0.9)[:3], before[:3])
 
 
-def test_the_model_loss_is_the_weighted_sum_of_its_parts(model, batch, tiny):
+def test_world_model_loss_is_the_sum_of_its_losses_times_their_scales(model, batch, tiny):
     chosen = {"reconstruction_scale": 2.0, "reward_scale": 3.0, "representation_scale": 0.5, "overshooting_scale": 0.7}
     config = tiny("", learning=chosen).learning
     loss, states, _, parts = world_model_loss(model, batch, config, stream())
@@ -65,8 +65,8 @@ def test_the_model_loss_is_the_weighted_sum_of_its_parts(model, batch, tiny):
     assert not any(part.requires_grad for part in states)
 
 
-def test_open_loop_predictions_follow_the_mean_of_the_prior_from_a_detached_start(model, batch, tiny):
-    """The overshooting terms, by hand: every window's first posterior, then the true actions step by step."""
+def test_overshooting_predicts_with_the_prior_mean_from_detached_starts(model, batch, tiny):
+    """The loss equals a step-by-step computation from the first posterior of each window."""
     horizon = 2
     config = tiny("", learning={"overshooting_scale": 1.0, "overshooting_horizon": horizon, "free_nats": 0.0}).learning
     noise = torch.randn(*batch.frames.shape[:2], 32, generator=stream())
@@ -87,13 +87,13 @@ def test_open_loop_predictions_follow_the_mean_of_the_prior_from_a_detached_star
     assert parts["overshooting"].item() == pytest.approx(torch.stack(divergences).mean().item(), rel=1e-4)
 
 
-def test_less_divergence_than_the_free_nats_teaches_nothing(model, batch, tiny):
+def test_divergences_below_the_free_nats_are_constant(model, batch, tiny):
     config = tiny("", learning={"free_nats": 1e6}).learning
     parts = world_model_loss(model, batch, config, stream()).parts
     assert parts["dynamics"] == parts["representation"] == 1e6
 
 
-def test_both_divergences_are_one_number_with_two_gradients(model, batch, tiny):
+def test_dynamics_and_representation_losses_have_the_same_value(model, batch, tiny):
     parts = world_model_loss(model, batch, tiny("", learning={"free_nats": 0.0}).learning, stream()).parts
     assert parts["dynamics"] == pytest.approx(parts["representation"].item(), rel=1e-6)
     assert parts["dynamics"] > 0.0
@@ -107,13 +107,13 @@ def names_with_gradient(model):
     }
 
 
-def test_the_model_loss_leaves_actor_and_value_alone(model, batch, tiny):
+def test_world_model_loss_has_no_gradient_for_actor_and_value_head(model, batch, tiny):
     world_model_loss(model, batch, tiny("").learning, stream()).loss.backward()
     expected = {"encoder", "dynamics", "decoder", "reward_head", "continue_head"}
     assert names_with_gradient(model) == expected
 
 
-def test_the_behaviour_loss_leaves_the_world_model_alone(learner, batch):
+def test_behaviour_loss_has_no_gradient_for_the_world_model(learner, batch):
     learned = world_model_loss(learner.model, batch, learner.config, stream())
     loss, _ = learner._behaviour_loss(learned, batch, stream())
     learner._descend(learner.configure_optimizers()[1], loss)
@@ -122,7 +122,7 @@ def test_the_behaviour_loss_leaves_the_world_model_alone(learner, batch):
     assert all(parameter.grad is None for parameter in learner.target_value.parameters())
 
 
-def test_the_actor_learns_through_the_dynamics(model):
+def test_imagine_passes_gradients_from_rewards_to_the_actor(model):
     state = State(torch.zeros(3, 16), torch.zeros(3, 32))
     dream = imagine(model, state, 4, stream())
     assert dream.features.shape == (5, 3, 48)
@@ -136,12 +136,13 @@ def gradients_of_the_end(model, decay):
     means = torch.zeros(4, 3, 1, requires_grad=True)
     actions = iter(means)
     start = State(torch.zeros(3, 16), torch.zeros(3, 32))
-    features, _ = roll_out(model, lambda _: (next(actions), torch.ones(3, 1)), start, 4, stream(), decay)
+    noise = draw_noise(model, 4, 3, stream())
+    features, _ = model.dynamics.imagine(lambda _: (next(actions), torch.ones(3, 1)), start, *noise, decay)
     features[-1].square().sum().backward()
     return features, means.grad
 
 
-def test_a_decayed_gradient_loses_a_share_with_every_step_and_the_rollout_nothing(model):
+def test_gradient_decay_scales_gradients_per_step_but_not_the_rollout(model):
     (whole, gradient), (same, decayed) = (gradients_of_the_end(model, decay) for decay in (1.0, 0.5))
     assert torch.equal(whole, same)
     assert gradient.abs().min() > 0.0
@@ -149,33 +150,33 @@ def test_a_decayed_gradient_loses_a_share_with_every_step_and_the_rollout_nothin
     assert torch.allclose(decayed, shares * gradient, rtol=1e-3)
 
 
-def test_imagined_rewards_belong_to_the_states_they_arrive_with(model):
+def test_imagine_predicts_rewards_from_the_states_they_arrive_with(model):
     dream = imagine(model, State(torch.zeros(3, 16), torch.zeros(3, 32)), 4, stream())
     for time in range(4):
         expected = model.reward_head.mean(model.reward_head(dream.features[time + 1]))
         assert torch.allclose(dream.rewards[time], expected, rtol=1e-4, atol=1e-3)
 
 
-def test_the_entropy_is_that_of_a_gaussian(model):
+def test_imagine_returns_the_entropy_of_the_gaussian_actor(model):
     dream = imagine(model, State(torch.zeros(3, 16), torch.zeros(3, 32)), 1, stream())
     expected = torch.distributions.Normal(*model.actor(dream.features[0])).entropy().sum(-1)
     assert torch.allclose(dream.entropies[0], expected, atol=1e-5)
 
 
-def test_the_scale_of_returns_is_at_least_one_and_follows_their_spread(learner):
+def test_return_scale_is_at_least_one_and_follows_the_spread(learner):
     assert return_scale(learner.return_range, torch.zeros(100)) == 1.0
     wide = torch.linspace(0.0, 1000.0, 101)  # a spread of 900
     assert [return_scale(learner.return_range, wide).item() for _ in range(2)] == pytest.approx([9.0, 0.99 * 9.0 + 9.0])
     assert [return_scale(learner.return_range, wide) for _ in range(1000)][-1].item() == pytest.approx(900.0, rel=1e-3)
 
 
-def test_every_parameter_has_one_optimizer(learner):
+def test_every_parameter_belongs_to_one_optimizer(learner):
     groups = [group["params"] for optimizer in learner.configure_optimizers() for group in optimizer.param_groups]
     owned = [id(parameter) for group in groups for parameter in group]
     assert sorted(owned) == sorted(id(parameter) for parameter in learner.model.parameters())
 
 
-def test_probes_read_the_latent_without_shaping_it(batch, tiny):
+def test_probe_loss_has_no_gradient_for_the_latent(batch, tiny):
     torch.manual_seed(0)
     model = WorldModel(tiny("").model, action_dim=1, labels={"height": 2.0, "speed": 0.5})
     labelled = batch._replace(labels=torch.randn(4, 6, 2, generator=stream()))
@@ -191,7 +192,7 @@ def test_probes_read_the_latent_without_shaping_it(batch, tiny):
     assert torch.equal(*gradients)
 
 
-def test_a_probe_learns_the_quantity_of_its_name(batch, tiny):
+def test_probe_learns_its_quantity(batch, tiny):
     torch.manual_seed(0)
     model = WorldModel(tiny("").model, action_dim=1, labels={"height": 2.0})
     features = torch.randn(4, 6, 48, generator=stream())
@@ -204,7 +205,7 @@ def test_a_probe_learns_the_quantity_of_its_name(batch, tiny):
     assert (model.probe(features) - labels).abs().mean() < 0.5
 
 
-def test_a_model_without_labels_refuses_to_be_probed(model):
+def test_probe_raises_when_the_model_has_no_labels(model):
     with pytest.raises(ValueError, match="without labels"):
         model.probe(torch.zeros(2, 48))
 
@@ -213,7 +214,7 @@ def planned(mean, std):
     return torch.full((40, 1), mean), torch.full((40, 1), std)
 
 
-def test_imitation_is_the_divergence_of_the_actor_from_the_planner(model):
+def test_imitation_loss_is_the_kl_from_planner_to_actor(model):
     features = torch.randn(40, 48)
     mean, std = planned(0.4, 0.25)
     normal = torch.distributions.Normal
@@ -221,14 +222,14 @@ def test_imitation_is_the_divergence_of_the_actor_from_the_planner(model):
     assert torch.allclose(imitation_loss(model.actor, features, mean, std), expected, atol=1e-5)
 
 
-def test_imitation_asks_for_no_std_that_the_actor_cannot_have(model):
+def test_imitation_loss_clamps_the_std_into_the_range_of_the_actor(model):
     features = torch.randn(40, 48)
     narrow, floor = (imitation_loss(model.actor, features, *planned(0.4, std)) for std in (0.01, 0.1))
     assert torch.equal(narrow, floor)
     assert torch.equal(*(imitation_loss(model.actor, features, *planned(0.4, std)) for std in (1.0, 3.0)))
 
 
-def test_imitation_moves_the_actor_alone(model):
+def test_imitation_loss_has_a_gradient_for_the_actor_only(model):
     features = torch.randn(40, 48, requires_grad=True)
     imitation_loss(model.actor, features, *planned(0.4, 0.2)).mean().backward()
     assert features.grad is None

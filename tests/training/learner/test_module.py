@@ -1,4 +1,4 @@
-"""The learner: model and behaviour side by side, as if one after the other."""
+"""The learner: model and behaviour update side by side with the results of updates in turn."""
 
 from pathlib import Path
 
@@ -6,13 +6,14 @@ import pytest
 import torch
 
 from latentplan.models import WorldModel
+from latentplan.models.fast import accelerate
 from latentplan.replay.buffer import Replay
 from latentplan.training.learner.module import Learner
 from latentplan.training.state import restore
 
 
 class Standalone(Learner):
-    """A learner that holds its own optimizers, so that it updates without a Trainer."""
+    """A learner with its own optimizers, which updates without a Trainer."""
 
     def optimizers(self, use_pl_optimizer=True):
         self.__dict__.setdefault("own", self.configure_optimizers())
@@ -22,12 +23,11 @@ class Standalone(Learner):
 def standalone(tiny, **learning):
     torch.manual_seed(0)
     config = tiny("", learning=learning)
-    model = WorldModel(config.model, action_dim=1)
+    model = accelerate(WorldModel(config.model, action_dim=1))
     return Standalone(model, config.learning, 0.9, Replay(24, 1, 16, 1, torch.device("cpu")), seed=0)
 
 
-def test_behaviour_learns_each_batch_from_the_model_as_the_same_batch_left_it(batch, tiny):
-    """Side by side the two halves give exactly what they give one after the other."""
+def test_learner_gives_the_same_results_side_by_side_as_in_turn(batch, tiny):
     overlapped, in_turn = standalone(tiny), standalone(tiny)
     for _ in range(4):
         overlapped.training_step(batch, 0)
@@ -39,7 +39,7 @@ def test_behaviour_learns_each_batch_from_the_model_as_the_same_batch_left_it(ba
     assert overlapped.metrics.keys() == in_turn.metrics.keys() >= {"actor", "reconstruction"}
 
 
-def test_an_update_changes_model_and_behaviour_and_their_snapshot(batch, tiny):
+def test_update_changes_model_then_behaviour_and_refreshes_the_snapshot(batch, tiny):
     learner = standalone(tiny)
     before = {name: value.clone() for name, value in learner.model.state_dict().items()}
     learner.training_step(batch, 0)
@@ -54,7 +54,7 @@ def test_an_update_changes_model_and_behaviour_and_their_snapshot(batch, tiny):
     assert frozen.actor is own.actor and not frozen.dynamics.gates.weight.requires_grad
 
 
-def test_what_fails_in_behaviour_is_raised_in_the_update(batch, tiny):
+def test_catch_up_raises_the_error_of_the_behaviour_thread(batch, tiny):
     learner = standalone(tiny)
     learner.training_step(batch, 0)
     with torch.no_grad():
@@ -64,19 +64,19 @@ def test_what_fails_in_behaviour_is_raised_in_the_update(batch, tiny):
 
 
 @pytest.mark.parametrize("share", [0.0, 1.0])
-def test_beliefs_of_turned_sequences_are_not_kept(batch, tiny, share):
+def test_update_does_not_store_beliefs_of_turned_sequences(batch, tiny, share):
     learner = standalone(tiny, turned_share=share)
     learner.training_step(batch, 0)
     assert (learner.replay.deter[batch.rows] == 0.0).all() == (share == 1.0)
 
 
-def test_a_value_that_is_forgotten_begins_anew_and_nothing_else_does(batch, tiny):
+def test_reset_value_head_changes_only_the_value_head_and_its_optimizer_state(batch, tiny):
     learner = standalone(tiny)
     for _ in range(3):
         learner.training_step(batch, 0)
         learner.catch_up()
     before = {name: value.clone() for name, value in learner.model.state_dict().items()}
-    learner.forget_values()
+    learner.reset_value_head()
     fresh = learner.model.value_head.mlp.output.bias.clone()
     assert torch.equal(learner.averaged.value_head.mlp.output.bias, fresh)
     changed = {name for name, value in learner.model.state_dict().items() if not torch.equal(value, before[name])}
@@ -92,7 +92,7 @@ def test_a_value_that_is_forgotten_begins_anew_and_nothing_else_does(batch, tiny
 
 
 def averages_of(learner, batch, updates):
-    """The weights of all updates, oldest first, and what they were on average after each."""
+    """Learned and averaged weights after each update, oldest first."""
     seen = []
     for _ in range(updates):
         learner.training_step(batch, 0)
@@ -103,21 +103,21 @@ def averages_of(learner, batch, updates):
     return seen
 
 
-def test_what_is_kept_is_the_average_of_the_latest_weights(batch, tiny):
+def test_averaged_weights_follow_the_documented_average(batch, tiny):
     seen = averages_of(standalone(tiny, average_rate=0.4), batch, 30)
     for name in ("dynamics.gates.weight", "actor.mlp.output.weight", "value_head.mlp.output.bias"):
         weights, averages = ([pair[which][name] for pair in seen] for which in (0, 1))
-        assert torch.equal(averages[9], weights[9])  # the last tenth of ten is one
+        assert torch.equal(averages[9], weights[9])  # the last tenth of 10 updates is one update
         torch.testing.assert_close(averages[19], averages[18] + 0.5 * (weights[19] - averages[18]))
         torch.testing.assert_close(averages[29], averages[28] + 0.4 * (weights[29] - averages[28]))
 
 
-def test_without_averaging_the_latest_is_kept(batch, tiny):
+def test_averaged_weights_are_the_latest_ones_when_the_rate_is_one(batch, tiny):
     latest, averaged = averages_of(standalone(tiny, average_rate=1.0), batch, 12)[-1]
     assert all(torch.equal(averaged[name], value) for name, value in latest.items())
 
 
-def test_a_run_saved_before_weights_were_averaged_begins_its_average_where_it_is(batch, tiny):
+def test_restore_starts_the_average_from_the_saved_weights_when_none_was_saved(batch, tiny):
     learner, resumed = standalone(tiny), standalone(tiny)
     averages_of(learner, batch, 12)
     saved = {name: value for name, value in learner.state_dict().items() if not name.startswith("averaged")}

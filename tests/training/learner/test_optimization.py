@@ -1,20 +1,20 @@
-"""What all learners share, beside their steps."""
+"""Optimizer steps and memory settings that all learners share."""
 
 import json
 import platform
 
 import pytest
-import torch
-
-from latentplan.training.learner.optimization import follow, follow_together
 
 BLOCK = 30_000_000
 
-# Asked of malloc itself: what the system does with memory that is handed back differs between machines.
-# Thresholds that are set explicitly keep glibc from moving them by itself, see mallopt(3).
-TOLD = f"""
-import ctypes, json, torch
-from latentplan.training.learner.optimization import keep_freed_memory
+# The script reads malloc's own counters, because systems differ in what they do with returned memory. It sets both
+# thresholds first, which keeps glibc from adapting them (mallopt(3)), and loads the module without its package.
+SCRIPT = f"""
+import ctypes, importlib.util, json, torch
+
+spec = importlib.util.spec_from_file_location("optimization", "latentplan/training/learner/optimization.py")
+optimization = importlib.util.module_from_spec(spec)
+spec.loader.exec_module(optimization)
 
 class Mallinfo(ctypes.Structure):  # mallinfo(3)
     _fields_ = [(name, ctypes.c_uint) for name in (
@@ -30,28 +30,17 @@ def mapped_and_kept():
     del block
     return during.hblkhd - before.hblkhd, libc.mallinfo().fordblks
 
-for name in (-1, -3):  # the thresholds of trimming and of mapping, as malloc begins with them
+for name in (-1, -3):  # malloc's initial thresholds of trimming and of mapping
     assert libc.mallopt(name, 128 * 1024)
-as_begun = mapped_and_kept()
-assert keep_freed_memory()
-print(json.dumps([as_begun, mapped_and_kept()]))
+before = mapped_and_kept()
+assert optimization.keep_freed_memory()
+print(json.dumps([before, mapped_and_kept()]))
 """
 
 
 @pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="asks glibc")
-def test_memory_that_is_freed_is_kept_for_what_comes_next(run_python):
-    (mapped_before, _), (mapped, kept) = json.loads(run_python("-c", TOLD).stdout)
+def test_keep_freed_memory_serves_large_tensors_from_the_heap(run_python):
+    (mapped_before, _), (mapped, kept) = json.loads(run_python("-c", SCRIPT).stdout)
     assert mapped_before >= BLOCK, "an allocation of this size is mapped anew and handed back"
     assert mapped == 0, "it comes from the heap"
     assert kept >= BLOCK, "and stays there"
-
-
-@pytest.mark.parametrize("rate", [0.25, torch.tensor(0.25)])
-def test_a_slow_copy_follows_all_at_once_as_one_by_one(rate):
-    torch.manual_seed(0)
-    slow, fast = ([torch.randn(3), torch.randn(2, 2)] for _ in range(2))
-    expected = [part.clone() for part in slow]
-    follow(expected, fast, rate)
-    follow_together(slow, fast, rate)
-    for one, other in zip(slow, expected, strict=True):
-        torch.testing.assert_close(one, other)

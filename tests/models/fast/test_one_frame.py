@@ -1,4 +1,4 @@
-"""The fast path from frame to action says what the model itself says."""
+"""The backend's path from one frame to an action."""
 
 import numpy as np
 import pytest
@@ -7,7 +7,7 @@ import torch
 from latentplan.agents.actor import ActorAgent
 from latentplan.config import Config, ModelConfig
 from latentplan.models import State, WorldModel
-from latentplan.models.fast import reflex
+from latentplan.models.fast import CpuBackend
 
 
 def make_model(channels=(8, 12, 16), seed=0):
@@ -26,21 +26,21 @@ def frames_of(rows, seed=0):
 
 @pytest.mark.parametrize("channels", [(8,), (8, 12), (8, 12, 16), (4, 6, 8, 10, 12)])
 @pytest.mark.parametrize("rows", [1, 5])
-def test_belief_and_action_are_those_of_the_model(channels, rows):
+def test_one_frame_path_equals_the_model_for_every_encoder(channels, rows):
     model = make_model(channels)
-    weights = reflex.lay_out(model)
+    backend = CpuBackend()
     state, action = State(torch.randn(rows, 24), torch.randn(rows, 32)), torch.rand(rows, 3) * 2 - 1
     frames = frames_of(rows)
     with torch.no_grad():
         expected = model.infer(state, action, frames)
-        believed = reflex.see(weights, reflex.advance(weights, state, action), frames)
+        believed = backend.see(model, backend.advance(model, state, action), frames)
         assert torch.allclose(believed.deter, expected.deter, atol=1e-5)
         assert torch.allclose(believed.stoch, expected.stoch, atol=1e-4)
-        for ours, models in zip(reflex.act(weights, expected), model.actor(expected.features), strict=True):
+        for ours, models in zip(backend.act(model, expected), model.actor(expected.features), strict=True):
             assert torch.allclose(ours, models, atol=1e-5)
 
 
-def load_others(model):
+def load_other_weights(model):
     model.load_state_dict(make_model(seed=1).state_dict())
 
 
@@ -51,9 +51,10 @@ def descend(model):
     optimizer.step()
 
 
-@pytest.mark.parametrize("change", [load_others, descend])
-def test_an_agent_follows_a_model_that_changes_between_two_frames(change):
+@pytest.mark.parametrize("change", [load_other_weights, descend])
+def test_agent_uses_weights_that_changed_between_two_frames(change):
     model = make_model()
+    model.backend = CpuBackend()
     agent, frames = ActorAgent(model, Config()), frames_of(2)
     action = torch.from_numpy(agent.act(frames.numpy()))
     before = agent.state
@@ -65,7 +66,7 @@ def test_an_agent_follows_a_model_that_changes_between_two_frames(change):
         assert np.allclose(after, model.actor(expected.features)[0].numpy(), atol=1e-4)
 
 
-def test_laying_out_changes_no_weight():
+def test_backend_changes_no_weight():
     model, same = make_model(), make_model()
-    reflex.lay_out(model)
+    CpuBackend().act(model, State(torch.zeros(1, 24), torch.zeros(1, 32)))
     assert all(torch.equal(ours, theirs) for ours, theirs in zip(model.parameters(), same.parameters(), strict=True))

@@ -1,9 +1,9 @@
-"""One frame in, one action out: the belief's update and the actor, arranged for few rows and one core.
+"""Belief update and actor for one frame or a few, in float32.
 
-Equals `WorldModel.infer` followed by the actor, in float32. At one row the time goes into calls, not into arithmetic:
-so the weights are gathered once, the convolutions are products of patches (a convolution of one small picture spends
-most of its time on preparing itself), and the spread of the posterior is left out. Plain functions of tensors:
-`latentplan.agents.export` writes them down as a program of their own.
+The result equals `WorldModel.infer` followed by the actor, up to rounding. For one row the overhead of calls costs more
+than the arithmetic. So the weights are collected once, convolutions are matrix products of patches (torch spends most
+of a small convolution on its preparation), and the std of the posterior is not computed. The functions take plain
+tensors, so that `latentplan.agents.export` can trace them into a program.
 """
 
 from __future__ import annotations
@@ -27,20 +27,20 @@ Norm = tuple[Tensor, Tensor]  # scale and shift
 Hidden = tuple[Tensor, Norm]  # weight (out, in) and the norm behind it
 
 
-class Reflex(NamedTuple):
-    """The weights that seeing and acting need.
+class FrameWeights(NamedTuple):
+    """The weights that belief update and actor need.
 
     Attributes:
-        patches: On pixels in [-0.5, 0.5].
-        convolutions: Each with a weight (out, y x in), so that it multiplies patches.
-        embedding: From the last picture to the embedding.
-        input: From latent and action to the recurrence.
-        gates: Of the recurrence.
-        posterior_deter: The deterministic state's share of the posterior, (embedding, deter).
-        posterior_norm: Of its hidden layer.
-        posterior_mean: From there to the latent.
+        patches: First layer of the encoder, on pixels in [-0.5, 0.5].
+        convolutions: Convolutions of the encoder, with weights (out, y x in) that multiply patches.
+        embedding: Last layer of the encoder.
+        input: Input layer of the GRU, for latent and action.
+        gates: Gates of the GRU.
+        posterior_deter: The posterior's weights for the deterministic state, (embedding, deter).
+        posterior_norm: Norm of the posterior's hidden layer.
+        posterior_mean: From the posterior's hidden layer to the mean of the latent.
         actor: Hidden layers of the actor.
-        action: From there to the mean and raw std of the action.
+        action: From the actor's hidden layers to mean and raw std of the action.
     """
 
     patches: Affine
@@ -56,15 +56,15 @@ class Reflex(NamedTuple):
 
 
 @torch.no_grad()
-def lay_out(model: WorldModel) -> Reflex:
+def convert_weights(model: WorldModel) -> FrameWeights:
     """The weights of a world model.
 
-    On the CPU they share its memory and so follow whatever changes it in place; to that end the convolutions' weights
-    are moved, unchanged, to where their channels lie side by side. On other devices these are copies.
+    On the CPU the weights share the model's memory. For this the model's convolutions are converted to the memory
+    format `channels_last`; their values stay the same. On other devices the convolutions' weights are copies.
     """
     encoder, dynamics, latent = model.encoder, model.dynamics, model.dynamics.latent_dim
     output = dynamics.posterior_output
-    return Reflex(
+    return FrameWeights(
         patches=_affine(encoder.patches),
         convolutions=tuple(_convolution(layer) for layer in encoder.convolutions if isinstance(layer, nn.Conv2d)),
         embedding=_affine(encoder.linear),
@@ -78,48 +78,50 @@ def lay_out(model: WorldModel) -> Reflex:
     )
 
 
-def see(reflex: Reflex, deter: Tensor, frames: Tensor) -> State:
-    """The belief with posterior mean for deter (rows, deter) and uint8 frames (rows, 64, 64, 3)."""
-    product = functional.linear(deter, reflex.posterior_deter) + _embed(reflex, frames)
-    return State(deter, functional.linear(pointwise.norm_silu(product, *reflex.posterior_norm), *reflex.posterior_mean))
+def see(weights: FrameWeights, deter: Tensor, frames: Tensor) -> State:
+    """The belief with the posterior's mean for deter (rows, deter) and uint8 frames (rows, 64, 64, 3)."""
+    product = functional.linear(deter, weights.posterior_deter) + _embed(weights, frames)
+    return State(
+        deter, functional.linear(pointwise.norm_silu(product, *weights.posterior_norm), *weights.posterior_mean)
+    )
 
 
-def advance(reflex: Reflex, state: State, action: Tensor) -> Tensor:
+def advance(weights: FrameWeights, state: State, action: Tensor) -> Tensor:
     """The deterministic state (rows, deter) after action (rows, action) in [-1, 1]."""
-    hidden = _layer(torch.cat([state.stoch, action], -1), reflex.input)
-    weight, norm = reflex.gates
+    hidden = _layer(torch.cat([state.stoch, action], -1), weights.input)
+    weight, norm = weights.gates
     product = functional.linear(torch.cat([hidden, state.deter], -1), weight)
-    return pointwise.gated(product, *norm, state.deter)
+    return pointwise.update_deter(product, *norm, state.deter)
 
 
-def act(reflex: Reflex, state: State) -> tuple[Tensor, Tensor]:
+def act(weights: FrameWeights, state: State) -> tuple[Tensor, Tensor]:
     """Mean in [-1, 1] and std of the actor's action, (rows, action) each."""
     hidden = state.features
-    for layer in reflex.actor:
+    for layer in weights.actor:
         hidden = _layer(hidden, layer)
-    return action_distribution(functional.linear(hidden, *reflex.action))
+    return action_distribution(functional.linear(hidden, *weights.action))
 
 
-def _embed(reflex: Reflex, frames: Tensor) -> Tensor:
+def _embed(weights: FrameWeights, frames: Tensor) -> Tensor:
     """Embeddings (rows, embedding) of uint8 frames (rows, 64, 64, 3)."""
     # Sizes come from `shape`: `len` would build the number of rows into an exported program.
     rows, side = frames.shape[0], FRAME_SIZE // PATCH
     patches = frames.reshape(rows, side, PATCH, side, 3 * PATCH).transpose(2, 3).reshape(rows, side * side, -1)
-    pixels = patches.to(reflex.patches[0].dtype).mul_(1.0 / 255.0).sub_(0.5)
-    tokens = functional.silu(functional.linear(pixels, *reflex.patches))
-    for weight, shift in reflex.convolutions:
+    pixels = patches.to(weights.patches[0].dtype).mul_(1.0 / 255.0).sub_(0.5)
+    tokens = functional.silu(functional.linear(pixels, *weights.patches))
+    for weight, shift in weights.convolutions:
         windows = _windows(tokens.reshape(rows, side, side, -1))
         tokens, side = functional.silu(functional.linear(windows, weight, shift)), side // STRIDE
-    return functional.linear(tokens.reshape(rows, -1), *reflex.embedding)
+    return functional.linear(tokens.reshape(rows, -1), *weights.embedding)
 
 
 def _windows(picture: Tensor) -> Tensor:
-    """What each output of a convolution reads, (rows, output, y x channel), of pictures (rows, side, side, channel)."""
+    """The input patch of each output of a convolution, (rows, output, y x channel), for (rows, side, side, channel)."""
     rows, side, _, channels = picture.shape
     padded = functional.pad(picture, (0, 0, PADDING, PADDING, PADDING, PADDING))
     wide, outputs = side + 2 * PADDING, side // STRIDE
     line = wide * channels
-    # A window's line of pixels lies in one piece, so that four pieces make a window.
+    # A line of a window is contiguous in memory, so that a window is four contiguous pieces.
     windows = padded.as_strided(
         (rows, outputs, outputs, KERNEL, KERNEL * channels),
         (wide * line, STRIDE * line, STRIDE * channels, line, 1),

@@ -1,0 +1,68 @@
+"""Environments by the names in the settings: looks up the suite in `latentplan.config.suites` and calls its factory.
+
+A suite's factory is called as `factory(config, seed)`, with an `EnvConfig` and the seed of the first reset (None draws
+one), and returns a `gymnasium.Env` with these spaces and values:
+
+    observation_space       Box, uint8 (64, 64, 3); every observation is an array of its own
+    action_space            Box in [-1, 1], float32 (action,)
+    reset                   depends on `seed` alone where one is given, else continues the random stream
+    step                    holds the action for `config.action_repeat` control steps and sums their rewards
+    info["env_frames"]      control steps that this step took; 0 from `reset`
+
+`latentplan.envs.wrap_user_env` makes such an environment of any other with image observations. Further attributes are
+optional, and each serves one feature:
+
+    decisions_per_episode   decisions until the time limit (the discount is derived from it)
+    labels                  scale of each named quantity; `info["labels"]` then holds the values, float32 (label,)
+    render_large(size)      a larger picture, uint8 (size, size, 3), for films
+    substeps_per_decision, step_schedule    actions that change within a decision, for worlds that do not wait
+    record_quantities       values after each control step in `info`, for scores of objectives named at test time
+"""
+
+from __future__ import annotations
+
+import difflib
+import importlib
+from collections.abc import Iterable
+from typing import Any
+
+from latentplan.config import USER_DOMAIN, EnvConfig, UserError
+from latentplan.config.suites import DEFAULT_SUITE, find_suite
+
+
+def make_env(config: EnvConfig, seed: int | None = None) -> Any:
+    """The environment that the settings name.
+
+    Args:
+        config: Suite, domain, task, action repeat, camera and render quality.
+        seed: Start of its random stream; None draws one from the system.
+
+    Raises:
+        UserError: Suite, domain, task or camera do not exist, or no OpenGL library can render.
+    """
+    if config.domain == USER_DOMAIN:
+        raise UserError(
+            "this agent learned in an environment of your own, which a command cannot make: play it from Python, "
+            "agent = load_agent(DIR)"
+        )
+    module, name = find_suite(config.suite).factory.split(":")
+    return getattr(importlib.import_module(module), name)(config, seed)
+
+
+def default_task(domain: str, suite: str = DEFAULT_SUITE) -> str:
+    """The usual task of a domain in benchmarks.
+
+    Raises:
+        UserError: The suite or the domain is unknown.
+    """
+    tasks = find_suite(suite).tasks
+    if domain not in tasks:
+        raise UserError(unknown_name("domain", domain, tasks))
+    return tasks[domain]
+
+
+def unknown_name(kind: str, name: str, available: Iterable[str]) -> str:
+    """An error message for a name that does not exist: all names that do, and the nearest of them."""
+    choices = sorted(available)
+    nearest = difflib.get_close_matches(name, choices, n=1, cutoff=0.0)[0]
+    return f"unknown {kind} {name!r}; available: {', '.join(choices)}. Did you mean {nearest!r}?"

@@ -1,0 +1,128 @@
+"""The computations of a world model that can be made faster, and their reference in plain torch.
+
+A `WorldModel` asks its backend for everything that planners, agents and learners need often. `Backend` is the
+reference: it works on every device, with every kind of dynamics. The backends in `latentplan.models.fast` return the
+same results up to rounding; `latentplan.models.fast.accelerate` chooses one for a model.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING, Any
+
+import torch
+from torch import Tensor
+
+from latentplan.models.dynamics import Gaussian, State
+
+if TYPE_CHECKING:
+    from latentplan.models.world_model import WorldModel
+
+
+class Backend:
+    """Computes a world model in plain torch.
+
+    Every method takes the model as its first argument, so that copies of a model can share a backend. A backend can be
+    copied and pickled with its model.
+
+    Args:
+        trunk_dtype: Precision of the matrix products outside the last layers of heads.
+    """
+
+    def __init__(self, trunk_dtype: torch.dtype = torch.float32) -> None:
+        self.trunk_dtype = trunk_dtype
+
+    # For planners.
+
+    def step(self, model: WorldModel, state: State, action: Tensor) -> tuple[State, Tensor]:
+        """The state after action (rows, action) by the mean of the prior, and the reward (rows,); passes gradients."""
+        with model.trunk_precision():
+            following = _advance_by_mean(model, state, action)
+            return following, model.reward_head.mean(model.reward_head(following.features))
+
+    def fast_step(self, model: WorldModel, state: State, action: Tensor) -> tuple[State, Tensor]:
+        """The same as `step`; a faster backend need not pass gradients."""
+        return self.step(model, state, action)
+
+    def rollout(self, model: WorldModel, state: State, actions: Tensor) -> tuple[Tensor, State]:
+        """Repeated steps along actions (rows, horizon, action).
+
+        Gradients reach the state and the actions. A faster backend need not pass gradients to the weights.
+
+        Returns:
+            Rewards float32 (rows, horizon), and the last state.
+        """
+        rewards: list[Tensor] = []
+        for action in actions.unbind(1):
+            state, reward = self.step(model, state, action)
+            rewards.append(reward)
+        return torch.stack(rewards, 1), state
+
+    def propose(self, model: WorldModel, state: State, noise: Tensor) -> Tensor:
+        """Actions of the actor along the mean of the prior, float32 (rows, horizon, action).
+
+        Args:
+            model: The world model.
+            state: Start of every sequence, (rows, ...).
+            noise: Standard normal draws for samples, zeros for the mode, (rows, horizon, action).
+        """
+        actions: list[Tensor] = []
+        for draw in noise.unbind(1):
+            with model.trunk_precision():
+                mean, std = model.actor(state.features)
+                actions.append((mean + std * draw).clamp(-1.0, 1.0))
+                state = _advance_by_mean(model, state, actions[-1])
+        return torch.stack(actions, 1)
+
+    def value(self, model: WorldModel, state: State) -> Tensor:
+        """The expected discounted return from a state on, float32 (...)."""
+        with model.trunk_precision():
+            return model.value_head.mean(model.value_head(state.features))
+
+    # For agents, which get one frame at a time: float32 and without gradients.
+
+    def advance(self, model: WorldModel, state: State, action: Tensor) -> Tensor:
+        """The deterministic state (rows, deter) after action (rows, action)."""
+        return model.dynamics.advance(state, action)
+
+    def see(self, model: WorldModel, deter: Tensor, frames: Tensor) -> State:
+        """The belief with the posterior's mean for deter (rows, deter) and uint8 frames (rows, 64, 64, 3)."""
+        return model.see(deter, frames)
+
+    def act(self, model: WorldModel, state: State) -> tuple[Tensor, Tensor]:
+        """Mean in [-1, 1] and std of the actor's action, (rows, action) each."""
+        mean, std = model.actor(state.features)
+        return mean, std
+
+    # For learners, with gradients.
+
+    def observe(
+        self, model: WorldModel, embeddings: Tensor, actions: Tensor, deter: Tensor, noise: Tensor
+    ) -> tuple[State, Gaussian]:
+        """See `Dynamics.observe`; gradients reach the embeddings and the weights."""
+        return model.dynamics.observe(embeddings, actions, deter, noise)
+
+    def predict(self, model: WorldModel, start: State, actions: Tensor) -> tuple[Tensor, Gaussian]:
+        """See `Dynamics.predict`; gradients reach the weights."""
+        return model.dynamics.predict(start, actions)
+
+    def imagine(
+        self, model: WorldModel, start: State, action_noise: Tensor, noise: Tensor, decay: float
+    ) -> tuple[Tensor, Tensor]:
+        """See `Dynamics.imagine`, with the model's actor as the policy; gradients reach the actor."""
+        return model.dynamics.imagine(model.actor, start, action_noise, noise, decay)
+
+    def call(self, function: Callable[..., Any], *arguments: Any) -> Any:
+        """The result of a function of tensors; a faster backend may compile the function."""
+        return function(*arguments)
+
+    @torch.no_grad()
+    def move_towards(self, slow: Sequence[Tensor], fast: Sequence[Tensor], rate: float | Tensor) -> None:
+        """Move each of the slow tensors by a share in [0, 1] of its distance to the fast one, in place."""
+        for one, other in zip(slow, fast, strict=True):
+            one.lerp_(other, rate)
+
+
+def _advance_by_mean(model: WorldModel, state: State, action: Tensor) -> State:
+    deter = model.dynamics.advance(state, action)
+    return State(deter, model.dynamics.prior(deter).mean)

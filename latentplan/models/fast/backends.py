@@ -1,0 +1,176 @@
+"""The backends for processors and for GPUs."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Hashable, Sequence
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from latentplan.models.backend import Backend
+from latentplan.models.dynamics import Gaussian, Rssm, State
+from latentplan.models.fast import compiled, one_frame, pointwise, unroll
+from latentplan.models.fast import rollout as rollouts
+from latentplan.models.world_model import WorldModel
+
+
+class ConvertedWeights:
+    """A converted copy of some weights, made again when one of them was replaced or written to in place.
+
+    Writes through `parameter.data` go unnoticed. A copy or a pickle of this object starts empty, because converted
+    weights can hold pointers.
+
+    Args:
+        parts: The modules of a model whose weights are converted.
+        convert: Makes the converted weights of a model, with products in a dtype.
+    """
+
+    def __init__(
+        self, parts: Callable[[WorldModel], tuple[nn.Module, ...]], convert: Callable[[WorldModel, torch.dtype], Any]
+    ) -> None:
+        self._parts, self._convert = parts, convert
+        self._places: tuple[tuple[nn.Module, ...], list[tuple[dict[str, Any], str]]] | None = None
+        self._kept: tuple[Hashable, Any] | None = None
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {**self.__dict__, "_places": None, "_kept": None}
+
+    def of(self, model: WorldModel, dtype: torch.dtype) -> Any:
+        """The converted weights of a model as they are now."""
+        parameters = self._parameters(model)
+        if parameters[0].is_inference():  # torch does not count writes to such tensors
+            return self._convert(model, dtype)
+        key = (dtype, *((parameter.data_ptr(), parameter._version) for parameter in parameters))
+        kept = self._kept  # read once: another thread may replace it
+        if kept is None or kept[0] != key:
+            with torch.inference_mode(False):  # tensors made in inference mode could not be used for gradients later
+                kept = self._kept = (key, self._convert(model, dtype))
+        return kept[1]
+
+    def _parameters(self, model: WorldModel) -> list[Tensor]:
+        parts, places = self._parts(model), self._places
+        if places is None or any(one is not other for one, other in zip(places[0], parts, strict=True)):
+            # Kept, because a walk through the modules takes longer than an imagined step.
+            modules = [module for part in parts for module in part.modules()]
+            places = parts, [(module._parameters, name) for module in modules for name in module._parameters]
+            self._places = places
+        return [owner[name] for owner, name in places[1] if owner[name] is not None]
+
+
+class _ConvertingBackend(Backend):
+    """Rollouts and single frames with weights that are converted once, for dynamics of the class `Rssm`."""
+
+    def __init__(self, trunk_dtype: torch.dtype) -> None:
+        super().__init__(trunk_dtype)
+        self._rollout_weights = ConvertedWeights(_rollout_parts, _convert_for_rollouts)
+        self._frame_weights = ConvertedWeights(_frame_parts, _convert_for_frames)
+
+    @staticmethod
+    def can_compute(model: WorldModel) -> bool:
+        """Whether the backend knows the model's dynamics."""
+        return type(model.dynamics) is Rssm
+
+    def rollout(self, model: WorldModel, state: State, actions: Tensor) -> tuple[Tensor, State]:
+        """See `Backend.rollout`; gradients do not reach the weights."""
+        return rollouts.imagine(self._weights(model), state, actions)
+
+    def propose(self, model: WorldModel, state: State, noise: Tensor) -> Tensor:
+        """See `Backend.propose`; gradients do not reach the weights."""
+        return rollouts.propose(self._weights(model), state, noise)
+
+    def advance(self, model: WorldModel, state: State, action: Tensor) -> Tensor:
+        """See `Backend.advance`."""
+        return one_frame.advance(self._frame_weights.of(model, torch.float32), state, action)
+
+    def see(self, model: WorldModel, deter: Tensor, frames: Tensor) -> State:
+        """See `Backend.see`."""
+        return one_frame.see(self._frame_weights.of(model, torch.float32), deter, frames)
+
+    def act(self, model: WorldModel, state: State) -> tuple[Tensor, Tensor]:
+        """See `Backend.act`."""
+        return one_frame.act(self._frame_weights.of(model, torch.float32), state)
+
+    def _weights(self, model: WorldModel) -> rollouts.Weights:
+        kind = model.device.type
+        with model.trunk_precision():
+            dtype = torch.get_autocast_dtype(kind) if torch.is_autocast_enabled(kind) else torch.float32
+        weights: rollouts.Weights = self._rollout_weights.of(model, dtype)
+        return weights
+
+
+class CpuBackend(_ConvertingBackend):
+    """Rollouts, steps and values in one compiled call each, where the processor multiplies bfloat16; else torch."""
+
+    def __init__(self) -> None:
+        super().__init__(torch.bfloat16)
+
+    def fast_step(self, model: WorldModel, state: State, action: Tensor) -> tuple[State, Tensor]:
+        """See `Backend.fast_step`."""
+        if self._packed(model) is None:
+            return self.step(model, state, action)
+        rewards, following = self.rollout(model, state, action.unsqueeze(1))
+        return following, rewards.squeeze(1)
+
+    def value(self, model: WorldModel, state: State) -> Tensor:
+        """See `Backend.value`."""
+        packed = self._packed(model) if state.deter.ndim == 2 else None
+        return super().value(model, state) if packed is None else compiled.value(packed, *state)
+
+    def _packed(self, model: WorldModel) -> compiled.Packed | None:
+        """Weights for compiled calls; None if torch has to compute, or if gradients could be required."""
+        return None if torch.is_grad_enabled() else self._weights(model).packed
+
+
+class GpuBackend(_ConvertingBackend):
+    """Fewer kernels per step: the gradients of the recurrence are written out, and elementwise work is compiled.
+
+    The trunk is float32, because converting operands takes longer than products of this size save. Where the tensors
+    are on a CPU the same arithmetic runs uncompiled.
+    """
+
+    def __init__(self) -> None:
+        super().__init__(torch.float32)
+
+    def observe(
+        self, model: WorldModel, embeddings: Tensor, actions: Tensor, deter: Tensor, noise: Tensor
+    ) -> tuple[State, Gaussian]:
+        """See `Backend.observe`."""
+        return unroll.observe(model.dynamics, embeddings, actions, deter, noise)
+
+    def predict(self, model: WorldModel, start: State, actions: Tensor) -> tuple[Tensor, Gaussian]:
+        """See `Backend.predict`."""
+        return unroll.predict(model.dynamics, start, actions)
+
+    def imagine(
+        self, model: WorldModel, start: State, action_noise: Tensor, noise: Tensor, decay: float
+    ) -> tuple[Tensor, Tensor]:
+        """See `Backend.imagine`; the weights of the dynamics get no gradient."""
+        return unroll.imagine(model.dynamics, model.actor, start, action_noise, noise, decay)
+
+    def call(self, function: Callable[..., Any], *arguments: Any) -> Any:
+        """See `Backend.call`."""
+        return pointwise.run(function, *arguments)
+
+    @torch.no_grad()
+    def move_towards(self, slow: Sequence[Tensor], fast: Sequence[Tensor], rate: float | Tensor) -> None:
+        """See `Backend.move_towards`; three kernels for all tensors."""
+        steps = torch._foreach_sub(list(fast), list(slow))
+        torch._foreach_mul_(steps, rate)
+        torch._foreach_add_(list(slow), steps)
+
+
+def _rollout_parts(model: WorldModel) -> tuple[nn.Module, ...]:
+    return model.dynamics, model.reward_head, model.value_head, model.actor
+
+
+def _convert_for_rollouts(model: WorldModel, dtype: torch.dtype) -> rollouts.Weights:
+    return rollouts.convert_weights(model.dynamics, model.reward_head, model.value_head, model.actor, dtype)
+
+
+def _frame_parts(model: WorldModel) -> tuple[nn.Module, ...]:
+    return model.encoder, model.dynamics, model.actor
+
+
+def _convert_for_frames(model: WorldModel, dtype: torch.dtype) -> one_frame.FrameWeights:
+    return one_frame.convert_weights(model)

@@ -1,0 +1,88 @@
+"""The calls that `benchmark.py paths` times."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import torch
+
+from latentplan.config import LearningConfig
+from latentplan.models import State, WorldModel
+
+Calls = dict[str, Callable[[WorldModel], Any]]
+
+
+def planner_calls(model: WorldModel, rows: int, horizon: int) -> Calls:
+    """What a search asks for, without gradients."""
+    state, actions = _states(model, rows), _actions(model, rows, horizon)
+    noise = torch.randn_like(actions)
+
+    def without_gradients(call: Callable[[WorldModel], Any]) -> Callable[[WorldModel], Any]:
+        return torch.no_grad()(call)
+
+    return {
+        f"rollout of {rows}": without_gradients(lambda model: model.rollout(state, actions)),
+        f"proposals of {rows}": without_gradients(lambda model: model.backend.propose(model, state, noise)),
+        f"step of {rows}": without_gradients(lambda model: model.fast_step(state, actions[:, 0])),
+        f"value of {rows}": without_gradients(lambda model: model.value(state)),
+    }
+
+
+def frame_calls(model: WorldModel) -> Calls:
+    """Belief update and actor for one frame."""
+    state, action = _states(model, 1), _actions(model, 1, 1)[:, 0]
+    frames = torch.randint(0, 256, (1, 64, 64, 3), dtype=torch.uint8, device=model.device)
+
+    @torch.inference_mode()
+    def decide(model: WorldModel) -> Any:
+        deter = model.backend.advance(model, state, action)
+        return model.backend.act(model, model.backend.see(model, deter, frames))
+
+    return {"one frame": decide}
+
+
+def learner_calls(model: WorldModel, learning: LearningConfig) -> Calls:
+    """Forward and backward passes of the recurrence, and the slow copies of weights."""
+    batch, time, sizes, device = learning.batch_size, learning.sequence_length, model.config, model.device
+    embeddings = torch.randn(batch, time + 1, sizes.hidden_dim, device=device, requires_grad=True)
+    noise = torch.randn(batch, time + 1, sizes.latent_dim, device=device)
+    actions, deter = _actions(model, batch, time), torch.zeros(batch, sizes.deter_dim, device=device)
+    windows = max(1, learning.overshooting_horizon)
+    starts = _states(model, batch * max(1, time // windows))
+    following = _actions(model, len(starts.deter), windows)
+    first, horizon = _states(model, learning.imagination_starts), learning.imagination_horizon
+    action_noise = torch.randn(horizon, len(first.deter), model.action_dim, device=device)
+    latent_noise = torch.randn(horizon, len(first.deter), sizes.latent_dim, device=device)
+    slow = [parameter.detach().clone() for parameter in model.parameters()]
+    latest = [parameter.detach() for parameter in model.parameters()]
+
+    def observe(model: WorldModel) -> None:
+        _descend(*model.backend.observe(model, embeddings, actions, deter, noise))
+
+    def predict(model: WorldModel) -> None:
+        deters, prior = model.backend.predict(model, starts, following)
+        _descend((deters,), prior)
+
+    def imagine(model: WorldModel) -> None:
+        _descend(model.backend.imagine(model, first, action_noise, latent_noise, learning.gradient_decay))
+
+    return {
+        "observation, gradients written out": observe,
+        "open-loop prediction, gradients written out": predict,
+        "imagination, gradients written out": imagine,
+        "moving averages, all tensors at once": lambda model: model.backend.move_towards(slow, latest, 0.01),
+    }
+
+
+def _states(model: WorldModel, rows: int) -> State:
+    sizes = (model.config.deter_dim, model.config.latent_dim)
+    return State(*(torch.randn(rows, size, device=model.device).tanh() for size in sizes))
+
+
+def _actions(model: WorldModel, rows: int, time: int) -> torch.Tensor:
+    return torch.rand(rows, time, model.action_dim, device=model.device) * 2.0 - 1.0
+
+
+def _descend(*outputs: tuple[torch.Tensor, ...]) -> None:
+    torch.stack([part.sum() for parts in outputs for part in parts]).sum().backward()

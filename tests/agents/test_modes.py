@@ -1,0 +1,82 @@
+"""The table of agent modes: every row can be used, a new row is enough for a new mode."""
+
+import numpy as np
+import pytest
+
+from latentplan.agents.checkpoint import load_agent, save_checkpoint
+from latentplan.agents.modes import MODES, AgentMode, planning_modes
+from latentplan.agents.planning import PlanningAgent
+from latentplan.config import UserError
+from tests.agents.small_agents import CONFIG, make_model
+
+FRAME = np.zeros((64, 64, 3), np.uint8)
+HERE = "tests.agents.test_modes"
+
+
+class ReversedAgent(PlanningAgent):
+    """Executes the negative of each planned action, times a factor."""
+
+    def __init__(self, model, config, discount, *, planner=None, factor=1.0):
+        super().__init__(model, config, discount, planner=planner)
+        self.factor = factor
+
+    def _choose(self, state):
+        return -self.factor * super()._choose(state)
+
+
+class RestingAgent:
+    """Executes zeros."""
+
+    def __init__(self, model, config):
+        self.num_actions = model.action_dim
+
+    def seed(self, seed):
+        pass
+
+    def reset(self):
+        pass
+
+    def act(self, frame):
+        return np.zeros(self.num_actions, np.float32)
+
+
+@pytest.fixture(scope="module")
+def checkpoint(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("agent")
+    info = {"domain": "cartpole", "task": "swingup", "env_frames": 1, "discount": 0.9}
+    save_checkpoint(folder, make_model(), CONFIG, info)
+    return folder
+
+
+def test_table_needs_the_standard_library_only(run_python):
+    code = (
+        "import sys\nbefore = set(sys.modules)\nimport latentplan.agents.modes\n"
+        "new = {name.split('.')[0] for name in set(sys.modules) - before}\n"
+        "print(sorted(new - sys.stdlib_module_names))"
+    )
+    finished = run_python("-c", code)
+    assert finished.stdout.strip() == "['latentplan']", finished.stderr
+
+
+def test_planning_modes_are_those_whose_agents_take_an_objective():
+    assert planning_modes() == ("planner", "gated", "background")
+    for name, mode in MODES.items():
+        assert hasattr(mode.load(), "set_objective") == mode.plans, name
+
+
+def test_registered_mode_that_plans_is_loaded_with_planner_settings_and_its_own_options(checkpoint, monkeypatch):
+    monkeypatch.setitem(MODES, "reversed", AgentMode(f"{HERE}:ReversedAgent", plans=True, options=("factor",)))
+    plain, reversed_agent = load_agent(checkpoint, horizon=2), load_agent(checkpoint, "reversed", horizon=2, factor=0.5)
+    assert reversed_agent.controller.planner.horizon == 2
+    assert np.allclose(reversed_agent.act(FRAME), -0.5 * plain.act(FRAME), atol=1e-6)
+    with pytest.raises(UserError, match="did you mean factor?"):
+        load_agent(checkpoint, "reversed", facter=0.5)
+    with pytest.raises(UserError, match="planner, gated, background, actor, random, reversed, got 'revers'"):
+        load_agent(checkpoint, "revers")
+
+
+def test_registered_mode_that_does_not_plan_takes_no_planner_settings(checkpoint, monkeypatch):
+    monkeypatch.setitem(MODES, "resting", AgentMode(f"{HERE}:RestingAgent"))
+    assert load_agent(checkpoint, "resting").act(FRAME).tolist() == [0.0, 0.0]
+    with pytest.raises(UserError, match="horizon has no effect in mode resting"):
+        load_agent(checkpoint, "resting", horizon=2)
