@@ -1,4 +1,4 @@
-"""`python -m latentplan`: train, eval, distill, export, doctor and --version."""
+"""`python -m latentplan COMMAND ...` does the same as `latentplan COMMAND ...`."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Teach a trained agent's actor what its planner does: `python scripts/distill.py --checkpoint DIR`; see --help."""
+"""Teach a trained agent's actor to act as its planner does: `python scripts/distill.py --checkpoint DIR`."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
-from latentplan.commands.distill import main  # noqa: E402
+from latentplan.commands.main import run_script  # noqa: E402
 
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(run_script("distill"))

@@ -1,4 +1,4 @@
-"""Run a trained agent in closed loop: `python scripts/eval.py --checkpoint DIR`; --help lists every flag."""
+"""Play a trained agent in closed loop: `python scripts/eval.py --checkpoint DIR`; --help lists the flags."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
-from latentplan.commands.evaluate import main  # noqa: E402
+from latentplan.commands.main import run_script  # noqa: E402
 
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(run_script("eval"))

@@ -1,4 +1,4 @@
-"""Teach a trained agent to pursue goals that are named later: `goals.py --checkpoint DIR`; see --help."""
+"""Teach a trained agent to pursue goals that are named later: `python scripts/goals.py --checkpoint DIR`."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
-from latentplan.commands.goals import main  # noqa: E402
+from latentplan.commands.main import run_script  # noqa: E402
 
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(run_script("goals"))

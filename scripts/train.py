@@ -1,4 +1,4 @@
-"""Train an agent from pixels: `python scripts/train.py --domain walker`; --help lists every setting."""
+"""Train an agent from pixels: `python scripts/train.py --domain walker`; --help lists the flags."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
-from latentplan.commands.main import train_main  # noqa: E402
+from latentplan.commands.main import run_script  # noqa: E402
 
 if __name__ == "__main__":
-    sys.exit(train_main())
+    sys.exit(run_script("train"))

@@ -93,8 +93,10 @@ def test_continuous_integration_runs_the_two_commands_and_nothing_else():
 
 
 def test_the_flags_of_continuous_integration_are_valid():
-    from latentplan.commands.main import parse_train
+    from latentplan.commands import train
+    from latentplan.commands.flags import read_request
 
     script = (ROOT / ".ci" / "run").read_text().replace("\\\n", " ")
     arguments = re.search(r'ARGS="([^"]*)"', script)[1].split()
-    assert parse_train(["--domain", "walker", *arguments]).config.env.domain == "cartpole"
+    request = read_request(train.Request, ["--domain", "walker", *arguments])
+    assert train.resolve(request).env.domain == "cartpole"

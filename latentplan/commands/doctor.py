@@ -1,4 +1,4 @@
-"""What this machine offers for training, and what to do about whatever is wrong."""
+"""`latentplan doctor`: report what this machine offers for training, and how to mend each problem."""
 
 from __future__ import annotations
 
@@ -14,7 +14,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from latentplan.config import RENDER_QUALITIES, EnvConfig, UserError
-from latentplan.replay.memory import MEMORY_FACTS, free_memory
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
@@ -46,6 +45,11 @@ _VIDEO_FRAMES = 8
 
 
 @dataclass(frozen=True)
+class Request:
+    """The doctor has no flags of its own."""
+
+
+@dataclass(frozen=True)
 class Finding:
     """One line of the report.
 
@@ -62,7 +66,7 @@ class Finding:
     fatal: bool = True
 
 
-def run_doctor() -> int:
+def run(request: Request) -> int:
     """Print the report.
 
     Returns:
@@ -181,7 +185,9 @@ def _frame_times() -> Iterator[Finding]:
 
 
 def _space() -> Iterator[Finding]:
-    if MEMORY_FACTS.exists():  # elsewhere nobody tells what is free
+    from latentplan.replay.memory import MEMORY_FACTS, free_memory
+
+    if MEMORY_FACTS.exists():  # other systems do not say how much is free
         memory = free_memory() / _GIB
         short = memory < _ENOUGH_MEMORY_GIB
         remedy = f"below {_ENOUGH_MEMORY_GIB:g} GiB: lower --replay.capacity, or end other programs"

@@ -1,6 +1,6 @@
-"""`scripts/eval.py`: what a trained agent earns in closed loop, how long it thinks, and a film of it.
+"""`latentplan eval`: play a trained agent in closed loop: its return, its decision latency, a film.
 
-Torch and the simulator are imported when a rollout needs them, so that `--help` and bad input answer at once.
+Torch and the simulator are imported when the first episode needs them, so that `--help` and bad input answer at once.
 """
 
 from __future__ import annotations
@@ -10,19 +10,16 @@ import dataclasses
 import json
 import os
 import sys
-from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from latentplan.commands.evaluation_request import (
-    PLANNING_MODES,
-    EvaluationRequest,
-    help_text,
-    parse_arguments,
-)
-from latentplan.commands.main import run_guarded, use_device
-from latentplan.config import EnvConfig, PlannerConfig, UserError, from_dict, to_dict
-from latentplan.config.files import build_config
-from latentplan.config.planner import override_planner
+from latentplan.commands.flags import overrides
+from latentplan.commands.saved import saved_config, search_settings
+from latentplan.commands.shell import ComputeRequest
+from latentplan.config import EnvConfig, PlannerConfig, UserError, to_dict
+from latentplan.config.checks import above_zero, at_least, one_of, within
+from latentplan.config.parsing import option
 
 if TYPE_CHECKING:
     from latentplan.envs.suite import SuiteEnv
@@ -30,33 +27,105 @@ if TYPE_CHECKING:
     from latentplan.evaluation.goals import Goals, ScoredEnv
     from latentplan.evaluation.statistics import Episode
 
-ON_ONE_THREAD = ("actor", "background")  # more would only wait for each other at a single frame
+
+@dataclass(frozen=True, kw_only=True)
+class Request(ComputeRequest):
+    """What the command line of an evaluation asks for.
+
+    Attributes:
+        checkpoint: Folder of a trained agent, or of a run (its best checkpoint).
+        episodes: Episodes to play.
+        mode: Agent that chooses the actions.
+        objective: Objective in place of the task, such as 'speed -> 2.0 and height > 1.1'.
+        constraint: Condition that must hold at every moment, such as 'cart < 0.5'; may be repeated.
+        planning_budget: Share of its decisions that a gated agent may plan, in [0, 1]; None takes the agent's own.
+        video: Film of the first episode, .mp4 or .webm.
+        json: Result as JSON.
+        control_hz: Decisions per second of a world that goes on while the agent computes; None makes the world wait.
+        latency: Time that a decision takes in a world that does not wait: `measured`, or a file of milliseconds.
+        seed: Seed of the starts: episode i starts from a state that depends only on the seed and i.
+        planner: Settings of the search, in place of the agent's own.
+    """
+
+    NOTES = "Planner defaults shown are the program's; the settings of a checkpoint hold unless given here."
+
+    checkpoint: Path = option(metavar="DIR")
+    episodes: int = 10
+    mode: str = option("planner", choices=lambda: list_modes())
+    objective: str | None = None
+    constraint: str | None = option(None, join="; ")
+    planning_budget: float | None = None
+    video: Path | None = option(None, metavar="FILE", is_output=True)
+    json: Path | None = option(None, metavar="FILE", is_output=True)
+    control_hz: float | None = None
+    latency: str | None = option(None, metavar="measured|FILE")
+    seed: int = 0
+    planner: dict[str, Any] = overrides(PlannerConfig, prefix="planner.")
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        at_least(self, episodes=1, seed=0)
+        one_of(self, mode=list_modes())
+        above_zero(self, "control_hz")
+        if self.planner and self.mode not in planning_modes():
+            raise UserError(
+                f"--planner.{next(iter(self.planner))} has no effect in mode {self.mode}; use --mode planner"
+            )
+        if self.planning_budget is not None:
+            within(self, planning_budget=(0.0, 1.0))
+            if self.mode != "gated":
+                raise UserError(f"--planning-budget has no effect in mode {self.mode}; use --mode gated")
+        if self.latency is not None and self.control_hz is None:
+            raise UserError("--latency has no effect in a world that waits; give --control-hz too")
+        if self.video is not None:
+            from latentplan.reporting.video import check_video_path
+
+            check_video_path(self.video)
 
 
-def main(argv: Sequence[str] | None = None) -> int:
-    """Run `scripts/eval.py` and return the exit code: 0, 2 for bad input, 130 when interrupted."""
-    return run_guarded(_evaluate, sys.argv[1:] if argv is None else argv)
+def list_modes() -> tuple[str, ...]:
+    """The names of the modes that an agent can act in."""
+    from latentplan.agents.modes import MODES
+
+    return tuple(MODES)
 
 
-def _evaluate(argv: Sequence[str]) -> int:
-    if "-h" in argv or "--help" in argv:
-        print(help_text())
-        return 0
-    request = parse_arguments(argv)
+def planning_modes() -> tuple[str, ...]:
+    """The names of the modes that pursue an objective; the other modes are only scored on it."""
+    from latentplan.agents.modes import planning_modes
+
+    return planning_modes()
+
+
+def resolve(request: Request) -> dict[str, Any]:
+    """The request, with every setting of the search that the agent would use."""
     from latentplan.agents.checkpoint import read_info
+
+    saved = saved_config(request.checkpoint, read_info(request.checkpoint))
+    return {**vars(request), "planner": search_settings(saved.planner, request.planner)}
+
+
+def run(request: Request) -> int:
+    """Play the episodes, print and write what they gave, and return the exit code.
+
+    Raises:
+        UserError: The checkpoint, an objective, the latency or an output cannot be used.
+    """
+    from latentplan.evaluation.latency import MEASURED, read_latency
+
+    latency = read_latency(request.latency or MEASURED)
+    from latentplan.agents.checkpoint import read_info
+    from latentplan.agents.modes import MODES
     from latentplan.evaluation.clock import VirtualClock
     from latentplan.evaluation.timed import load_timed_agent
 
     info = read_info(request.checkpoint)
-    try:
-        config = from_dict(info["config"])
-    except (AttributeError, TypeError, ValueError) as error:
-        raise UserError(f"{request.checkpoint} has settings of another version: {error}") from None
-    planner = build_config({"planner": override_planner(to_dict(config.planner), request.planner)}).planner
-    overrides = {name: getattr(planner, name) for name in request.planner}
+    config = saved_config(request.checkpoint, info)
+    planner = search_settings(config.planner, request.planner)
+    changes = {name: getattr(planner, name) for name in request.planner}
     if request.planning_budget is not None:
-        overrides["planning_budget"] = request.planning_budget
-    device = use_device(request.device, request.threads or (1 if request.mode in ON_ONE_THREAD else None))
+        changes["planning_budget"] = request.planning_budget
+    device = request.use_device(threads=1 if MODES[request.mode].one_thread else None)
     from latentplan.envs import make_env
     from latentplan.evaluation.goals import goal_env, read_goals, score_env
 
@@ -64,14 +133,14 @@ def _evaluate(argv: Sequence[str]) -> int:
     world = config.env if goals is None else goal_env(config.env)
     env = make_env(world)
     try:
-        clock = VirtualClock(request.control_hz, request.latency)
-        agent = load_timed_agent(request.checkpoint, request.mode, clock, device, **overrides)
+        clock = VirtualClock(request.control_hz, latency)
+        agent = load_timed_agent(request.checkpoint, request.mode, clock, device, **changes)
         about = _describe(request, info, world, planner, goals)
         print(
             f"{about['domain']}-{about['task']}, {request.mode} on {device}, pictures by {about['renderer']}",
             flush=True,
         )
-        played = env if goals is None else score_env(env, goals, agent if request.mode in PLANNING_MODES else None)
+        played = env if goals is None else score_env(env, goals, agent if request.mode in planning_modes() else None)
         try:
             return _play_and_report(request, played, agent, about, clock)
         except OSError as error:
@@ -81,13 +150,13 @@ def _evaluate(argv: Sequence[str]) -> int:
 
 
 def _play_and_report(
-    request: EvaluationRequest,
+    request: Request,
     env: SuiteEnv | ScoredEnv,
     agent: Any,
     about: dict[str, Any],
     clock: VirtualClock,
 ) -> int:
-    """Plays, prints, writes; an interrupt reports the episodes that were finished."""
+    """Play, print and write; after an interrupt, report the episodes that were finished."""
     from latentplan.evaluation.episodes import episode_seed
     from latentplan.evaluation.goals import ScoredEnv
     from latentplan.evaluation.timed import iterate_timed_episodes, summarize_timed
@@ -101,7 +170,7 @@ def _play_and_report(
         if request.video is not None:
             from latentplan.reporting.film import filming
 
-            planner = agent if request.mode in PLANNING_MODES else None
+            planner = agent if request.mode in planning_modes() else None
             on_step = stack.enter_context(filming(request.video, env, planner, goals=scored))
         try:
             for episode in iterate_timed_episodes(env, agent, seeds, clock, on_step=on_step):
@@ -113,7 +182,7 @@ def _play_and_report(
         if episodes:
             scores = {} if scored is None else scored.summarize(len(episodes))
             result = {**about, **summarize_timed(episodes, clock), **scores}
-            if request.mode == "gated":  # where a plan goes on none was made
+            if request.mode == "gated":  # an action of an older plan needed no search
                 result["planned_fraction"] = result["action_source"]["plan"] / sum(result["action_source"].values())
             if request.mode == "planner" and agent.surprise_limit is not None:
                 result["surprised"] = sum(episode.surprised for episode in episodes)
@@ -122,7 +191,7 @@ def _play_and_report(
 
 
 def _describe(
-    request: EvaluationRequest, info: dict[str, Any], env: EnvConfig, planner: PlannerConfig, goals: Goals | None
+    request: Request, info: dict[str, Any], env: EnvConfig, planner: PlannerConfig, goals: Goals | None
 ) -> dict[str, Any]:
     from latentplan.envs import render_info
 
@@ -136,15 +205,15 @@ def _describe(
         "floor": env.floor,
         "renderer": render_info()["renderer"],
     }
-    if request.mode not in PLANNING_MODES:
+    if request.mode not in planning_modes():
         return described
     is_own = goals is None or (any(phase.objective.is_return for phase in goals.phases) and not goals.constraints)
     if request.mode != "planner" or not is_own:
-        planner = dataclasses.replace(planner, surprise_limit=None)  # which is not heeded then
+        planner = dataclasses.replace(planner, surprise_limit=None)  # the agent ignores it here
     return {**described, "planner": to_dict(planner)}
 
 
-def _report(request: EvaluationRequest, result: dict[str, Any]) -> None:
+def _report(request: Request, result: dict[str, Any]) -> None:
     low, high = result["ci95"]
     interval = "no interval from one episode" if low is None else f"95 % interval {low:.1f} to {high:.1f}"
     latency = "   ".join(f"{name} {value:.2f}" for name, value in result["decision_ms"].items())

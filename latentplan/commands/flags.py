@@ -1,143 +1,262 @@
-"""Flags made of a dataclass of settings, and what commands that teach a trained agent ask with them."""
+"""Flags, help and errors of a command, made from the dataclass of its request.
+
+A field `control_hz` becomes the flag `--control-hz`; a field made by `overrides` stands for the settings of another
+dataclass, as `--planner.horizon`. Types, defaults and meanings are those of the dataclass; its `__post_init__` checks
+the values. `--help` prints the flags that people use and `--help-all` prints every flag.
+"""
 
 from __future__ import annotations
 
+import argparse
 import dataclasses
-import math
-import typing
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from datetime import datetime
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
-from latentplan.config import DEVICES, UserError
-from latentplan.config.files import raise_unknown
+from latentplan.config import UserError, output_file
+from latentplan.config.parsing import Setting, alternatives, list_settings, raise_unknown, read_values
+from latentplan.config.removed import REMOVED
 
-COMMON_FLAGS = {
-    "--resume": ("DIR", "go on with the learning in this folder"),
-    "--device": ("|".join(DEVICES), "where the agent computes (auto: cuda where usable)"),
-    "--threads": ("N", "CPU threads (torch's own choice)"),
+Request = TypeVar("Request")
+
+GENERAL_FLAGS = {
+    "--help": "print the flags that people use",
+    "--help-all": "print every flag",
+    "--print-config": "print the settings as YAML instead of running",
 }
+_METAVARS = {int: "N", float: "X", bool: "true|false", str: "TEXT", Path: "PATH", tuple: "[A,B]"}
+_WIDTH = 110
 
 
 @dataclass(frozen=True)
-class LearningRequest:
-    """What the command line of teaching a trained agent asks for.
+class Flag:
+    """A setting on the command line.
 
     Attributes:
-        checkpoint: Folder of the agent to begin with; None when a learning resumes.
-        out: Where the agent that has learned goes, or None for a folder of its own under `runs`.
-        resume: Folder of the learning to go on with, or None.
-        settings: Fields of the dataclass of settings that were given.
-        device: `auto`, `cpu` or `cuda`.
-        threads: CPU threads, or None to leave it to torch.
+        names: Spellings of the flag, the usual one first.
+        setting: The setting; its key is the path of the value inside the request.
+        is_common: Whether `--help` shows the flag; `--help-all` shows every flag.
     """
 
-    checkpoint: Path | None
-    out: Path | None
-    resume: Path | None
-    settings: dict[str, Any]
-    device: str
-    threads: int | None
+    names: tuple[str, ...]
+    setting: Setting
+    is_common: bool
+
+    @property
+    def is_required(self) -> bool:
+        """Whether the command cannot run without the flag."""
+        return self.setting.default is dataclasses.MISSING
+
+    @property
+    def metavar(self) -> str:
+        """The placeholder for the value in `--help`."""
+        kind = alternatives(self.setting.hint)[0]
+        shown = "|".join(self.setting.choices) or _METAVARS.get(getattr(kind, "__origin__", kind), "VALUE")
+        if "separator" in self.setting.options:
+            shown = self.setting.options["separator"].join(["A", "B", "..."])
+        return str(self.setting.options.get("metavar", shown))
+
+    @property
+    def help(self) -> str:
+        """The meaning of the flag, with its default where it has one."""
+        default = self.setting.default
+        if default in (None, dataclasses.MISSING, (), ""):
+            return self.setting.meaning
+        shown = str(default).lower() if isinstance(default, bool) else default
+        if isinstance(default, tuple):
+            separator = self.setting.options.get("separator")
+            shown = separator.join(map(str, default)) if separator else list(default)
+        return f"{self.setting.meaning} (default: {shown})"
 
 
-def read_request(settings: type, flags: Mapping[str, str], resumable: Sequence[str]) -> LearningRequest:
-    """The request that flags make.
+def overrides(kind: type, short: Mapping[str, str] | None = None, prefix: str = "") -> Any:
+    """A field that holds those settings of a dataclass that were given, by name: `{"horizon": 3}`.
 
     Args:
-        settings: The dataclass of settings.
-        flags: By name, as they were typed.
-        resumable: Those that may be given with `--resume`.
+        kind: The dataclass; settings of dataclasses inside it are in nested dictionaries.
+        short: Short names for settings, by dotted name: `{"run.frames": "--frames"}`.
+        prefix: First part of every flag, such as `planner.`.
+    """
+    return field(default_factory=dict, metadata={"overrides": kind, "short": short or {}, "prefix": prefix})
+
+
+def list_flags(request: type) -> list[Flag]:
+    """The flags of a request, in the order in which `--help` prints them."""
+    flags = []
+    for setting in list_settings(request):
+        kind = setting.options.get("overrides")
+        if kind is None:
+            flags.append(Flag((_spelled(setting.key),), setting, not setting.options.get("is_rare")))
+            continue
+        for inner in list_settings(kind):
+            dotted = setting.options["prefix"] + inner.key
+            short = setting.options["short"].get(inner.key)
+            names = (*((short,) if short else ()), _spelled(dotted))
+            is_common = short is not None or ("." not in dotted and not inner.options.get("is_rare"))
+            flags.append(Flag(names, dataclasses.replace(inner, key=f"{setting.key}.{inner.key}"), is_common))
+    return sorted(flags, key=lambda flag: bool(flag.setting.options.get("is_last")))
+
+
+def read_request(request: type[Request], argv: Sequence[str]) -> Request:
+    """The request that a command line makes.
 
     Raises:
-        UserError: A flag or value is wrong; the message says what to give.
+        UserError: A flag or value is wrong or an output cannot be written; the message says what to give instead.
     """
-    if "--resume" in flags:
-        for flag in flags:
-            if flag not in ("--resume", *resumable):
-                raise UserError(f"{flag} cannot be given with --resume; only {', '.join(resumable)} can")
-    elif "--checkpoint" not in flags:
-        raise UserError("flag --checkpoint is missing; give the folder of a trained agent or of a run")
-    device = flags.get("--device", "auto")
-    if device not in DEVICES:
-        raise_unknown("device", device, DEVICES)
-    checkpoint, out, resume = (
-        Path(flags[flag]) if flag in flags else None for flag in ("--checkpoint", "--out", "--resume")
-    )
-    return LearningRequest(checkpoint, out, resume, read_settings(settings, flags), device, read_threads(flags))
-
-
-def name_folder(kind: str, info: Mapping[str, Any]) -> Path:
-    """A folder under `runs` for what an agent becomes: `runs/<kind>-<domain>-<task>-<date>`."""
-    return Path("runs") / f"{kind}-{info['domain']}-{info['task']}-{datetime.now():%Y%m%d-%H%M%S}"
-
-
-def setting_kinds(settings: type) -> dict[str, type]:
-    """The flags that are fields of a dataclass of numbers, and whether each is `int` or `float`."""
-    hints = typing.get_type_hints(settings)
-    names = [field.name for field in dataclasses.fields(settings)]
-    return {_flag(name): int if hints[name] is int else float for name in names}
-
-
-def read_settings(settings: type, flags: Mapping[str, str]) -> dict[str, Any]:
-    """The fields that were given, checked by the dataclass itself.
-
-    Raises:
-        UserError: A value is no number, or not one that is allowed.
-    """
-    given = {
-        name: read_number(_flag(name), flags[_flag(name)], setting_kinds(settings)[_flag(name)])
-        for name in (field.name for field in dataclasses.fields(settings))
-        if _flag(name) in flags
-    }
+    flags = list_flags(request)
+    names = {flag.setting.key: flag.names[0] for flag in flags}
+    values = read_values([flag.setting for flag in flags], _read_texts(flags, argv), names)
+    _check_resumed(request, [names[key] for key in values])
+    _check_outputs(flags, values)
+    for flag in flags:
+        if flag.is_required and flag.setting.key not in values:
+            raise UserError(f"flag {flag.names[0]} is missing; give the {_begin_small(flag.setting.meaning)}")
+    nested: dict[str, Any] = {}
+    for key, value in values.items():
+        *path, name = key.split(".")
+        folder = nested
+        for part in path:
+            folder = folder.setdefault(part, {})
+        folder[name] = value
     try:
-        settings(**given)
+        return request(**nested)
+    except UserError:
+        raise
     except ValueError as error:
-        name, _, rest = str(error).partition(" ")
-        raise UserError(f"{_flag(name)} {rest}") from None
-    return given
+        first, _, rest = str(error).partition(" ")
+        named = [name for key, name in names.items() if key.rpartition(".")[2] == first]
+        raise UserError(f"{named[0] if named else first} {rest}") from None
 
 
-def read_number(flag: str, text: str, kind: type) -> Any:
-    """The number of a flag.
+def format_flags(request: type, program: str, summary: str, every_flag: bool) -> str:
+    """The text of `--help`, or of `--help-all`.
 
-    Raises:
-        UserError: It is no finite number, or not whole where it has to be.
+    Args:
+        request: Dataclass of what the command can be asked for; its `NOTES` end the text.
+        program: How the command is called, such as `latentplan eval`.
+        summary: One sentence on what the command does.
+        every_flag: Whether the flags that are rarely used are shown too.
     """
-    try:
-        number = float(text)
-    except ValueError:
-        number = math.nan
-    if not math.isfinite(number) or (kind is int and number != int(number)):
-        raise UserError(f"{flag} must be a {'whole ' if kind is int else ''}number, got {text!r}")
-    return kind(number)
+    flags = list_flags(request)
+    needed = [f"{flag.names[0]} {flag.metavar}" for flag in flags if flag.is_required]
+    parser = _Parser(
+        [flag for flag in flags if flag.is_common or every_flag],
+        usage=" ".join([program, *needed, "[--name value ...]"]),
+    )
+    parser.description = summary
+    for name, meaning in GENERAL_FLAGS.items():
+        parser.add_argument(name, action="store_true", help=meaning)
+    notes = vars(request).get("NOTES", "")
+    resumable = getattr(request, "RESUMABLE", ())
+    parser.epilog = f"With --resume only {', '.join(resumable)} may be given. {notes}" if resumable else notes
+    return parser.format_help()
 
 
-def read_threads(flags: Mapping[str, str]) -> int | None:
-    """CPU threads as `--threads` has them; None without.
+class _Parser(argparse.ArgumentParser):
+    """Reads flags as text; every mistake is a `UserError`, and a value may begin with one dash."""
 
-    Raises:
-        UserError: It is no whole number from 1 on.
-    """
-    if "--threads" not in flags:
-        return None
-    threads = int(read_number("--threads", flags["--threads"], int))
-    if threads < 1:
-        raise UserError(f"--threads must be at least 1, got {threads}")
-    return threads
+    def __init__(self, flags: Sequence[Flag], usage: str | None = None) -> None:
+        super().__init__(
+            usage=usage, add_help=False, allow_abbrev=False, exit_on_error=False, formatter_class=_HelpFormatter
+        )
+        for flag in flags:
+            join = flag.setting.options.get("join")
+            self.add_argument(
+                *flag.names,
+                dest=flag.setting.key,
+                metavar=flag.metavar,
+                default=argparse.SUPPRESS,
+                help=flag.help.replace("%", "%%"),
+                **({"action": _Join, "const": join} if join else {}),
+            )
+
+    def error(self, message: str) -> Any:
+        """Raise the mistake that argparse found."""
+        raise UserError(message)
+
+    def parse_args(self, args: Any = None, namespace: Any = None) -> Any:
+        """The text of every flag that was given, the last one of a repeated flag."""
+        try:
+            found, others = self.parse_known_args(args, namespace)
+        except argparse.ArgumentError as error:
+            raise UserError(f"flag {str(error.argument_name).split('/')[0]} needs a value") from None
+        if others:
+            raise UserError(f"unexpected argument {others[0]!r}; settings are given as --name value")
+        return found
+
+    def _parse_optional(self, arg_string: str) -> Any:
+        """The flag that a word is, or None for a value; argparse calls this for every word."""
+        if not arg_string.startswith("--"):
+            return None
+        name = arg_string.partition("=")[0]
+        if name in self._option_string_actions:
+            return super()._parse_optional(arg_string)
+        removed = REMOVED.get(name[2:])
+        if removed is not None:
+            raise UserError(f"{name} no longer exists: {removed.advice}")
+        raise_unknown("flag", name, [*self._option_string_actions, *GENERAL_FLAGS, "--version"])
 
 
-def describe_settings(settings: type) -> list[tuple[str, str]]:
-    """Each flag with a placeholder, and what it means, with its default."""
-    lines = (settings.__doc__ or "").partition("Attributes:")[2].splitlines()
-    meanings = dict(line.strip().split(": ", 1) for line in lines if ": " in line)
-    rows = []
-    for field in dataclasses.fields(settings):
-        shown = "" if field.default is None else f" ({field.default:g})"
-        rows.append((f"{_flag(field.name)} N", meanings[field.name].rstrip(".") + shown))
-    return rows
+class _Join(argparse.Action):
+    """Joins the values of a repeated flag."""
+
+    def __call__(self, parser: Any, namespace: Any, values: Any, option_string: str | None = None) -> None:
+        earlier = getattr(namespace, self.dest, None)
+        setattr(namespace, self.dest, values if earlier is None else f"{earlier}{self.const}{values}")
 
 
-def _flag(name: str) -> str:
-    return f"--{name.replace('_', '-')}"
+class _HelpFormatter(argparse.HelpFormatter):
+    def __init__(self, prog: str) -> None:
+        super().__init__(prog, max_help_position=34, width=_WIDTH)
+
+    def _format_action_invocation(self, action: argparse.Action) -> str:
+        metavar = f" {action.metavar}" if action.metavar else ""
+        return f"{', '.join(action.option_strings)}{metavar}"
+
+
+def _read_texts(flags: Sequence[Flag], argv: Sequence[str]) -> dict[str, Any]:
+    """The text of every flag that was given, by key; lists are split."""
+    texts = vars(_Parser(flags).parse_args(list(argv)))
+    for flag in flags:
+        separator = flag.setting.options.get("separator")
+        if separator and flag.setting.key in texts:
+            texts[flag.setting.key] = _split(flag.names[0], texts[flag.setting.key], separator)
+    return texts
+
+
+def _check_resumed(request: type, given: Sequence[str]) -> None:
+    resumable = getattr(request, "RESUMABLE", ())
+    if "--resume" in given:
+        for name in given:
+            if name not in ("--resume", *resumable):
+                raise UserError(f"{name} cannot be given with --resume; only {', '.join(resumable)} can")
+
+
+def _check_outputs(flags: Sequence[Flag], values: dict[str, Any]) -> None:
+    """Try every file that is to be written, before any work is spent on it."""
+    checked: dict[Path, str] = {}
+    for flag in flags:
+        key, name = flag.setting.key, flag.names[0]
+        if flag.setting.options.get("is_output") and values.get(key) is not None:
+            values[key] = output_file(values[key], name)
+            other = checked.setdefault(values[key].resolve(), name)
+            if other != name:
+                raise UserError(f"{other} and {name} name the same file; give two")
+
+
+def _split(name: str, text: str, separator: str) -> list[str]:
+    """The distinct items of a list, in order."""
+    items = list(dict.fromkeys(item.strip() for item in text.split(separator) if item.strip()))
+    if not items:
+        raise UserError(f"{name} must name at least one, separated by {separator!r}, got {text!r}")
+    return items
+
+
+def _spelled(key: str) -> str:
+    """`--control-hz` for `control_hz`; dotted names keep their underscores, as in YAML files."""
+    return f"--{key}" if "." in key else f"--{key.replace('_', '-')}"
+
+
+def _begin_small(sentence: str) -> str:
+    return sentence[:1].lower() + sentence[1:].rstrip(".")

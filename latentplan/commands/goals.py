@@ -1,60 +1,47 @@
-"""`scripts/goals.py`: a trained agent, taught to pursue goals that are named later.
-
-Torch is imported when it is needed, so that `--help` and bad input answer at once.
-"""
+"""`latentplan goals`: teach a trained agent to pursue goals that are named later."""
 
 from __future__ import annotations
 
-import sys
-from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
 
-from latentplan.commands.flags import (
-    COMMON_FLAGS,
-    LearningRequest,
-    describe_settings,
-    name_folder,
-    read_request,
-    setting_kinds,
-)
-from latentplan.commands.main import read_flags, run_guarded, use_device
+from latentplan.commands.flags import overrides
+from latentplan.commands.learning import LearningRequest, name_folder
 from latentplan.config import GoalsConfig
 
-FLAGS = {
-    "--checkpoint": ("DIR", "folder of a run, whose replay is learned from, or of an agent, which then plays a while"),
-    "--out": ("DIR", "folder of the agent that knows goals (runs/goals-<domain>-<task>-<date>)"),
-    **COMMON_FLAGS,
-}
-RESUMABLE = ("--updates", "--minutes", "--device", "--threads")
 
+@dataclass(frozen=True, kw_only=True)
+class Request(LearningRequest):
+    """What the command line of learning goals asks for.
 
-def main(argv: Sequence[str] | None = None) -> int:
-    """Run `scripts/goals.py` and return the exit code: 0, 2 for bad input, 130 when interrupted."""
-    return run_guarded(learn, sys.argv[1:] if argv is None else argv)
-
-
-def parse_arguments(argv: Sequence[str]) -> LearningRequest:
-    """Read the command line.
-
-    Raises:
-        UserError: A flag or value is wrong; the message says what to give.
+    Attributes:
+        settings: Settings of the learning that were given.
     """
-    return read_request(GoalsConfig, read_flags(argv, [*FLAGS, *setting_kinds(GoalsConfig)]), RESUMABLE)
+
+    RESUMABLE = ("--updates", "--minutes", "--device", "--threads")
+    NOTES = (
+        "Nothing else about the agent changes. The agent learns from the replay of its run where --checkpoint names a "
+        "run; a lone checkpoint first plays --play-decisions decisions."
+    )
+
+    settings: dict[str, Any] = overrides(GoalsConfig)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        GoalsConfig(**self.settings)
 
 
-def learn(argv: Sequence[str]) -> int:
-    """Run the command and return its exit code.
+def resolve(request: Request) -> dict[str, Any]:
+    """The request, with every setting of the learning."""
+    return {**vars(request), "settings": GoalsConfig(**request.settings)}
 
-    Raises:
-        UserError: A flag, the run or a folder cannot be used.
-    """
-    if "-h" in argv or "--help" in argv:
-        print(_help())
-        return 0
-    request = parse_arguments(argv)
+
+def run(request: Request) -> int:
+    """Learn goals, or continue to, and return the exit code."""
     from latentplan.agents.checkpoint import read_info
 
-    info = read_info(request.checkpoint) if request.checkpoint is not None else {}
-    device = use_device(request.device, request.threads)
+    info = {} if request.checkpoint is None else read_info(request.checkpoint)
+    device = request.use_device()
     from latentplan.training import learn_goals, resume_goals
 
     if request.resume is not None:
@@ -62,14 +49,3 @@ def learn(argv: Sequence[str]) -> int:
     assert request.checkpoint is not None
     out = request.out or name_folder("goals", info)
     return learn_goals(request.checkpoint, out, GoalsConfig(**request.settings), device=device).exit_code
-
-
-def _help() -> str:
-    """Flags with their meanings."""
-    rows = [(f"{flag} {metavar}", meaning) for flag, (metavar, meaning) in FLAGS.items()]
-    lines = "\n".join(f"  {flag:<24}{meaning}" for flag, meaning in rows + describe_settings(GoalsConfig))
-    return (
-        "usage: goals.py --checkpoint DIR [--name value ...]\n\n"
-        "Teach a trained agent to pursue goals that are named later; nothing else about it changes.\n"
-        f"With --resume only {', '.join(RESUMABLE)} may be given.\n\n{lines}"
-    )

@@ -1,4 +1,4 @@
-"""Every setting of latentplan, one frozen dataclass per component; imports the standard library alone."""
+"""Every setting of latentplan: one frozen dataclass per component, built on the standard library alone."""
 
 from latentplan.config.checks import MAX_THREADS, UserError, derive_seed, make_folder, output_file
 from latentplan.config.distill import DistillConfig
@@ -13,6 +13,7 @@ from latentplan.config.settings import (
     RENDER_QUALITIES,
     USER_DOMAIN,
     Config,
+    Device,
     EnvConfig,
     EvaluationConfig,
     ModelConfig,
@@ -31,6 +32,7 @@ __all__ = [
     "USER_DOMAIN",
     "CollectionConfig",
     "Config",
+    "Device",
     "DistillConfig",
     "EnvConfig",
     "EvaluationConfig",

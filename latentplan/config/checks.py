@@ -1,4 +1,4 @@
-"""What settings have in common: how they are checked, how their errors read, how their seeds derive."""
+"""Checks that settings share, the error that users see, derived seeds, and checks of files to be written."""
 
 from __future__ import annotations
 
@@ -7,24 +7,24 @@ import os
 from pathlib import Path
 from typing import Any
 
-MAX_THREADS = 1024  # more are refused before they exhaust the machine
+MAX_THREADS = 1024  # more threads would exhaust the machine
 
 
 class UserError(ValueError):
-    """Something the user gave cannot work; the message is one line that says what to give instead."""
+    """A mistake of the user; the message is one line that says what to give instead."""
 
 
 def derive_seed(seed: int, name: str, counter: int = 0) -> int:
-    """A seed in [0, 2**31) for the stream `name` of a run, the same on every machine."""
+    """A seed in [0, 2**31) for the random stream `name` of a run, the same on every machine."""
     digest = hashlib.sha256(f"{seed}/{name}/{counter}".encode()).digest()
     return int.from_bytes(digest[:4], "little") >> 1
 
 
 def make_folder(path: Path) -> None:
-    """Make a folder for results, and those above it.
+    """Make a folder for results, and the folders above it.
 
     Raises:
-        UserError: It cannot be made.
+        UserError: The folder cannot be made.
     """
     try:
         path.mkdir(parents=True, exist_ok=True)
@@ -33,15 +33,19 @@ def make_folder(path: Path) -> None:
 
 
 def output_file(path: Path, flag: str) -> Path:
-    """The path, tried before any work is spent on what goes there; where a link leads, if it is one.
+    """The path of a file to be written, checked before any work is spent on its content.
+
+    Args:
+        path: The file; of a link, the file that the link leads to is returned.
+        flag: The flag that names the file, for the error.
 
     Raises:
-        UserError: It is a folder or a device, its folder does not exist, or nothing can be written in that.
+        UserError: The path is a folder or a device, its folder does not exist, or nothing can be written there.
     """
-    import tempfile  # when there is a file to be written: every command imports this module
+    import tempfile  # imported here because every command imports this module, and few write files
 
     given = str(path)
-    if path.is_symlink():  # it stays, what it leads to is replaced
+    if path.is_symlink():  # the link stays and its target is replaced
         path = Path(os.path.realpath(path))
         if path.is_symlink() or not path.parent.is_dir():
             raise UserError(f"{flag} {given!r} is a link that leads nowhere; give another name")
@@ -49,7 +53,7 @@ def output_file(path: Path, flag: str) -> Path:
     if path.is_dir():
         raise UserError(f"{flag} {given!r} is a folder; give a file in it")
     if path.exists() and not path.is_file():
-        raise UserError(f"{flag} {given!r} is not a file, and would be replaced by one; give another name")
+        raise UserError(f"{flag} {given!r} is not a regular file; give another name")
     if not folder.is_dir():
         existing = next(parent for parent in folder.parents if parent.is_dir())
         raise UserError(f"{flag}: there is no folder {str(folder)!r}; the nearest that exists is {str(existing)!r}")

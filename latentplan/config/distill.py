@@ -1,39 +1,41 @@
-"""Settings of distillation."""
+"""Settings of distillation: how an actor learns to act as its planner does."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
 from latentplan.config.checks import above_zero, at_least, within
+from latentplan.config.parsing import option
 
 
 @dataclass(frozen=True)
 class DistillConfig:
-    """Teaching the actor what the planner does.
+    """How an actor is taught to act as its planner does.
 
     Attributes:
-        rounds: Rounds of driving, labelling and learning.
-        episodes: Episodes driven per round.
-        minutes: No round begins after so many minutes; None leaves it to `rounds`.
-        planner_rounds: First rounds that the planner drives (behavioural cloning); in the others the actor does.
+        rounds: Rounds; each plays episodes, has the planner label their beliefs, and trains the actor on the labels.
+        episodes: Episodes played per round.
+        minutes: Minutes after which no round begins; None sets no limit.
+        planner_rounds: First rounds in which the planner acts (behavioural cloning); in later rounds the actor acts.
         updates: Updates of the actor per round.
         batch_size: Beliefs per update.
         learning_rate: Adam step of the actor.
-        relabel_share: Share of the stored beliefs, those with the oldest labels, that each round plans again.
+        relabel_share: Share of the stored beliefs that each round labels again, those with the oldest labels first.
         plan_batch: Beliefs per call of the planner.
-        evaluation_episodes: Episodes that choose between rounds; as many, on other starts, judge the one chosen.
+        evaluation_episodes: Episodes by which the best round is chosen; the chosen actor is then measured by the same
+            number of episodes from other starts.
         seed: Seed of every random stream.
     """
 
     rounds: int = 10
     episodes: int = 4
     minutes: float | None = None
-    planner_rounds: int = 1
+    planner_rounds: int = option(1, is_rare=True)
     updates: int = 500
-    batch_size: int = 256
-    learning_rate: float = 1e-3
-    relabel_share: float = 0.1
-    plan_batch: int = 256
+    batch_size: int = option(256, is_rare=True)
+    learning_rate: float = option(1e-3, is_rare=True)
+    relabel_share: float = option(0.1, is_rare=True)
+    plan_batch: int = option(256, is_rare=True)
     evaluation_episodes: int = 10
     seed: int = 0
 

@@ -1,25 +1,26 @@
-"""Settings of learning goals."""
+"""Settings of goal-conditioned learning: how an agent learns to pursue goals that are named later."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
 from latentplan.config.checks import above_zero, at_least
+from latentplan.config.parsing import option
 
 
 @dataclass(frozen=True)
 class GoalsConfig:
-    """Teaching a trained agent to pursue goals that are named later.
+    """How a trained agent is taught to pursue goals that are named later.
 
     Attributes:
-        updates: Updates in all.
-        minutes: No update begins after so many minutes; None leaves it to `updates`.
+        updates: Updates in total.
+        minutes: Minutes after which no update begins; None sets no limit.
         starts: Imagined rollouts per update, each from a replayed belief and for a goal of its own.
-        horizon: Steps of each.
+        horizon: Model steps of an imagined rollout.
         hidden_dim: Width of the hidden layers of the actor and the value.
-        learning_rate: Adam step of both.
-        entropy_scale: What a nat of the actor's entropy counts, of the spread of returns.
-        play_decisions: Decisions that the agent plays to begin from, where it comes without the replay of its run.
+        learning_rate: Adam step of the actor and the value.
+        entropy_scale: Weight of the actor's entropy, in units of the spread of returns per nat.
+        play_decisions: Decisions that the agent first plays where the replay of its run is missing.
         seed: Seed of every random stream.
     """
 
@@ -27,9 +28,9 @@ class GoalsConfig:
     minutes: float | None = None
     starts: int = 320
     horizon: int = 12
-    hidden_dim: int = 48
-    learning_rate: float = 1e-3
-    entropy_scale: float = 1e-3
+    hidden_dim: int = option(48, is_rare=True)
+    learning_rate: float = option(1e-3, is_rare=True)
+    entropy_scale: float = option(1e-3, is_rare=True)
     play_decisions: int = 10_000
     seed: int = 0
 

@@ -1,12 +1,14 @@
-"""Settings of learning, and of gathering what is learned from."""
+"""Settings of learning, and of collecting the experience to learn from."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Literal, get_args
 
 from latentplan.config.checks import above_zero, at_least, one_of, within
 
-BEHAVIOURS = ("planner", "actor", "both")
+Behaviour = Literal["planner", "actor", "both"]
+BEHAVIOURS = get_args(Behaviour)
 
 
 @dataclass(frozen=True)
@@ -16,34 +18,34 @@ class LearningConfig:
     Attributes:
         batch_size: Sequences per update.
         sequence_length: Decisions per sequence.
-        random_shift: Pixels by which each replayed sequence of frames is moved at most, in either direction.
-        turned_share: Of the replayed sequences, turned by quarter turns; for a body to which every side is the same.
-        model_learning_rate: Adam step of encoder, dynamics, decoder, reward and continue heads.
+        random_shift: Largest shift of a replayed sequence of frames, in pixels, in either direction of each axis.
+        turned_share: Share of the replayed sequences that are turned by quarter turns, for a body that looks the same
+            from every side, in [0, 1].
+        model_learning_rate: Adam step of encoder, dynamics, decoder, reward head and continue head.
         behaviour_learning_rate: Adam step of actor and value.
         max_grad_norm: Gradient norm at which each optimizer clips.
         reconstruction_scale: Weight of the squared error summed over the 32 x 32 picture.
-        dynamics_scale: Weight of the KL that pulls the prior to the posterior.
-        representation_scale: Weight of the KL that pulls the posterior to the prior.
-        free_nats: KL below which neither is pulled.
-        overshooting_scale: Weight of the KL that pulls open-loop predictions to what was seen.
-        overshooting_horizon: Decisions that open-loop predictions reach.
+        dynamics_scale: Weight of the KL that moves the prior towards the posterior.
+        representation_scale: Weight of the KL that moves the posterior towards the prior.
+        free_nats: KL in nats below which both KL losses have no gradient.
+        overshooting_scale: Weight of the KL that moves open-loop predictions towards the posterior.
+        overshooting_horizon: Decisions that an open-loop prediction spans.
         reward_scale: Weight of the reward loss.
         imagination_horizon: Model steps of each imagined rollout.
-        imagination_starts: Rollouts imagined per update, drawn from the batch's states.
-        gradient_decay: Share of the actor's gradient that each imagined step passes back to the one before, in [0, 1].
+        imagination_starts: Imagined rollouts per update; their starts are drawn from the states of the batch.
+        gradient_decay: Share of the actor's gradient that each imagined step passes back to the step before, in [0, 1].
         lambda_: Mixing of n-step returns into the lambda-return, in [0, 1].
         discount: Discount per decision; None derives 1 - 5 / (decisions per episode).
-        replay_value_scale: Weight of the value loss on replayed rewards beside the imagined one.
-        entropy_scale: Weight of the actor's entropy, in units of the normalised return.
-        imitation_scale: Weight of the actor's KL to the plans it was collected with; 0 leaves it out.
-        target_rate: Share of the value network that its slow target takes over at each update.
-        average_rate: Least weight of the latest update in the average of the weights that acts, is judged and is kept:
-            0.01 averages over some hundred updates (early on over fewer), 1 over none.
+        replay_value_scale: Weight of the value loss on replayed rewards, beside the loss on imagined rewards.
+        entropy_scale: Weight of the actor's entropy, in units of the normalised return per nat.
+        target_rate: Share of the value network's weights that the slow target network takes at each update.
+        average_rate: Smallest weight of the latest update in the averaged weights, which act, are evaluated and are
+            saved: 0.01 averages over about a hundred updates (fewer early on), 1 turns averaging off.
         curriculum_task: Task of the same domain, or expression over its quantities such as `upright`, whose reward is
-            learned first, on the way to the run's own task or `env.objective`; None starts with that.
-        curriculum_frames: Simulator frames of the run for which it is, counted before action repeat.
-        cuda_graph: Whether an update on a GPU is recorded once, as a CUDA graph, and replayed; needs
-            `replay.on_device`. On a CPU it changes nothing.
+            learned first; None starts with the reward of the run's own task or `env.objective`.
+        curriculum_frames: Simulator frames with the reward of `curriculum_task`, counted before action repeat.
+        cuda_graph: Whether an update on a GPU is recorded once as a CUDA graph and replayed, which needs
+            `replay.on_device`. The setting has no effect on a CPU.
     """
 
     batch_size: int = 16
@@ -67,7 +69,6 @@ class LearningConfig:
     discount: float | None = None
     replay_value_scale: float = 0.3
     entropy_scale: float = 1e-3
-    imitation_scale: float = 0.0
     target_rate: float = 0.02
     average_rate: float = 0.01
     curriculum_task: str | None = None
@@ -80,7 +81,7 @@ class LearningConfig:
         )
         at_least(self, reconstruction_scale=0.0, dynamics_scale=0.0, representation_scale=0.0, free_nats=0.0)
         at_least(self, overshooting_scale=0.0, reward_scale=0.0, replay_value_scale=0.0, entropy_scale=0.0)
-        at_least(self, imitation_scale=0.0, random_shift=0, curriculum_frames=0)
+        at_least(self, random_shift=0, curriculum_frames=0)
         above_zero(
             self, "model_learning_rate", "behaviour_learning_rate", "max_grad_norm", "target_rate", "average_rate"
         )
@@ -92,28 +93,28 @@ class LearningConfig:
 
 @dataclass(frozen=True)
 class CollectionConfig:
-    """How experience is gathered, and how much is learned from it.
+    """How experience is collected, and how many updates it is used for.
 
     Attributes:
-        behaviour: Who acts while collecting: `planner`, `actor`, or `both` in alternate rounds.
-        noise_std: Standard deviation of the noise added to the planner's action.
-        noise_correlation: Of the planner's and the actor's noise between one decision and the next, in [0, 1).
-        noise_share: Share of the rounds with that noise; in the others planner and actor act as they are evaluated.
+        behaviour: Agent that acts while collecting: the planner, the actor, or both in alternate rounds.
+        noise_std: Standard deviation of the noise added to the planner's action, in action units.
+        noise_correlation: Correlation of the planner's and the actor's noise between one decision and the next, in
+            [0, 0.99].
         goals: Expressions such as `speed -> 2.0 and height > 1.1` that the planner pursues in turn in some rounds, so
-            that the model knows more than the way to the reward.
-        goal_share: Share of all rounds in which it does; planner and actor have the others.
-        goals_after: Simulator frames collected before the first of them.
-        episode_decisions: After how many a collected episode is cut short; None plays on. Evaluations are whole.
+            that the model also learns about states away from the reward.
+        goal_share: Share of all rounds in which the planner pursues a goal; `behaviour` divides the other rounds.
+        goals_after: Simulator frames collected before the first round with a goal.
+        episode_decisions: Decisions after which a collected episode is cut; None plays to its end. Evaluations are
+            never cut.
         prefill_decisions: Random decisions before learning starts.
-        round_decisions: Decisions per epoch: this many are collected, then learned from.
+        round_decisions: Decisions of a round; a round is collected, then learned from.
         updates_per_decision: Updates per collected decision (the replay ratio, in updates).
-        overlap: Whether the next round is collected in another process, on the CPU, while this one is learned from.
+        overlap: Whether the next round is collected in another process, on the CPU, while this round is learned from.
     """
 
-    behaviour: str = "both"
+    behaviour: Behaviour = "both"
     noise_std: float = 0.4
     noise_correlation: float = 0.5
-    noise_share: float = 1.0
     goals: tuple[str, ...] = ()
     goal_share: float = 0.0
     goals_after: int = 0
@@ -126,7 +127,7 @@ class CollectionConfig:
     def __post_init__(self) -> None:
         one_of(self, behaviour=BEHAVIOURS)
         at_least(self, noise_std=0.0, prefill_decisions=1, round_decisions=1, goals_after=0)
-        within(self, noise_correlation=(0.0, 0.99), noise_share=(0.0, 1.0), goal_share=(0.0, 1.0))
+        within(self, noise_correlation=(0.0, 0.99), goal_share=(0.0, 1.0))
         if self.goal_share > 0.0 and not self.goals:
             raise ValueError("goal_share needs goals; name at least one expression in collection.goals")
         if self.goals and self.goal_share == 0.0:

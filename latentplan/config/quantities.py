@@ -1,8 +1,8 @@
-"""Quantities of each body that have a name: what they mean, and what a typical difference in them is.
+"""Named quantities of each body: their meaning, their unit, and the size of a typical difference.
 
-The scale of a quantity has two uses. It standardises the loss of what predicts the quantity, and it is the margin of
-a clause: `height > 1.2` is worth 0.1 where the height is one scale short of 1.2. The rewards of a domain's tasks are
-quantities as well, named `task.stand`, `task.walk` and so on.
+The scale of a quantity has two uses. It standardises the loss of the head that predicts the quantity, and it is the
+margin of a clause: `height > 1.2` has the value 0.1 where the height is one scale below 1.2. The rewards of a domain's
+tasks are quantities as well, named `task.stand`, `task.walk` and so on.
 """
 
 from __future__ import annotations
@@ -18,10 +18,10 @@ class Quantity:
     """A number that the simulator knows and a model can learn to predict.
 
     Attributes:
-        name: How expressions call it; `task.NAME` is the reward of a task.
-        unit: Of its values.
-        scale: A difference that matters, above 0, in that unit.
-        meaning: One line.
+        name: Name in expressions; `task.NAME` is the reward of a task.
+        unit: Unit of the values.
+        scale: Difference that matters, above 0, in the unit of the quantity.
+        meaning: Description in one line.
     """
 
     name: str
@@ -36,8 +36,10 @@ def _rewards(*tasks: str) -> tuple[Quantity, ...]:
 
 
 _POLE = (
-    Quantity("pole_angle", "rad", 0.5, "angle of the pole from upright, in [-pi, pi]; of the first if there are more"),
-    Quantity("upright", "1", 0.5, "cosine of that angle: 1 upright, -1 hanging"),
+    Quantity(
+        "pole_angle", "rad", 0.5, "angle of the pole from upright, in [-pi, pi]; the first pole's if there are several"
+    ),
+    Quantity("upright", "1", 0.5, "cosine of the pole's angle: 1 upright, -1 hanging"),
     Quantity("pole_speed", "rad/s", 2.0, "angular velocity of the pole"),
 )
 

@@ -1,50 +1,55 @@
-"""The settings of a run, one frozen dataclass per component, and their plain form.
+"""The settings of a run: one frozen dataclass per component, and their plain form for YAML and JSON.
 
-Defaults are the recommended values. Bad values raise `ValueError` naming the field.
+Defaults are the recommended values. A value that is not allowed raises a `ValueError` that names the field.
 """
 
 from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, Literal, get_args
 
 from latentplan.config.checks import MAX_THREADS, UserError, above_zero, at_least, one_of, within
 from latentplan.config.learning import CollectionConfig, LearningConfig
-from latentplan.config.planner import PlannerConfig, drop_removed
+from latentplan.config.planner import PlannerConfig
+from latentplan.config.removed import drop_removed
 
 LATENT_DIM = 32
-RENDER_QUALITIES = ("exact", "fast", "fastest")
-FLOORS = ("suite", "endless")
-DEVICES = ("auto", "cpu", "cuda")
-USER_DOMAIN = "user"  # the domain of runs in an environment of the user's own
+RenderQuality = Literal["exact", "fast", "fastest"]
+Floor = Literal["suite", "endless"]
+Device = Literal["auto", "cpu", "cuda"]
+RENDER_QUALITIES = get_args(RenderQuality)
+FLOORS = get_args(Floor)
+DEVICES = get_args(Device)
+USER_DOMAIN = "user"  # `EnvConfig.domain` of runs in an environment that the user wrote
 
 
 @dataclass(frozen=True)
 class EnvConfig:
-    """What is controlled, and how it is seen.
+    """The environment: the body, its task and its camera.
 
     Attributes:
         suite: Suite that the domain belongs to, see `latentplan/config/suites.py`.
         domain: Domain of `dm_control.suite`.
-        task: Task of the domain; None picks the domain's usual one.
+        task: Task of the domain; None takes the usual task of the domain.
         action_repeat: Simulator control steps per decision.
         camera: Camera id of the MuJoCo model.
-        render_quality: `exact` (dm_control's default), `fast` (small shadow map) or `fastest`
-            (no shadows, reflections or anti-aliasing: a visibly easier picture).
-        floor: `suite` ends the picture of the floor where the suite does, two metres behind a walker's start; `endless`
-            draws it there as well, for goals that lead backwards. Physics and the picture ahead are the same.
-        num_envs: Environments that collect at once; more than one runs each in its own process.
-        objective: Expression over the body's quantities that pays in place of the task's reward, once per control step,
-            such as `speed -> 2.0 and height > 1.1`; None leaves the task's.
+        render_quality: `exact` is dm_control's default; `fast` has a small shadow map; `fastest` has no shadows,
+            reflections or anti-aliasing, and pictures that are visibly easier to learn from.
+        floor: `suite` draws the floor as the suite does, which ends two metres behind a walker's start; `endless` draws
+            the floor there as well, for goals that lead backwards. Physics and the picture ahead are the same.
+        num_envs: Environments that collect at the same time; if there are several, each runs in its own process.
+        objective: Expression over the body's quantities that replaces the task's reward at every control step, such as
+            `speed -> 2.0 and height > 1.1`; None keeps the task's reward.
+        suite: Suite that the domain belongs to, see `latentplan/config/suites.py`.
     """
 
     domain: str = "walker"
     task: str | None = None
     action_repeat: int = 2
     camera: int = 0
-    render_quality: str = "fast"
-    floor: str = "suite"
+    render_quality: RenderQuality = "fast"
+    floor: Floor = "suite"
     num_envs: int = 1
     objective: str | None = None
     suite: str = "dm_control"
@@ -62,11 +67,12 @@ class ModelConfig:
         latent_dim: Size of the stochastic latent, the space in which the planner searches.
         deter_dim: Size of the GRU state.
         hidden_dim: Width of the hidden layers of every head.
-        encoder_channels: Channels of the encoder's layers: the first reads 4 x 4 patches, each other halves the grid.
+        encoder_channels: Channels of the encoder's layers; the first layer reads patches of 4 x 4 pixels, each later
+            layer halves the grid.
         decoder_channels: Channels of the decoder's 8 x 8 grid of tokens.
         num_bins: Bins of the distributional reward and value heads.
-        turns: Turns of each frame by a quarter that agents keep a belief of, and act by the mean of: 1, or 4 for a body
-            to which every side is the same.
+        turns: Quarter turns of each frame for which an agent keeps a belief, and over which its action is averaged: 1,
+            or 4 for a body that looks the same from every side.
     """
 
     latent_dim: int = LATENT_DIM
@@ -87,12 +93,12 @@ class ModelConfig:
 
 @dataclass(frozen=True)
 class ReplayConfig:
-    """Where experience is kept.
+    """The replay buffer.
 
     Attributes:
-        capacity: Decisions kept; None holds the whole run when its length is known, else 200,000; and, when one is
-            resumed, no fewer than it has.
-        on_device: Whether the frames live on the training device instead of in main memory.
+        capacity: Decisions kept; None keeps the whole run where its length in frames is known, else 200,000 decisions,
+            and never fewer than a resumed run already holds.
+        on_device: Whether frames are stored on the training device instead of in main memory.
     """
 
     capacity: int | None = None
@@ -104,12 +110,12 @@ class ReplayConfig:
 
 @dataclass(frozen=True)
 class EvaluationConfig:
-    """When the agent is measured while it learns.
+    """Evaluations during and after training.
 
     Attributes:
         every_frames: Simulator frames between evaluations.
-        episodes: Paired episodes of planner and actor per evaluation during training.
-        final_episodes: Episodes of the evaluation that ends a run.
+        episodes: Episodes of the planner, and of the actor from the same starts, per evaluation during training.
+        final_episodes: Episodes of the evaluation at the end of a run.
         video: Whether each evaluation films its first episode.
     """
 
@@ -124,22 +130,22 @@ class EvaluationConfig:
 
 @dataclass(frozen=True)
 class RunConfig:
-    """One training run.
+    """Length, seed, device and folder of a training run.
 
     Attributes:
-        frames: Simulator frames to train for (counted before action repeat); None leaves it to `minutes`.
-        minutes: Minutes of wall clock to train for; None leaves it to `frames`.
+        frames: Simulator frames to train for, counted before action repeat; None sets no limit.
+        minutes: Minutes of wall clock to train for; None sets no limit. With both, the run ends at the first limit.
         seed: Seed of every random stream of the run.
-        device: `auto`, `cpu` or `cuda`.
-        threads: CPU threads of each half of an update (model and behaviour learn side by side), in [1, 1024]; None
-            shares every core but the one that collects between the two.
+        device: Device to learn on; `auto` takes CUDA where it is usable.
+        threads: CPU threads for each half of an update (model and behaviour learn in parallel), in [1, 1024]; None
+            divides all cores but one between the halves and leaves one to collection.
         run_dir: Folder of the run; None makes `runs/<domain>-<task>-<date>`.
     """
 
     frames: int | None = None
     minutes: float | None = None
     seed: int = 0
-    device: str = "auto"
+    device: Device = "auto"
     threads: int | None = None
     run_dir: str | None = None
 
@@ -153,11 +159,11 @@ class RunConfig:
 
 @dataclass(frozen=True)
 class Config:
-    """Everything that defines a run.
+    """Every setting of a run.
 
     Raises:
-        UserError: Episodes cut while collecting would be too short, a CUDA graph could not reach the replay, or agents
-            would see turned frames that nothing has learned from.
+        UserError: Two settings contradict each other: collected episodes shorter than training sequences, a CUDA graph
+            without a replay on the device, or agents that see turned frames without learning from turned frames.
     """
 
     env: EnvConfig = field(default_factory=EnvConfig)
@@ -174,9 +180,11 @@ class Config:
         if cut is not None and cut < length:
             raise UserError(f"collection.episode_decisions ({cut}) must be at least {length}, learning.sequence_length")
         if self.model.turns > 1 and self.learning.turned_share == 0.0:
-            raise UserError("model.turns 4 needs learning.turned_share above 0: turned frames have to be learned from")
+            raise UserError(
+                "model.turns 4 needs learning.turned_share above 0, so that the model learns from turned frames"
+            )
         if self.learning.cuda_graph and not self.replay.on_device:
-            why = "a graph gathers its sequences itself; give both, or neither"
+            why = "a graph reads its sequences from the device; set both, or neither"
             raise UserError(f"learning.cuda_graph needs replay.on_device: {why}")
 
 
@@ -189,20 +197,20 @@ def to_dict(config: Any) -> dict[str, Any]:
 
 
 def from_dict(values: dict[str, Any]) -> Config:
-    """The inverse of `to_dict`; absent fields take their defaults.
+    """The inverse of `to_dict`; absent fields take their defaults, and settings that no longer exist are dropped.
 
     Raises:
-        ValueError: A section or field is unknown, or a value is not allowed.
+        ValueError: A section or field is unknown, a value is not allowed, or a setting that no longer exists has a
+            value other than the one that had no effect.
     """
     sections = {f.name: f.default_factory for f in dataclasses.fields(Config)}
     built = {}
     for section, settings in values.items():
         if section not in sections:
             raise ValueError(f"unknown section {section!r}; available: {', '.join(sections)}")
-        if section == "planner":
-            settings = drop_removed(settings)
         kind: Any = sections[section]
         names = {f.name for f in dataclasses.fields(kind)}
+        settings = drop_removed(section, settings)
         for name in settings:
             if name not in names:
                 raise ValueError(f"unknown setting {section}.{name}; available: {', '.join(sorted(names))}")

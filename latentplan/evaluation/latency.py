@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import json
-import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -49,26 +48,6 @@ class Latency:
         return _charge(self.decision_ms, derive_seed(seed, "decision_ms")), _charge(
             self.plan_ms, derive_seed(seed, "plan_ms")
         )
-
-
-def read_clock_flags(flags: Mapping[str, str]) -> tuple[float | None, Latency]:
-    """What `--control-hz` and `--latency` ask for; a rate of None is a world that waits.
-
-    Raises:
-        UserError: The rate is no number above 0, the latency cannot be read, or it is given without a rate.
-    """
-    if "--control-hz" not in flags:
-        if "--latency" in flags:
-            raise UserError("--latency has no effect in a world that waits; give --control-hz too")
-        return None, Latency()
-    text = flags["--control-hz"]
-    try:
-        control_hz = float(text)
-    except ValueError:
-        control_hz = math.nan
-    if not 0.0 < control_hz < math.inf:
-        raise UserError(f"--control-hz must be a number above 0, got {text!r}")
-    return control_hz, read_latency(flags.get("--latency", MEASURED))
 
 
 def read_latency(text: str) -> Latency:

@@ -16,7 +16,7 @@ import torch
 from lightning.pytorch.loggers import TensorBoardLogger
 
 from latentplan.agents.checkpoint import load_model
-from latentplan.config import USER_DOMAIN, Config, UserError, derive_seed
+from latentplan.config import USER_DOMAIN, Config, Device, UserError, derive_seed
 from latentplan.config.files import dump_config, read_config
 from latentplan.envs import default_task
 from latentplan.models import WorldModel
@@ -94,7 +94,7 @@ def resume(
     *,
     frames: int | None = None,
     minutes: float | None = None,
-    device: str | None = None,
+    device: Device | None = None,
     make_env: EnvFactory | None = None,
 ) -> Result:
     """Continues a run from its last save: weights, optimizers, replay, clocks and random streams.

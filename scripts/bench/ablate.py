@@ -7,38 +7,51 @@ times are in milliseconds.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from bench.ablation_arms import NAMES, REFERENCE, Arm, Outcome, check_checkpoint, parse_arms, play_arm, single_thread
-from bench.options import DEVICE_FLAGS, Flags, choose_device, output_path, whole_number
 from bench.report import format_table, interval, number, write_csv, write_json
-from latentplan.config import UserError, to_dict
-
-FLAGS = {
-    "--checkpoint": ("DIR", "trained agent, or run (its best checkpoint)"),
-    "--episodes": ("N", "episodes of each arm, on the same starts (20)"),
-    "--seed": ("S", "episode i starts from a state that depends only on S and i (0)"),
-    "--arms": ("A,A", f"any of {','.join(NAMES)} (all), and name:field=value,field=value for settings of the search"),
-    "--workers": ("N", "arms played at once, each in its own process (1)"),
-    "--device": DEVICE_FLAGS["--device"],
-    "--json": ("FILE", "result as JSON"),
-    "--csv": ("FILE", "every episode as CSV"),
-}
-SETTINGS = ()
+from latentplan.commands.shell import ComputeRequest
+from latentplan.config import to_dict
+from latentplan.config.checks import at_least
+from latentplan.config.parsing import option
 
 
-def run(flags: Flags) -> int:
+@dataclass(frozen=True, kw_only=True)
+class Request(ComputeRequest):
+    """What is played.
+
+    Attributes:
+        checkpoint: Folder of a trained agent, or of a run (its best checkpoint).
+        episodes: Episodes of each arm, from the same starts.
+        seed: Seed of the starts: episode i starts from a state that depends only on the seed and i.
+        arms: Arms, separated by commas: known names, and name:field=value,field=value for settings of the search.
+        workers: Arms played at once, each in a process of its own.
+        json: Result as JSON.
+        csv: Every episode as CSV.
+    """
+
+    checkpoint: Path = option(metavar="DIR")
+    episodes: int = 20
+    seed: int = 0
+    arms: str = ",".join(NAMES)
+    workers: int = 1
+    json: Path | None = option(None, metavar="FILE", is_output=True)
+    csv: Path | None = option(None, metavar="FILE", is_output=True)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        at_least(self, episodes=1, seed=0, workers=1)
+
+
+def run(request: Request) -> int:
     """Play every arm from the same starts and compare with the full planner."""
-    if "--checkpoint" not in flags:
-        raise UserError("flag --checkpoint is missing; give the folder of a trained agent or of a run")
-    episodes, seed = whole_number(flags, "--episodes", 20), whole_number(flags, "--seed", 0, least=0)
-    workers = whole_number(flags, "--workers", 1)
-    json_path, csv_path = output_path(flags, "--json"), output_path(flags, "--csv")
-    checkpoint = flags["--checkpoint"]
-    info, planner = check_checkpoint(Path(checkpoint))
-    arms = parse_arms(flags.get("--arms", ",".join(NAMES)), planner)
-    device = str(choose_device(flags))
+    episodes, seed, workers, checkpoint = request.episodes, request.seed, request.workers, str(request.checkpoint)
+    info, planner = check_checkpoint(request.checkpoint)
+    arms = parse_arms(request.arms, planner)
+    device = request.use_device()
     from latentplan.evaluation.episodes import episode_seed
 
     seeds = [episode_seed(seed, index) for index in range(episodes)]
@@ -57,8 +70,8 @@ def run(flags: Flags) -> int:
     for outcome in _play(checkpoint, arms, seeds, device, workers):
         outcomes[outcome.arm.name] = outcome
         print(f"{outcome.arm.name}: mean return {sum(outcome.returns) / episodes:.1f}", flush=True)
-        write_csv(csv_path, episode_rows(list(outcomes.values()), seeds))
-        write_json(json_path, {**about, "arms": compare_arms(list(outcomes.values()))})
+        write_csv(request.csv, episode_rows(list(outcomes.values()), seeds))
+        write_json(request.json, {**about, "arms": compare_arms(list(outcomes.values()))})
     print(summary_table(compare_arms(list(outcomes.values()))))
     return 0
 

@@ -8,7 +8,8 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from latentplan.config import PlannerConfig, UserError, to_dict
-from latentplan.config.files import build_config, field_names, raise_unknown
+from latentplan.config.files import build_config, field_names
+from latentplan.config.parsing import raise_unknown
 from latentplan.config.planner import override_planner
 
 REFERENCE = "full"

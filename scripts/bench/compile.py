@@ -6,35 +6,51 @@ difference of the planned actions.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+from pathlib import Path
 from statistics import median
 from typing import TYPE_CHECKING, Any
 
-from bench.options import DEVICE_FLAGS, SEARCH_FLAGS, Flags, choose_device, output_path, search_sizes, whole_number
+from bench.options import SearchRequest
 from bench.report import format_table, number, write_json
+from latentplan.config.checks import at_least
+from latentplan.config.parsing import option
 
 if TYPE_CHECKING:
     import torch
 
     from latentplan.planning import CEMPlanner, Model
 
-FLAGS = {
-    **SEARCH_FLAGS,
-    "--plans": ("N", "timed searches of each model, taken in turns (30)"),
-    **DEVICE_FLAGS,
-    "--json": ("FILE", "result as JSON"),
-}
-SETTINGS = ()
 WARM_UP_PLANS = 3  # torch compiles for the first size, then once more for sizes that vary
 
 
-def run(flags: Flags) -> int:
+@dataclass(frozen=True, kw_only=True)
+class Request(SearchRequest):
+    """What is timed.
+
+    Attributes:
+        plans: Timed searches of each model, taken in turns.
+        json: Result as JSON.
+    """
+
+    plans: int = 30
+    json: Path | None = option(None, metavar="FILE", is_output=True)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        at_least(self, plans=1)
+
+
+def run(request: Request) -> int:
     """Time searches in both versions of each model, in turns, and print how they compare."""
-    plans, json_path = whole_number(flags, "--plans", 30), output_path(flags, "--json")
-    sizes = search_sizes(flags)
-    device = choose_device(flags)
+    plans, sizes = request.plans, request.sizes
+    device_name = request.use_device()
+    import torch
+
     from bench.machine import describe_machine
     from latentplan.planning import CEMPlanner
 
+    device = torch.device(device_name)
     planner = CEMPlanner(
         action_dim=1,
         horizon=sizes["horizon"],
@@ -52,7 +68,7 @@ def run(flags: Flags) -> int:
     header = ["model", "stepped, ms p50", "compiled", "ratio", "compilation, s", "actions differ by"]
     keys = (("stepped_ms", 1), ("compiled_ms", 1), ("ratio", 2), ("compilation_s", 1), ("largest_difference", 7))
     print(format_table(header, [[row["model"], *(number(row[key], digits) for key, digits in keys)] for row in rows]))
-    write_json(json_path, {**sizes, "plans": plans, "machine": machine, "rows": rows})
+    write_json(request.json, {**sizes, "plans": plans, "machine": machine, "rows": rows})
     return 0
 
 

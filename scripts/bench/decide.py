@@ -9,24 +9,17 @@ import math
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from bench.options import (
-    COMPOSE_FLAGS,
-    DEVICE_FLAGS,
-    Flags,
-    action_size,
-    choose_device,
-    composed_config,
-    output_path,
-    settings_layer,
-    whole_number,
-)
+from bench.options import ComposeRequest
 from bench.report import format_table, number, write_json
-from latentplan.config import Config, UserError, to_dict
+from latentplan.commands.flags import overrides
+from latentplan.config import Config, PlannerConfig, UserError, to_dict
+from latentplan.config.checks import at_least
 from latentplan.config.files import build_config
+from latentplan.config.parsing import option
 
 if TYPE_CHECKING:
     import torch
@@ -34,31 +27,47 @@ if TYPE_CHECKING:
     from latentplan.agents.base import Agent
     from latentplan.models import WorldModel
 
-FLAGS = {
-    "--checkpoint": ("DIR", "trained agent, or run; without it an untrained one is timed"),
-    **COMPOSE_FLAGS,
-    "--batch": ("B", "environments decided for at once (1)"),
-    "--decisions": ("N", "decisions that are timed (50)"),
-    **DEVICE_FLAGS,
-    "--json": ("FILE", "result as JSON"),
-}
-SETTINGS = ("planner",)
 WARM_UP_DECISIONS = 3
 UNTRAINED_DISCOUNT = 0.99
 
 
-def run(flags: Flags) -> int:
+@dataclass(frozen=True, kw_only=True)
+class Request(ComposeRequest):
+    """What is timed.
+
+    Attributes:
+        checkpoint: Folder of a trained agent, or of a run; None times an untrained agent.
+        batch: Environments decided for at once.
+        decisions: Decisions that are timed.
+        json: Result as JSON.
+        planner: Settings of the search.
+    """
+
+    checkpoint: Path | None = option(None, metavar="DIR")
+    batch: int = 1
+    decisions: int = 50
+    json: Path | None = option(None, metavar="FILE", is_output=True)
+    planner: dict[str, Any] = overrides(PlannerConfig, prefix="planner.")
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        at_least(self, batch=1, decisions=1)
+        for name in ("domain", "preset", "action_dim"):
+            if self.checkpoint is not None and getattr(self, name) is not None:
+                raise UserError(f"--{name.replace('_', '-')} has no effect with --checkpoint; give one of them")
+
+
+def run(request: Request) -> int:
     """Time decisions on random frames and print their percentiles."""
-    batch, decisions = whole_number(flags, "--batch", 1), whole_number(flags, "--decisions", 50)
-    json_path = output_path(flags, "--json")
-    for name in ("--domain", "--preset", "--action-dim"):
-        if "--checkpoint" in flags and name in flags:
-            raise UserError(f"{name} has no effect with --checkpoint; give one of them")
-    composed = None if "--checkpoint" in flags else composed_config(flags)
-    device = choose_device(flags)
+    batch, decisions = request.batch, request.decisions
+    composed = None if request.checkpoint is not None else request.compose({"planner": request.planner})
+    device_name = request.use_device()
+    import torch
+
     from bench.machine import describe_machine
 
-    model, config, discount = _load(flags, composed, device)
+    device = torch.device(device_name)
+    model, config, discount = _load(request, composed, device)
     arms = {
         name: measure_decisions(agent, batch, decisions) for name, agent in _agents(model, config, discount).items()
     }
@@ -70,7 +79,7 @@ def run(flags: Flags) -> int:
     print(f"{config.env.domain} on {machine['name']} ({device.type}, {machine['threads']} threads), batch {batch}")
     print(format_table(["decides", "ms p50", "p95", "p99", "model steps per decision"], rows))
     about = {"domain": config.env.domain, "batch": batch, "decisions": decisions, "machine": machine}
-    write_json(json_path, {**about, "planner": to_dict(config.planner), "arms": arms})
+    write_json(request.json, {**about, "planner": to_dict(config.planner), "arms": arms})
     return 0
 
 
@@ -125,7 +134,7 @@ def counted_model_steps(model: WorldModel) -> Iterator[dict[str, int]]:
             delattr(model, name)
 
 
-def _load(flags: Flags, composed: Config | None, device: torch.device) -> tuple[WorldModel, Config, float]:
+def _load(request: Request, composed: Config | None, device: torch.device) -> tuple[WorldModel, Config, float]:
     """Model, settings and discount: of the checkpoint, or of an untrained agent."""
     if composed is not None:
         import torch
@@ -134,12 +143,13 @@ def _load(flags: Flags, composed: Config | None, device: torch.device) -> tuple[
         from latentplan.models.fast import accelerate
 
         torch.manual_seed(0)
-        model = accelerate(WorldModel(composed.model, action_size(flags, composed)).to(device))
+        model = accelerate(WorldModel(composed.model, request.action_size(composed)).to(device))
         return model, composed, UNTRAINED_DISCOUNT
     from latentplan.agents.checkpoint import load_model
 
-    model, config, info = load_model(Path(flags["--checkpoint"]), str(device))
-    layer = {"planner": {**to_dict(config.planner), **settings_layer(flags).get("planner", {})}}
+    assert request.checkpoint is not None
+    model, config, info = load_model(request.checkpoint, str(device))
+    layer = {"planner": {**to_dict(config.planner), **request.planner}}
     return model, replace(config, planner=build_config(layer).planner), float(info["discount"])
 
 

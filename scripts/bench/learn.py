@@ -13,31 +13,20 @@ import statistics
 import subprocess
 import sys
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from bench.anchors import FRAMES, published
 from bench.learn_plot import Curve, Point, plot_runs
-from bench.options import Flags, choice, numbers, words
 from bench.report import format_table, interval, number, write_csv, write_json
-from latentplan.commands.main import parse_train
-from latentplan.config import Config, RunConfig, UserError, make_folder, to_dict
-from latentplan.config.files import SECTIONS, read_config
+from latentplan.commands import train
+from latentplan.commands.flags import overrides, read_request
+from latentplan.config import Config, Device, RunConfig, UserError, make_folder, to_dict
+from latentplan.config.checks import above_zero
+from latentplan.config.files import Preset, read_config
+from latentplan.config.parsing import option
 
-FLAGS = {
-    "--tasks": ("T,T", "domain-task each (cartpole-swingup,walker-walk)"),
-    "--seeds": ("S,S", "seeds of each task (0,1)"),
-    "--frames": ("N", "simulator frames of each run (without a budget, the preset's)"),
-    "--minutes": ("M", "minutes of each run; given with --frames, whichever ends first"),
-    "--thresholds": ("R,R", "evaluation returns to wait for (250,500,750)"),
-    "--mode": ("planner|actor", "whose evaluation return counts (planner)"),
-    "--out": ("DIR", "folder of the runs and results (runs/learn); finished runs in it are not repeated"),
-    "--preset": ("auto|cpu|gpu", "as in train.py"),
-    "--device": ("auto|cpu|cuda", "as in train.py"),
-    "--config": ("FILE", "as in train.py"),
-}
-SETTINGS = tuple(SECTIONS)
 OWN_FLAGS = {  # settings that these runs differ in, or are told by
     "env.domain": "--tasks",
     "env.task": "--tasks",
@@ -46,27 +35,76 @@ OWN_FLAGS = {  # settings that these runs differ in, or are told by
     "run.minutes": "--minutes",
     "run.run_dir": "--out",
 }
-FORWARDED = ("--preset", "--device", "--config")
 FINISHED = "finished.json"
-MODES = ("planner", "actor")
 NEAR = 0.03  # of a number of frames: how far from it an evaluation may be that stands for it
 OWN = "latentplan"
 
 
-def run(flags: Flags) -> int:
+@dataclass(frozen=True, kw_only=True)
+class Request:
+    """What is trained.
+
+    Attributes:
+        tasks: Tasks, each as domain-task.
+        seeds: Seeds of each task.
+        frames: Simulator frames of each run; without frames and minutes, the budget of the preset holds.
+        minutes: Minutes of each run; given with frames, a run ends with whichever is reached first.
+        thresholds: Evaluation returns for which the frames and minutes to reach them are reported.
+        mode: Agent that the reported evaluation returns are of.
+        out: Folder of the runs and results; finished runs in it are not repeated.
+        preset: Machine class, as for training; None takes `gpu` where CUDA is usable, else `cpu`.
+        device: Device, as for training; None takes CUDA where it is usable.
+        config: YAML file of settings, as for training.
+        settings: Settings of every run, by section and name.
+    """
+
+    tasks: tuple[str, ...] = option(("cartpole-swingup", "walker-walk"), separator=",")
+    seeds: tuple[int, ...] = option((0, 1), separator=",")
+    frames: int | None = None
+    minutes: float | None = None
+    thresholds: tuple[int, ...] = option((250, 500, 750), separator=",")
+    mode: Literal["planner", "actor"] = "planner"
+    out: Path = option(Path("runs/learn"), metavar="DIR")
+    preset: Preset | None = None
+    device: Device | None = None
+    config: Path | None = option(None, metavar="FILE")
+    settings: dict[str, Any] = overrides(Config)
+
+    def __post_init__(self) -> None:
+        above_zero(self, "frames", "minutes")
+        for name in ("seeds", "thresholds"):
+            if min(getattr(self, name)) < 0:
+                raise UserError(f"--{name} must be at least 0, got {min(getattr(self, name))}")
+        for key, own in OWN_FLAGS.items():
+            section, _, name = key.partition(".")
+            if name in self.settings.get(section, {}):
+                raise UserError(f"{own} sets --{key} here; give {own}")
+
+    @property
+    def budget(self) -> list[str]:
+        """The flags of `train.py` that end a run."""
+        given = (("--frames", self.frames), ("--minutes", self.minutes))
+        return [word for name, value in given if value is not None for word in (name, f"{value:.15g}")]
+
+    @property
+    def forwarded(self) -> list[str]:
+        """The other flags of `train.py` that all runs share."""
+        flags: dict[str, Any] = {"--preset": self.preset, "--device": self.device, "--config": self.config}
+        words = [word for name, value in flags.items() if value is not None for word in (name, str(value))]
+        for section, fields in self.settings.items():
+            for name, value in fields.items():
+                words += [f"--{section}.{name}", value if isinstance(value, str) else json.dumps(value)]
+        return words
+
+
+def run(request: Request) -> int:
     """Train what is missing, then collect, tabulate and plot the curves."""
-    tasks, seeds = words(flags, "--tasks", "cartpole-swingup,walker-walk"), numbers(flags, "--seeds", "0,1")
-    thresholds = numbers(flags, "--thresholds", "250,500,750")
-    mode = choice(flags, "--mode", "planner", MODES)
-    budget = [word for name in ("--frames", "--minutes") if name in flags for word in (name, flags[name])]
-    extra = [word for name, value in flags.items() if name in FORWARDED or "." in name for word in (name, value)]
-    for name, own in OWN_FLAGS.items():
-        if f"--{name}" in flags:
-            raise UserError(f"--{name} is what {own} says here; give that")
-    out = Path(flags.get("--out", "runs/learn"))
-    folders = {(task, seed): out / f"{task}-seed{seed}" for task in tasks for seed in seeds}
+    tasks, thresholds, mode, out = request.tasks, request.thresholds, request.mode, request.out
+    budget, extra = request.budget, request.forwarded
+    folders = {(task, seed): out / f"{task}-seed{seed}" for task in tasks for seed in request.seeds}
     for (task, seed), folder in folders.items():  # a mistake in any run stops before the first
-        check_same(parse_train(_new_run(task, seed, folder, budget, extra)).config, folder)
+        asked = read_request(train.Request, _new_run(task, seed, folder, budget, extra))
+        check_same(train.resolve(asked), folder)
     make_folder(out)
     for (task, seed), folder in folders.items():
         _train(task, seed, folder, budget, extra)

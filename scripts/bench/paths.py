@@ -4,22 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, ExitStack, nullcontext
+from dataclasses import dataclass
+from pathlib import Path
 from statistics import median
 from typing import TYPE_CHECKING, Any
 from unittest.mock import patch
 
-from bench.options import (
-    COMPOSE_FLAGS,
-    DEVICE_FLAGS,
-    Flags,
-    action_size,
-    choose_device,
-    composed_config,
-    numbers,
-    output_path,
-    whole_number,
-)
+from bench.options import ComposeRequest
 from bench.report import format_table, number, write_json
+from latentplan.commands.flags import overrides
+from latentplan.config import LearningConfig, ModelConfig, UserError
+from latentplan.config.checks import at_least
+from latentplan.config.parsing import option
 
 if TYPE_CHECKING:
     import torch
@@ -27,28 +23,46 @@ if TYPE_CHECKING:
     from latentplan.models import WorldModel
     from latentplan.models.backend import Backend
 
-FLAGS = {
-    **COMPOSE_FLAGS,
-    "--samples": ("N,N", "candidates of the rollouts (128,512)"),
-    "--horizon": ("H", "model steps of each candidate (8)"),
-    "--repeats": ("N", "calls that are timed of each path (20)"),
-    **DEVICE_FLAGS,
-    "--json": ("FILE", "result as JSON"),
-}
-SETTINGS = ("model", "learning")
 WARM_UP_CALLS = 2
 Call = Callable[["WorldModel"], Any]
 
 
-def run(flags: Flags) -> int:
+@dataclass(frozen=True, kw_only=True)
+class Request(ComposeRequest):
+    """What is timed.
+
+    Attributes:
+        samples: Candidates of the rollouts.
+        horizon: Model steps of each candidate.
+        repeats: Calls that are timed of each path.
+        json: Result as JSON.
+        model: Settings of the model.
+        learning: Settings of the learning.
+    """
+
+    samples: tuple[int, ...] = option((128, 512), separator=",")
+    horizon: int = 8
+    repeats: int = 20
+    json: Path | None = option(None, metavar="FILE", is_output=True)
+    model: dict[str, Any] = overrides(ModelConfig, prefix="model.")
+    learning: dict[str, Any] = overrides(LearningConfig, prefix="learning.")
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        at_least(self, horizon=1, repeats=1)
+        if min(self.samples) < 1:
+            raise UserError(f"--samples must be at least 1, got {min(self.samples)}")
+
+
+def run(request: Request) -> int:
     """Time every fast path that runs on the device beside its reference, in turns, and print the medians."""
-    samples, horizon = numbers(flags, "--samples", "128,512"), whole_number(flags, "--horizon", 8)
-    repeats, json_path = whole_number(flags, "--repeats", 20), output_path(flags, "--json")
-    config = composed_config(flags)
-    device = choose_device(flags)
-    action_dim = action_size(flags, config)
+    samples, horizon, repeats = list(request.samples), request.horizon, request.repeats
+    config = request.compose({"model": request.model, "learning": request.learning})
+    device_name = request.use_device()
+    action_dim = request.action_size(config)
     import torch
 
+    device = torch.device(device_name)
     from bench.machine import describe_machine
     from latentplan.models import WorldModel
 
@@ -66,7 +80,7 @@ def run(flags: Flags) -> int:
     print(f"{config.env.domain} on {machine['name']} ({device.type}, {machine['threads']} threads), horizon {horizon}")
     print(format_table(["path", "reference ms", "fast ms", "ratio"], rows))
     about = {"domain": config.env.domain, "horizon": horizon, "repeats": repeats, "machine": machine}
-    write_json(json_path, {**about, "paths": [{**row, "ratio": _ratio(row)} for row in results]})
+    write_json(request.json, {**about, "paths": [{**row, "ratio": _ratio(row)} for row in results]})
     return 0
 
 

@@ -7,41 +7,22 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from bench.options import (
-    COMPOSE_FLAGS,
-    DEVICE_FLAGS,
-    SEARCH_FLAGS,
-    Flags,
-    action_size,
-    choose_device,
-    composed_config,
-    output_path,
-    search_sizes,
-    whole_number,
-    words,
-)
+from bench.options import ComposeRequest, SearchRequest
 from bench.peers.install import FOLDER, PEERS, PeerError
 from bench.report import format_table, number, write_json
-from latentplan.config import to_dict
-from latentplan.config.files import raise_unknown
+from latentplan.commands.flags import overrides
+from latentplan.config import ModelConfig, to_dict
+from latentplan.config.checks import at_least
+from latentplan.config.parsing import option, raise_unknown
 
 if TYPE_CHECKING:
     from bench.peers.client import PeerProcess
     from bench.peers.problem import Problem
 
-FLAGS = {
-    **COMPOSE_FLAGS,
-    **SEARCH_FLAGS,
-    "--peers": ("P,P", f"any of {','.join(PEERS)} (all), or none; installed on first use, out of the project's way"),
-    "--plans": ("N", "timed searches of each planner, taken in turns (30)"),
-    **DEVICE_FLAGS,
-    "--json": ("FILE", "result as JSON"),
-    "--scaling": ("PNG", "also time our planner against samples, horizon, iterations and environments; plot it here"),
-}
-SETTINGS = ("model",)
 WARM_UP_PLANS = 2
 OURS, PLAIN, PRODUCTS = "latentplan", "plain loop", "matrix products"
 Times = dict[tuple[str, str], list[float]]
@@ -75,27 +56,58 @@ class Comparison(NamedTuple):
     left_out: dict[str, str]
 
 
-def run(flags: Flags) -> int:
+@dataclass(frozen=True, kw_only=True)
+class Request(SearchRequest, ComposeRequest):
+    """What is timed.
+
+    Attributes:
+        peers: Other planners, or `none`; each is installed on first use, in an environment of its own.
+        plans: Timed searches of each planner, taken in turns.
+        json: Result as JSON.
+        scaling: Picture of the time of our planner against samples, horizon, iterations and environments.
+        model: Settings of the model.
+    """
+
+    peers: tuple[str, ...] = option(tuple(PEERS), separator=",")
+    plans: int = 30
+    json: Path | None = option(None, metavar="FILE", is_output=True)
+    scaling: Path | None = option(None, metavar="PNG", is_output=True)
+    model: dict[str, Any] = overrides(ModelConfig, prefix="model.")
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        at_least(self, plans=1)
+        if self.peers != ("none",):
+            for name in self.peers:
+                if name not in PEERS:
+                    raise_unknown("peer", name, [*PEERS, "none"])
+
+    @property
+    def peer_names(self) -> list[str]:
+        """The peers that take part."""
+        return [] if self.peers == ("none",) else list(self.peers)
+
+
+def run(request: Request) -> int:
     """Time every planner in turns and print how they compare."""
-    plans, names = whole_number(flags, "--plans", 30), _peer_names(flags)
-    sizes = search_sizes(flags)
-    json_path, plot_path = output_path(flags, "--json"), output_path(flags, "--scaling")
-    config = composed_config(flags)
-    device = choose_device(flags)
+    plans, sizes = request.plans, request.sizes
+    config = request.compose({"model": request.model})
+    device_name = request.use_device()
     import torch
 
     from bench.machine import describe_machine
     from bench.peers.problem import Problem
 
+    device = torch.device(device_name)
     problem = Problem(
         **sizes,
-        action_dim=action_size(flags, config),
+        action_dim=request.action_size(config),
         model=to_dict(config.model),
         device=device.type,
         threads=torch.get_num_threads(),
     )
     machine = describe_machine(device)
-    measured = compare(problem, names, plans)
+    measured = compare(problem, request.peer_names, plans)
     result = {
         **summarise(measured.times, problem.threads),
         "peers": measured.versions,
@@ -106,13 +118,13 @@ def run(flags: Flags) -> int:
     }
     print(f"{machine['name']} ({device.type}, {machine['threads']} threads), {config.env.domain}, {sizes}")
     print(table(result))
-    if plot_path is not None:
+    if request.scaling is not None:
         from bench.plan_scaling import measure_scaling, plot_scaling, scaling_table
 
         result["scaling"] = measure_scaling(problem, result["best_dtype"])
         print(scaling_table(result["scaling"]))
-        plot_scaling(result["scaling"], plot_path)
-    write_json(json_path, result)
+        plot_scaling(result["scaling"], request.scaling)
+    write_json(request.json, result)
     return 0
 
 
@@ -208,16 +220,6 @@ def table(result: dict[str, Any]) -> str:
             f"ours / its matrix products: {number(result['ratio_matrix_limit'], 2)}",
         ]
     )
-
-
-def _peer_names(flags: Flags) -> list[str]:
-    names = words(flags, "--peers", ",".join(PEERS))
-    if names == ["none"]:
-        return []
-    for name in names:
-        if name not in PEERS:
-            raise_unknown("peer", name, [*PEERS, "none"])
-    return names
 
 
 def _peer_arm(process: PeerProcess, dtype: str) -> Arm:

@@ -7,43 +7,60 @@ number of actions executed from each plan, and the model's prediction error by m
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from bench.options import DEVICE_FLAGS, Flags, choose_device, output_path, positive_number, whole_number, words
 from bench.report import format_table, interval, number, write_json
+from latentplan.commands.shell import ComputeRequest
 from latentplan.config import UserError, to_dict
-from latentplan.config.files import raise_unknown
+from latentplan.config.checks import at_least
+from latentplan.config.parsing import option, raise_unknown
 
 if TYPE_CHECKING:
     from bench.realtime_measurements import Row, Trial
 
 PARTS = ("iterations", "rates", "error", "replan")
-FLAGS = {
-    "--checkpoint": ("DIR", "trained agent, or run (its best checkpoint)"),
-    "--episodes": ("N", "episodes of each point, on the same starts (5)"),
-    "--seed": ("S", "episode i starts from a state that depends only on S and i (0)"),
-    "--parts": ("P,P", f"any of {','.join(PARTS)} (all)"),
-    "--rates": ("F,F", "decisions per second of the worlds that do not wait (25,50,100,200)"),
-    **DEVICE_FLAGS,
-    "--json": ("FILE", "result as JSON, written anew after every point"),
-    "--plot": ("PNG", "result as a picture"),
-}
-SETTINGS = ()
 
 
-def run(flags: Flags) -> int:
+@dataclass(frozen=True, kw_only=True)
+class Request(ComputeRequest):
+    """What is measured.
+
+    Attributes:
+        checkpoint: Folder of a trained agent, or of a run (its best checkpoint).
+        episodes: Episodes of each point, from the same starts.
+        seed: Seed of the starts: episode i starts from a state that depends only on the seed and i.
+        parts: Parts of the measurement.
+        rates: Decisions per second of the worlds that do not wait.
+        json: Result as JSON, written anew after every point.
+        plot: Result as a picture.
+    """
+
+    checkpoint: Path = option(metavar="DIR")
+    episodes: int = 5
+    seed: int = 0
+    parts: tuple[str, ...] = option(PARTS, separator=",")
+    rates: tuple[float, ...] = option((25.0, 50.0, 100.0, 200.0), separator=",")
+    json: Path | None = option(None, metavar="FILE", is_output=True)
+    plot: Path | None = option(None, metavar="PNG", is_output=True)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        at_least(self, episodes=1, seed=0)
+        for part in self.parts:
+            if part not in PARTS:
+                raise_unknown("part", part, PARTS)
+        if min(self.rates) <= 0.0:
+            raise UserError(f"--rates must be above 0, got {min(self.rates):g}")
+
+
+def run(request: Request) -> int:
     """Measure the parts that were asked for, one point after the other."""
-    if "--checkpoint" not in flags:
-        raise UserError("flag --checkpoint is missing; give the folder of a trained agent or of a run")
-    episodes, seed = whole_number(flags, "--episodes", 5), whole_number(flags, "--seed", 0, least=0)
-    parts = words(flags, "--parts", ",".join(PARTS))
-    for part in parts:
-        if part not in PARTS:
-            raise_unknown("part", part, PARTS)
-    rates = [positive_number({"--rates": word}, "--rates", 0.0) for word in words(flags, "--rates", "25,50,100,200")]
-    json_path, plot_path = output_path(flags, "--json"), output_path(flags, "--plot")
-    device = choose_device(flags)
+    episodes, seed, checkpoint = request.episodes, request.seed, str(request.checkpoint)
+    device = request.use_device()
+    import torch
+
     from bench.ablation_arms import check_checkpoint
     from bench.machine import describe_machine
     from bench.realtime_measurements import Trial
@@ -51,34 +68,34 @@ def run(flags: Flags) -> int:
     from latentplan.envs import make_env
     from latentplan.evaluation.episodes import episode_seed
 
-    info, planner = check_checkpoint(Path(flags["--checkpoint"]))
+    info, planner = check_checkpoint(request.checkpoint)
     about = {
-        "checkpoint": flags["--checkpoint"],
+        "checkpoint": checkpoint,
         "domain": info["domain"],
         "task": info["task"],
         "episodes": episodes,
         "seed": seed,
         "planner": to_dict(planner),
-        "machine": describe_machine(device),
+        "machine": describe_machine(torch.device(device)),
     }
     print(f"{about['domain']}-{about['task']}, {episodes} episodes per point", flush=True)
-    env = make_env(load_model(flags["--checkpoint"])[1].env)
+    env = make_env(load_model(checkpoint)[1].env)
     seeds = [episode_seed(seed, index) for index in range(episodes)]
-    result: dict[str, list[Row]] = {part: [] for part in parts}
+    result: dict[str, list[Row]] = {part: [] for part in request.parts}
     try:
-        trial = Trial(flags["--checkpoint"], str(device), env, seeds, planner.horizon)
-        for part, row in measure_parts(trial, parts, rates):
+        trial = Trial(checkpoint, device, env, seeds, planner.horizon)
+        for part, row in measure_parts(trial, request.parts, request.rates):
             result[part].append(row)
             print(_progress(part, row), flush=True)
-            write_json(json_path, {**about, **result})
+            write_json(request.json, {**about, **result})
     finally:
         env.close()
     for part, rows in result.items():
         print(f"\n{part_table(part, rows)}")
-    if plot_path is not None:
+    if request.plot is not None:
         from bench.realtime_plot import plot_realtime
 
-        plot_realtime(result, plot_path)
+        plot_realtime(result, request.plot)
     return 0
 
 

@@ -7,38 +7,52 @@ from __future__ import annotations
 
 import dataclasses
 import time
+from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from bench.options import Flags, output_path, whole_number, words
 from bench.report import format_table, number, write_json
 from latentplan.config import RENDER_QUALITIES, EnvConfig
-from latentplan.config.files import DOMAINS, compose, raise_unknown
+from latentplan.config.checks import at_least
+from latentplan.config.files import DOMAINS, compose
+from latentplan.config.parsing import option, raise_unknown
 
 if TYPE_CHECKING:
     import numpy as np
 
-FLAGS = {
-    "--domains": ("D,D", "domains of dm_control.suite (walker,cheetah,cartpole)"),
-    "--frames": ("N", "frames per domain and quality (30)"),
-    "--json": ("FILE", "result as JSON"),
-}
-SETTINGS = ()
 REPEATS = 3
 
 
-def run(flags: Flags) -> int:
+@dataclass(frozen=True)
+class Request:
+    """What is rendered.
+
+    Attributes:
+        domains: Domains of `dm_control.suite`.
+        frames: Frames per domain and quality.
+        json: Result as JSON.
+    """
+
+    domains: tuple[str, ...] = option(("walker", "cheetah", "cartpole"), separator=",")
+    frames: int = 30
+    json: Path | None = option(None, metavar="FILE", is_output=True)
+
+    def __post_init__(self) -> None:
+        at_least(self, frames=1)
+        for domain in self.domains:
+            if domain not in DOMAINS:
+                raise_unknown("domain", domain, DOMAINS)
+
+
+def run(request: Request) -> int:
     """Render the same states in every quality and compare time and pictures."""
-    domains = words(flags, "--domains", "walker,cheetah,cartpole")
-    frames, json_path = whole_number(flags, "--frames", 30), output_path(flags, "--json")
-    for domain in domains:
-        if domain not in DOMAINS:
-            raise_unknown("domain", domain, DOMAINS)
     from latentplan.envs import render_info
 
     info = render_info()
     print(f"pictures by {info['renderer']} (MUJOCO_GL={info['backend']}, mujoco {info['mujoco']})", flush=True)
     measured = {
-        domain: measure_qualities(compose({}, {"env": {"domain": domain}}, "cpu").env, frames) for domain in domains
+        domain: measure_qualities(compose({}, {"env": {"domain": domain}}, "cpu").env, request.frames)
+        for domain in request.domains
     }
     rows = [
         [f"{domain}, {quality}", number(facts["frame_ms"], 2), number(facts["pixel_change"], 2)]
@@ -46,7 +60,7 @@ def run(flags: Flags) -> int:
         for quality, facts in qualities.items()
     ]
     print(format_table(["64 x 64", "ms per frame", "mean pixel change / 255"], rows))
-    write_json(json_path, {"render": info, "frames": frames, "domains": measured})
+    write_json(request.json, {"render": info, "frames": request.frames, "domains": measured})
     return 0
 
 

@@ -14,10 +14,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from bench.options import DEVICE_FLAGS, Flags, choose_device, output_path, positive_number, whole_number, words
 from bench.report import format_table, number, write_json
-from latentplan.config import UserError
-from latentplan.config.files import raise_unknown
+from latentplan.commands.shell import ComputeRequest
+from latentplan.config.checks import above_zero, at_least
+from latentplan.config.parsing import option, raise_unknown
 
 if TYPE_CHECKING:
     import numpy as np
@@ -26,16 +26,6 @@ if TYPE_CHECKING:
 
 MODES = ("actor", "gated", "background", "planner")
 IDLE = "no-op"
-FLAGS = {
-    "--checkpoint": ("DIR", "trained agent, or run (its best checkpoint)"),
-    "--mode": ("M,M", f"any of {','.join(MODES)} (actor,gated,background); an agent that does nothing joins them"),
-    "--control-hz": ("F", "decisions per second (50)"),
-    "--decisions": ("N", "decisions that are due, of each agent (10000)"),
-    "--block": ("N", "decisions of one agent before the next takes over (250)"),
-    **DEVICE_FLAGS,
-    "--json": ("FILE", "result as JSON"),
-}
-SETTINGS = ()
 NUM_FRAMES = 250
 WARM_UP_DECISIONS = 5
 DEADLINE_SHARE = 0.3  # share of a period for a search; encoding and gating take as much, the machine takes the rest
@@ -69,33 +59,58 @@ class IdleAgent:
         """Does nothing."""
 
 
-def run(flags: Flags) -> int:
+@dataclass(frozen=True, kw_only=True)
+class Request(ComputeRequest):
+    """What is counted.
+
+    Attributes:
+        checkpoint: Folder of a trained agent, or of a run (its best checkpoint).
+        mode: Modes of the agent, some of actor, gated, background and planner; an idle agent joins them.
+        control_hz: Decisions per second.
+        decisions: Decisions that are due, of each agent.
+        block: Decisions of one agent before the next agent takes over.
+        json: Result as JSON.
+    """
+
+    checkpoint: Path = option(metavar="DIR")
+    mode: tuple[str, ...] = option(("actor", "gated", "background"), separator=",")
+    control_hz: float = 50.0
+    decisions: int = 10_000
+    block: int = 250
+    json: Path | None = option(None, metavar="FILE", is_output=True)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        above_zero(self, "control_hz")
+        at_least(self, decisions=1, block=1)
+        for mode in self.mode:
+            if mode not in MODES:
+                raise_unknown("mode", mode, MODES)
+
+
+def run(request: Request) -> int:
     """Let the agents take turns in real time, and count what each misses."""
-    if "--checkpoint" not in flags:
-        raise UserError("flag --checkpoint is missing; give the folder of a trained agent or of a run")
-    modes = words(flags, "--mode", "actor,gated,background")
-    for mode in modes:
-        if mode not in MODES:
-            raise_unknown("mode", mode, MODES)
-    control_hz = positive_number(flags, "--control-hz", 50.0)
-    decisions, block = whole_number(flags, "--decisions", 10_000), whole_number(flags, "--block", 250)
-    json_path, device = output_path(flags, "--json"), choose_device(flags)
+    modes, control_hz, checkpoint = request.mode, request.control_hz, str(request.checkpoint)
+    decisions, block = request.decisions, request.block
+    device = request.use_device()
+    import torch
+
     from bench.machine import describe_machine
 
     about = {
-        "checkpoint": flags["--checkpoint"],
+        "checkpoint": checkpoint,
         "control_hz": control_hz,
         "block": block,
-        "machine": describe_machine(device),
+        "machine": describe_machine(torch.device(device)),
     }
-    frames = _record_frames(Path(flags["--checkpoint"]), str(device))
+    frames = _record_frames(request.checkpoint, device)
     seconds = decisions / control_hz * (len(modes) + 1)
     print(f"{', '.join([IDLE, *modes])} at {control_hz:g} Hz in turns, {seconds:.0f} s in all", flush=True)
     tallies = {name: Tally() for name in (IDLE, *modes)}
     code = 0
     from latentplan.planning import settle
 
-    with _loaded_agents(flags["--checkpoint"], modes, str(device), 1000.0 * DEADLINE_SHARE / control_hz) as agents:
+    with _loaded_agents(checkpoint, modes, device, 1000.0 * DEADLINE_SHARE / control_hz) as agents:
         settle()
         try:
             take_turns(agents, frames, control_hz, decisions, block, tallies)
@@ -104,7 +119,7 @@ def run(flags: Flags) -> int:
             print("\ninterrupted", flush=True)
     rows = soak_rows(tallies)
     print(soak_table(rows))
-    write_json(json_path, {**about, "agents": rows})
+    write_json(request.json, {**about, "agents": rows})
     return code
 
 

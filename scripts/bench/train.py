@@ -5,44 +5,56 @@ The table shows milliseconds, GFLOP and GFLOP/s of each part, beside the GFLOP/s
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
-from bench.options import (
-    COMPOSE_FLAGS,
-    DEVICE_FLAGS,
-    Flags,
-    action_size,
-    choose_device,
-    composed_config,
-    output_path,
-    whole_number,
-)
+from bench.options import ComposeRequest
 from bench.report import format_table, number, write_json
-
-FLAGS = {
-    **COMPOSE_FLAGS,
-    "--updates": ("N", "updates that are timed (20)"),
-    **DEVICE_FLAGS,
-    "--json": ("FILE", "result as JSON"),
-}
-SETTINGS = ("model", "learning", "replay")
+from latentplan.commands.flags import overrides
+from latentplan.config import LearningConfig, ModelConfig, ReplayConfig
+from latentplan.config.checks import at_least
+from latentplan.config.parsing import option
 
 
-def run(flags: Flags) -> int:
+@dataclass(frozen=True, kw_only=True)
+class Request(ComposeRequest):
+    """What is timed.
+
+    Attributes:
+        updates: Updates that are timed.
+        json: Result as JSON.
+        model: Settings of the model.
+        learning: Settings of the learning.
+        replay: Settings of the replay.
+    """
+
+    updates: int = 20
+    json: Path | None = option(None, metavar="FILE", is_output=True)
+    model: dict[str, Any] = overrides(ModelConfig, prefix="model.")
+    learning: dict[str, Any] = overrides(LearningConfig, prefix="learning.")
+    replay: dict[str, Any] = overrides(ReplayConfig, prefix="replay.")
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        at_least(self, updates=1)
+
+
+def run(request: Request) -> int:
     """Time updates on synthetic replay and print where the time goes."""
-    updates, json_path = whole_number(flags, "--updates", 20), output_path(flags, "--json")
-    config = composed_config(flags)
-    device = choose_device(flags)
-    action_dim = action_size(flags, config)
+    config = request.compose({"model": request.model, "learning": request.learning, "replay": request.replay})
+    device_name = request.use_device()
+    action_dim = request.action_size(config)
     import torch
 
+    device = torch.device(device_name)
     from bench.machine import describe_machine, product_limits
     from bench.train_update import measure_update
     from latentplan.training.resources import set_up_torch
 
     set_up_torch(torch.get_num_threads(), device)  # as a run does
     before = product_limits(device)
-    measured = measure_update(config, action_dim, device, updates)
+    measured = measure_update(config, action_dim, device, request.updates)
     after = product_limits(device)  # the better of two: other work may have disturbed one
     limits = {name: max(before[name], after[name]) for name in before}
     result = {
@@ -53,7 +65,7 @@ def run(flags: Flags) -> int:
         "fraction_of_limit": {name: measured["flop_per_s"] / limit for name, limit in limits.items()},
     }
     print(_summary(result))
-    write_json(json_path, result)
+    write_json(request.json, result)
     return 0
 
 

@@ -8,47 +8,24 @@ quantities of the simulator; decision times are in milliseconds.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from bench.ablation_arms import check_checkpoint, single_thread
-from bench.options import (
-    DEVICE_FLAGS,
-    Flags,
-    choose_device,
-    output_path,
-    positive_number,
-    settings_layer,
-    whole_number,
-)
 from bench.report import format_table, interval, number, write_json
-from latentplan.config import EnvConfig, UserError, to_dict
-from latentplan.config.files import build_config, raise_unknown
-from latentplan.config.planner import override_planner
+from latentplan.commands.flags import overrides
+from latentplan.commands.saved import search_settings
+from latentplan.commands.shell import ComputeRequest
+from latentplan.config import EnvConfig, PlannerConfig, UserError, to_dict
+from latentplan.config.checks import above_zero, at_least
+from latentplan.config.parsing import option, raise_unknown
 from latentplan.objectives.parser import split_outside_quotes
 
 if TYPE_CHECKING:
     from latentplan.envs import SuiteEnv
     from latentplan.evaluation.episodes import Step
 
-FLAGS = {
-    "--checkpoint": ("DIR", "trained agent, or run (its best checkpoint)"),
-    "--objectives": ("A | B", "objectives as in eval.py, separated by |"),
-    "--constraints": ("A | B", "constraints as in eval.py, separated by |, each with the objective of the training"),
-    "--players": (
-        "A, B",
-        "rows of each goal: some of planner, gated, random moments, random gate, unconstrained, actor, random (all)",
-    ),
-    "--trained": ("DIR", "agent trained for the goals, to compare with: two rows more, its planner and its actor"),
-    "--episodes": ("N", "episodes of each row, on the same starts (10)"),
-    "--seed": ("S", "episode i starts from a state that depends only on S and i (0)"),
-    "--push": ("STD", "of kicks to all joint velocities, one decision in 25, the same for every player (none)"),
-    "--workers": ("N", "rows played at once, each in its own process (1)"),
-    "--device": DEVICE_FLAGS["--device"],
-    "--json": ("FILE", "result as JSON"),
-}
-SETTINGS = ("planner",)
 PUSH_PROBABILITY = 0.04  # per decision
 PURSUERS = ("planner", "gated", "random moments", "random gate")
 OBJECTIVE_PLAYERS = (*PURSUERS, "actor", "random")
@@ -91,27 +68,57 @@ class Conditions(NamedTuple):
     trained: str | None = None
 
 
-def run(flags: Flags) -> int:
+@dataclass(frozen=True, kw_only=True)
+class Request(ComputeRequest):
+    """What is played.
+
+    Attributes:
+        checkpoint: Folder of a trained agent, or of a run (its best checkpoint).
+        objectives: Objectives as of `eval`, separated by |.
+        constraints: Constraints as of `eval`, separated by |; each is pursued with the objective of the training.
+        players: Rows of each goal; some of planner, gated, random moments, random gate, unconstrained, actor, random.
+        trained: Agent trained for the goals, to compare with: two rows more, its planner and its actor.
+        episodes: Episodes of each row, from the same starts.
+        seed: Seed of the starts: episode i starts from a state that depends only on the seed and i.
+        push: Standard deviation of kicks to all joint velocities, at one decision in 25, the same for every player.
+        workers: Rows played at once, each in a process of its own.
+        json: Result as JSON.
+        planner: Settings of the search, in place of the agent's own.
+    """
+
+    checkpoint: Path = option(metavar="DIR")
+    objectives: str = option("", metavar='"A | B"')
+    constraints: str = option("", metavar='"A | B"')
+    players: tuple[str, ...] = option((*OBJECTIVE_PLAYERS, "unconstrained"), separator=",")
+    trained: Path | None = option(None, metavar="DIR")
+    episodes: int = 10
+    seed: int = 0
+    push: float | None = None
+    workers: int = 1
+    json: Path | None = option(None, metavar="FILE", is_output=True)
+    planner: dict[str, Any] = overrides(PlannerConfig, prefix="planner.")
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        at_least(self, episodes=1, seed=0, workers=1)
+        above_zero(self, "push")
+
+
+def run(request: Request) -> int:
     """Play every goal with every player from the same starts."""
-    if "--checkpoint" not in flags:
-        raise UserError("flag --checkpoint is missing; give the folder of a trained agent or of a run")
-    checkpoint, json_path = flags["--checkpoint"], output_path(flags, "--json")
-    episodes, seed = whole_number(flags, "--episodes", 10), whole_number(flags, "--seed", 0, least=0)
-    workers, push = whole_number(flags, "--workers", 1), 0.0
-    if "--push" in flags:
-        push = positive_number(flags, "--push", push)
-    jobs = list_jobs(flags)
-    info, trained = check_checkpoint(Path(checkpoint))
+    checkpoint, episodes, seed = str(request.checkpoint), request.episodes, request.seed
+    workers, push = request.workers, request.push or 0.0
+    jobs = list_jobs(request)
+    info, trained = check_checkpoint(request.checkpoint)
     _check_goals(jobs, info["config"]["env"]["domain"])
-    trained_for = flags.get("--trained")
+    trained_for = None if request.trained is None else str(request.trained)
     if trained_for is not None:
         domain = check_checkpoint(Path(trained_for))[0]["domain"]
         if domain != info["domain"]:
             raise UserError(f"--trained {trained_for!r} controls {domain}, --checkpoint {info['domain']}")
-    typed = settings_layer(flags).get("planner", {})
-    planner = build_config({"planner": override_planner(to_dict(trained), typed)}).planner
-    overrides = {name: getattr(planner, name) for name in typed}
-    device = str(choose_device(flags))
+    planner = search_settings(trained, request.planner)
+    changes = {name: getattr(planner, name) for name in request.planner}
+    device = request.use_device()
     from latentplan.evaluation.episodes import episode_seed
     from latentplan.evaluation.goals import goal_env
 
@@ -131,29 +138,29 @@ def run(flags: Flags) -> int:
     }
     print(f"{about['domain']}-{about['task']}, {episodes} episodes per row, {workers} at once", flush=True)
     rows: list[dict[str, Any]] = []
-    for row in _play(Conditions(checkpoint, seeds, device, overrides, push, trained_for), jobs, workers):
+    for row in _play(Conditions(checkpoint, seeds, device, changes, push, trained_for), jobs, workers):
         rows.append(row)
         print(f"{row['goal']}, {row['player']}: {number(row['mean'], row['digits'])}", flush=True)
-        write_json(json_path, {**about, "rows": rows})
+        write_json(request.json, {**about, "rows": rows})
     print(summary_table(rows))
     return 0
 
 
-def list_jobs(flags: Flags) -> list[Job]:
-    """The rows that the flags ask for.
+def list_jobs(request: Request) -> list[Job]:
+    """The rows that a request asks for.
 
     Raises:
-        UserError: They ask for none, or for a player that there is not.
+        UserError: There is no row, or a player is unknown.
     """
-    objectives, constraints = _parts(flags.get("--objectives", "")), _parts(flags.get("--constraints", ""))
+    objectives, constraints = _parts(request.objectives), _parts(request.constraints)
     if not objectives and not constraints:
         raise UserError("give --objectives 'height > 1.2 | speed -> 2.0' or --constraints 'cart < 0.5', or both")
     known = (*OBJECTIVE_PLAYERS, "unconstrained")
-    wanted = [name.strip() for name in flags["--players"].split(",")] if "--players" in flags else list(known)
+    wanted = request.players
     for name in wanted:
         if name not in known:
             raise_unknown("player", name, known)
-    trained = TRAINED_PLAYERS if "--trained" in flags else ()
+    trained = TRAINED_PLAYERS if request.trained is not None else ()
     asked = [name for name in (*OBJECTIVE_PLAYERS, *trained) if name in (*wanted, *trained)]
     jobs = [
         *(Job(text, None, name) for text in objectives for name in asked),

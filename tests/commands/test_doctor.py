@@ -1,4 +1,4 @@
-"""The doctor reports what is there, and survives what is missing."""
+"""`latentplan doctor` reports what the machine offers, and goes on when a check fails."""
 
 import importlib.metadata
 
@@ -6,8 +6,8 @@ from latentplan.commands import doctor
 from latentplan.config import UserError
 
 
-def test_a_working_machine_passes_and_every_part_is_named(capsys):
-    assert doctor.run_doctor() == 0
+def test_doctor_names_every_part_of_a_working_machine(capsys):
+    assert doctor.run(doctor.Request()) == 0
     out = capsys.readouterr().out
     for part in ("torch", "mujoco", "processor", "cuda", "renderer", "frame, exact", "memory", "disk", "video (VP9)"):
         assert part in out
@@ -15,7 +15,7 @@ def test_a_working_machine_passes_and_every_part_is_named(capsys):
     assert "8 of 8 frames read back" in out
 
 
-def test_a_missing_or_bad_package_fails_with_its_remedy(monkeypatch, capsys):
+def test_versions_name_a_remedy_when_a_package_is_missing_or_bad(monkeypatch, capsys):
     real = importlib.metadata.version
 
     def version(name):
@@ -30,7 +30,7 @@ def test_a_missing_or_bad_package_fails_with_its_remedy(monkeypatch, capsys):
     assert findings["torch"].problem is None
 
 
-def test_a_check_that_breaks_becomes_a_line_and_the_rest_goes_on(monkeypatch, capsys):
+def test_doctor_reports_checks_that_fail_and_goes_on(monkeypatch, capsys):
     def refuse():
         raise UserError("no OpenGL library found to render with; install one")
         yield
@@ -46,7 +46,7 @@ def test_a_check_that_breaks_becomes_a_line_and_the_rest_goes_on(monkeypatch, ca
 
     for name, check in {"_renderer": refuse, "_frame_times": crash, "_device": unimportable}.items():
         monkeypatch.setattr(doctor, name, check)
-    assert doctor.run_doctor() == 1
+    assert doctor.run(doctor.Request()) == 1
     out = capsys.readouterr().out
     assert "fix: refuse: no OpenGL library found" in out
     assert "OSError: driver gone" in out and "first half" in out
@@ -54,7 +54,7 @@ def test_a_check_that_breaks_becomes_a_line_and_the_rest_goes_on(monkeypatch, ca
     assert "video (VP9)" in out
 
 
-def test_a_machine_without_a_compiler_is_told_what_it_lacks(monkeypatch):
+def test_kernels_name_a_remedy_when_no_compiler_works(monkeypatch):
     from latentplan.models.fast import library as kernels
 
     monkeypatch.setattr(kernels, "load", lambda: None)

@@ -1,5 +1,8 @@
+"""`latentplan eval` plays an agent, and prints, films and writes what it measured."""
+
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -14,35 +17,16 @@ import torch
 
 from latentplan.agents.checkpoint import load_model, save_checkpoint
 from latentplan.agents.random import RandomAgent
-from latentplan.commands import evaluate, evaluation_request
-from latentplan.config import USER_DOMAIN, Config, EnvConfig, ModelConfig, PlannerConfig, UserError
+from latentplan.commands.main import main
+from latentplan.config import USER_DOMAIN
 from latentplan.envs import make_env
 from latentplan.evaluation import evaluate_agent
 from latentplan.models import WorldModel
-
-ENV = EnvConfig(domain="cartpole", task="swingup", action_repeat=100, render_quality="fastest")
-MODEL = ModelConfig(deter_dim=8, hidden_dim=8, encoder_channels=(4, 4), decoder_channels=2, num_bins=5)
-PLANNER = PlannerConfig(horizon=3, num_samples=8, num_elites=2, num_policy_samples=1, num_iterations=2)
-
-
-@pytest.fixture(scope="module")
-def run_folder(tmp_path_factory):
-    """A run folder whose best checkpoint is an untrained agent for ten-decision episodes of cartpole."""
-    folder = tmp_path_factory.mktemp("run")
-    info = {"domain": "cartpole", "task": "swingup", "env_frames": 1234, "discount": 0.9, "metrics": {}}
-    torch.manual_seed(0)
-    model = WorldModel(MODEL, action_dim=1)
-    save_checkpoint(folder / "checkpoints" / "best", model, Config(env=ENV, model=MODEL, planner=PLANNER), info)
-    return folder
-
-
-@pytest.fixture(scope="module")
-def checkpoint(run_folder):
-    return run_folder / "checkpoints" / "best"
+from tests.commands.conftest import CONFIG
 
 
 def run(checkpoint, *flags):
-    return evaluate.main(["--checkpoint", str(checkpoint), "--device", "cpu", *map(str, flags)])
+    return main(["eval", "--checkpoint", str(checkpoint), "--device", "cpu", *map(str, flags)])
 
 
 def result_of(tmp_path, checkpoint, *flags):
@@ -50,20 +34,27 @@ def result_of(tmp_path, checkpoint, *flags):
     return json.loads((tmp_path / "result.json").read_text())
 
 
-def error_line(capsys, *flags, code=2):
-    assert evaluate.main([str(flag) for flag in flags]) == code
-    captured = capsys.readouterr()
-    assert captured.out == ""
-    assert captured.err.startswith("error: ")
-    assert captured.err.count("\n") == 1
-    return captured.err
+def count_frames(film):
+    capture, count = cv2.VideoCapture(str(film)), 0
+    while capture.grab():
+        count += 1
+    return count, capture.get(cv2.CAP_PROP_FRAME_WIDTH)
+
+
+@pytest.fixture(scope="module")
+def returns(checkpoint, tmp_path_factory):
+    """Returns of two episodes that the agent plays with default settings."""
+    return result_of(tmp_path_factory.mktemp("plain"), checkpoint, "--episodes", 2)["returns"]
 
 
 @pytest.mark.parametrize("mode", ["planner", "gated", "background", "actor", "random"])
-def test_results_hold_the_promised_keys(tmp_path, checkpoint, mode):
+def test_eval_prints_and_writes_what_it_promises(tmp_path, checkpoint, mode, capsys):
     result = result_of(tmp_path, checkpoint, "--mode", mode, "--episodes", 2, "--seed", 5)
     promised = {"domain", "task", "mode", "seed", "returns", "mean_return", "ci95", "decision_ms"}
-    assert {*promised, "env_frames_trained"} <= result.keys()
+    assert {*promised, "env_frames_trained"} <= result.keys() and "surprised" not in result
+    printed = capsys.readouterr().out
+    for words in ("mean return", "95 % interval", "p50", "p95", "p99", "cartpole-swingup", mode):
+        assert words in printed
     assert (result["domain"], result["task"], result["mode"], result["seed"]) == ("cartpole", "swingup", mode, 5)
     assert result["env_frames_trained"] == 1234
     assert len(result["returns"]) == result["episodes"] == 2
@@ -77,73 +68,41 @@ def test_results_hold_the_promised_keys(tmp_path, checkpoint, mode):
         assert sources["plan" if mode == "planner" else "actor"] == 20
     elif mode == "gated":
         assert sources["plan"] >= 2 and sources["tail"] == 0  # an episode's first decision is planned
+        assert fraction <= 0.3  # the budget of a gated agent unless another is given
 
 
-def test_the_same_call_gives_the_same_returns(tmp_path, checkpoint):
-    first, second, other = (
-        result_of(tmp_path, checkpoint, "--episodes", 1, "--seed", seed)["returns"] for seed in (0, 0, 1)
-    )
-    assert first == second != other
+def test_returns_depend_on_seed_and_episode_alone(tmp_path, run_folder, returns):
+    flags = ("--episodes", 1, "--threads", 1)  # a run folder stands for its best checkpoint
+    film = tmp_path / "film.mp4"
+    assert result_of(tmp_path, run_folder, *flags, "--video", film)["returns"] == returns[:1]
+    assert result_of(tmp_path, run_folder, *flags, "--seed", 1)["returns"] != returns[:1]
+    count, width = count_frames(film)
+    assert count == 11 and width >= 2 * 256  # ten decisions and the last frame, beside what the plan imagines
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["film.mp4", "result.json"]
 
 
-def test_more_episodes_leave_the_first_ones_as_they_were(tmp_path, checkpoint):
-    one, two = (result_of(tmp_path, checkpoint, "--episodes", count)["returns"] for count in (1, 2))
-    assert one == two[:1]
+def test_film_of_an_agent_that_plans_nothing_holds_every_decision(tmp_path, checkpoint):
+    assert run(checkpoint, "--episodes", 1, "--mode", "random", "--video", tmp_path / "film.webm") == 0
+    assert count_frames(tmp_path / "film.webm")[0] == 11
 
 
-def test_a_run_folder_means_its_best_checkpoint(tmp_path, run_folder, checkpoint):
-    flags = ("--episodes", 1, "--mode", "actor")
-    assert result_of(tmp_path, run_folder, *flags)["returns"] == result_of(tmp_path, checkpoint, *flags)["returns"]
+def test_planner_flags_replace_settings_of_the_checkpoint(tmp_path, checkpoint):
+    flags = ("--planner.horizon", 1, "--planner.terminal_value", "false", "--planner.deadline_ms", 5)
+    planner = result_of(tmp_path, checkpoint, "--episodes", 1, "--mode", "gated", *flags)["planner"]
+    assert (planner["horizon"], planner["terminal_value"], planner["deadline_ms"]) == (1, False, 5.0)
+    assert planner["num_samples"] == CONFIG.planner.num_samples
 
 
-def test_planner_settings_replace_those_of_the_checkpoint(tmp_path, checkpoint):
-    flags = ("--episodes", 1, "--planner.horizon", 1, "--planner.terminal_value", "false")
-    planner = result_of(tmp_path, checkpoint, *flags)["planner"]
-    assert (planner["horizon"], planner["terminal_value"], planner["num_samples"]) == (1, False, PLANNER.num_samples)
-
-
-@pytest.mark.parametrize("mode", ["planner", "gated"])
-def test_a_deadline_can_be_given(tmp_path, checkpoint, mode):
-    result = result_of(tmp_path, checkpoint, "--episodes", 1, "--mode", mode, "--planner.deadline_ms", 5)
-    assert result["planner"]["deadline_ms"] == 5.0
-
-
-def test_a_gated_agent_plans_no_more_than_it_may(tmp_path, checkpoint):
-    for budget, fraction in ((0, 0.1), (0.5, 0.5), (1, 1.0)):  # the first of ten is planned whatever is allowed
+def test_gated_agent_plans_its_budget(tmp_path, checkpoint):
+    for budget, fraction in ((0, 0.1), (1, 1.0)):  # the first of ten decisions is planned whatever the budget is
         result = result_of(tmp_path, checkpoint, "--episodes", 1, "--mode", "gated", "--planning-budget", budget)
-        assert 0.1 <= result["planned_fraction"] <= fraction
-        assert budget == 0.5 or result["planned_fraction"] == fraction
+        assert result["planned_fraction"] == fraction
 
 
-def test_mean_interval_and_latency_are_printed(capsys, checkpoint):
-    assert run(checkpoint, "--episodes", 2, "--mode", "random") == 0
-    out = capsys.readouterr().out
-    for words in ("mean return", "95 % interval", "p50", "p95", "p99", "cartpole-swingup", "random"):
-        assert words in out
-
-
-@pytest.mark.parametrize("mode", ["planner", "random"])
-def test_the_film_holds_every_decision_and_the_end(tmp_path, checkpoint, mode):
-    path = tmp_path / "film.mp4"
-    assert run(checkpoint, "--episodes", 2, "--mode", mode, "--video", path) == 0
-    capture, count = cv2.VideoCapture(str(path)), 0
-    while capture.grab():
-        count += 1
-    assert count == 11  # ten decisions and what they led to
-    assert capture.get(cv2.CAP_PROP_FRAME_WIDTH) >= 2 * 256
-    assert [entry.name for entry in tmp_path.iterdir()] == ["film.mp4"]
-
-
-def test_filming_changes_no_return(tmp_path, checkpoint):
-    plain = result_of(tmp_path, checkpoint, "--episodes", 1)
-    filmed = result_of(tmp_path, checkpoint, "--episodes", 1, "--video", tmp_path / "film.mp4")
-    assert plain["returns"] == filmed["returns"]
-
-
-def test_evaluate_agent_pairs_agents_by_episode():
-    env = make_env(ENV)
+def test_evaluate_agent_repeats_with_the_same_seed():
+    env = make_env(CONFIG.env)
     try:
-        first, again = (evaluate_agent(RandomAgent(1), env, seed=3, episodes=3) for _ in range(2))
+        first, again = (evaluate_agent(RandomAgent(1), env, seed=3, episodes=1) for _ in range(2))
     finally:
         env.close()
     assert first["returns"] == again["returns"]
@@ -157,7 +116,7 @@ def test_evaluate_agent_pairs_agents_by_episode():
         (("--device", "cud"), ("'cud'", "'cuda'")),
         (("--planner.horizn", "3"), ("--planner.horizn", "--planner.horizon")),
         (("--episods", "3"), ("--episods", "--episodes")),
-        (("--episodes", "0"), ("--episodes", "at least 1", "'0'")),
+        (("--episodes", "0"), ("--episodes", "at least 1", "got 0")),
         (("--episodes", "ten"), ("--episodes", "whole number", "'ten'")),
         (("--seed", "-1"), ("--seed", "at least 0")),
         (("--planner.deadline_ms", "0"), ("planner.deadline_ms", "above 0")),
@@ -165,111 +124,101 @@ def test_evaluate_agent_pairs_agents_by_episode():
         (("--planner.num_elites", "9"), ("num_elites (9)", "num_samples (8)")),
         (("--mode", "actor", "--planner.horizon", "3"), ("--planner.horizon", "--mode planner")),
         (("--planning-budget", "0.5"), ("--planning-budget", "--mode gated")),
-        (("--mode", "gated", "--planning-budget", "30%"), ("--planning-budget", "0 to 1", "'30%'")),
+        (("--mode", "gated", "--planning-budget", "30%"), ("--planning-budget", "a finite number or null", "'30%'")),
         (("--video", "film.avi"), (".mp4", "'film.avi'")),
         (("--json",), ("--json", "value")),
         (("--json", "a.mp4", "--video", f"../{Path.cwd().name}/a.mp4"), ("--video and --json", "same file")),
-        (("--threads", "1000000000000"), ("--threads", "1 to 1024")),
+        (("--mode", "gated", "--planning-budget", "1.5"), ("--planning-budget", "[0.0, 1.0]", "1.5")),
+        (("--threads", "1000000000000"), ("--threads", "[1, 1024]")),
         (("--objective", "1e200 * 1e200 * cart > 1"), ("1e+200 * 1e+200", "not finite")),
         (("--constraint", "cart < 1e308 * 1e308"), ("not finite",)),
     ],
 )
-def test_bad_flags_get_one_line_that_names_them(capsys, checkpoint, flags, words):
-    line = error_line(capsys, "--checkpoint", checkpoint, *flags)
-    assert all(word in line for word in words), line
+def test_eval_refuses_bad_flags_in_one_line(assert_refused, checkpoint, flags, words):
+    assert_refused(["eval", "--checkpoint", checkpoint, *flags], *words)
 
 
-def test_the_checkpoint_must_be_given(capsys):
-    assert "--checkpoint" in error_line(capsys, "--episodes", "1")
-
-
-def test_a_missing_checkpoint_is_told_what_there_is(capsys, checkpoint):
-    line = error_line(capsys, "--checkpoint", checkpoint.with_name("bets"))
-    assert "bets" in line
-    assert str(checkpoint) in line
+def test_eval_refuses_a_missing_checkpoint(assert_refused, checkpoint):
+    assert_refused(["eval", "--episodes", "1"], "flag --checkpoint is missing; give the folder of a trained agent")
+    assert_refused(["eval", "--checkpoint", checkpoint.with_name("bets")], "bets", checkpoint)
 
 
 @pytest.mark.parametrize("foreign", ["empty", "unreadable", "another"])
-def test_a_foreign_checkpoint_is_one_line(capsys, tmp_path, foreign):
+def test_eval_refuses_a_foreign_checkpoint(assert_refused, tmp_path, foreign):
     if foreign != "empty":
         (tmp_path / "weights.safetensors").write_bytes(b"no weights")
         (tmp_path / "info.json").write_text("{" if foreign == "unreadable" else '{"architectures": ["Bert"]}')
-    assert str(tmp_path) in error_line(capsys, "--checkpoint", tmp_path)
+    assert_refused(["eval", "--checkpoint", tmp_path], tmp_path)
 
 
-def test_an_agent_of_the_users_own_environment_is_played_from_python(capsys, tmp_path, checkpoint):
+@pytest.mark.parametrize("planner", [{"horizons": 3}, {"start": "policy"}, {"start": "shifted"}])
+def test_eval_loads_settings_of_an_earlier_version_where_they_mean_the_same(
+    assert_refused, tmp_path, checkpoint, planner
+):
+    shutil.copytree(checkpoint, tmp_path / "old")
+    info = json.loads((checkpoint / "info.json").read_text())
+    info["config"]["planner"].update(planner)
+    (tmp_path / "old" / "info.json").write_text(json.dumps(info))
+    flags = ["--episodes", "1", "--mode", "random"]
+    if planner == {"start": "shifted"}:
+        assert run(tmp_path / "old", *flags) == 0
+    else:
+        reason = "unknown setting planner.horizons" if "horizons" in planner else "a search starts from the shifted"
+        assert_refused(["eval", "--checkpoint", tmp_path / "old", *flags], "settings of another version", reason)
+
+
+def test_eval_refuses_an_agent_of_the_users_own_environment(assert_refused, tmp_path, checkpoint):
     model, config, info = load_model(checkpoint)
     own = replace(config, env=replace(config.env, domain=USER_DOMAIN, task="Dot"))
     save_checkpoint(tmp_path / "own", model, own, info)
-    assert "load_agent" in error_line(capsys, "--checkpoint", tmp_path / "own")
+    assert_refused(["eval", "--checkpoint", tmp_path / "own"], "load_agent")
 
 
-def test_a_search_that_finds_nothing_finite_is_told(capsys, checkpoint, monkeypatch):
+def test_eval_warns_when_a_search_finds_nothing_finite(capsys, checkpoint, monkeypatch):
     monkeypatch.setattr(WorldModel, "rollout", lambda self, state, actions: (actions[..., 0] * torch.nan, state))
     assert run(checkpoint, "--episodes", "1") == 0
     assert "at 10 decisions the search found nothing finite" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("flags", [[], ["--control-hz", 1]])
-def test_what_surprised_the_model_is_no_failed_search(capsys, tmp_path, checkpoint, flags):
+def test_eval_reports_surprised_decisions_apart_from_failed_searches(capsys, tmp_path, checkpoint, flags):
     result = result_of(tmp_path, checkpoint, "--episodes", 1, "--planner.surprise_limit", 1e-9, *flags)
     assert result["surprised"] == result["action_source"]["actor"] == 10
     told = capsys.readouterr()
     assert "surprised    10 of 10 decisions" in told.out and told.err == ""
-    assert "surprised" not in result_of(tmp_path, checkpoint, "--episodes", 1)
 
 
 @pytest.mark.parametrize(("objective", "limit"), [("return", 1e-9), ("return; 5: 2", 1e-9), ("2", None)])
-def test_the_result_tells_whether_surprise_was_heeded(tmp_path, checkpoint, objective, limit):
+def test_result_names_the_surprise_limit_only_where_it_is_used(tmp_path, checkpoint, objective, limit):
     flags = ["--episodes", 1, "--planner.surprise_limit", 1e-9, "--objective", objective]
     result = result_of(tmp_path, checkpoint, *flags)
     assert result["planner"]["surprise_limit"] == limit
     assert (result["surprised"] > 0) == (limit is not None)
 
 
-def test_a_name_that_is_too_long_is_one_line(capsys, checkpoint):
+def test_eval_refuses_names_that_are_too_long(assert_refused, checkpoint):
     for flags in (["--checkpoint", "a" * 300], ["--checkpoint", checkpoint, "--json", "a" * 300]):
-        assert "too long" in error_line(capsys, *flags)
+        assert_refused(["eval", *flags], "too long")
 
 
 @pytest.mark.parametrize("flag", ["--video", "--json"])
-def test_output_paths_are_tried_before_anything_is_played(capsys, tmp_path, checkpoint, flag):
+def test_eval_tries_outputs_before_it_plays(assert_refused, tmp_path, checkpoint, flag):
     name = {"--video": "film.mp4", "--json": "result.json"}[flag]
-    line = error_line(capsys, "--checkpoint", checkpoint, flag, tmp_path / "no" / "where" / name)
-    assert f"nearest that exists is '{tmp_path}'" in line
+    where = ["eval", "--checkpoint", checkpoint, flag]
+    assert_refused([*where, tmp_path / "no" / "where" / name], flag, f"nearest that exists is '{tmp_path}'")
     (tmp_path / name).mkdir()
-    assert "is a folder" in error_line(capsys, "--checkpoint", checkpoint, flag, tmp_path / name)
+    assert_refused([*where, tmp_path / name], "is a folder")
+    assert_refused([*where, f"/proc/{name}"], "cannot write in '/proc'")
 
 
-def test_a_result_goes_where_a_link_leads(tmp_path, checkpoint):
+def test_result_goes_where_a_link_leads(tmp_path, checkpoint):
     (tmp_path / "link.json").symlink_to("target.json")
     assert run(checkpoint, "--episodes", 1, "--json", tmp_path / "link.json") == 0
     assert (tmp_path / "link.json").is_symlink()
     assert json.loads((tmp_path / "target.json").read_text())["episodes"] == 1
 
 
-def test_a_folder_that_cannot_be_written_is_named(tmp_path):
-    with pytest.raises(UserError, match="cannot write in '/proc'"):
-        evaluation_request.parse_arguments(["--checkpoint", str(tmp_path), "--json", "/proc/result.json"])
-
-
-def test_help_lists_the_flags_without_torch_or_simulator(run_python, root):
-    code = (
-        "import runpy, sys\n"
-        "sys.argv = ['eval.py', '--help']\n"
-        "try: runpy.run_path(sys.path.pop(), run_name='__main__')\n"
-        "except SystemExit as stop: print('code', stop.code)\n"
-        "print('loaded', sorted({'torch', 'lightning', 'mujoco', 'cv2', 'gymnasium', 'numpy'} & set(sys.modules)))\n"
-    )
-    script = root / "scripts" / "eval.py"
-    result = run_python("-c", f"import sys; sys.path.append({str(script)!r})\n{code}")
-    assert "code 0" in result.stdout, result.stderr
-    assert "loaded []" in result.stdout
-    for flag in (*evaluation_request.FLAGS, "--planner.horizon", "--planner.num_policy_samples"):
-        assert flag in result.stdout
-
-
-def test_an_interrupt_reports_what_was_measured(root, tmp_path, checkpoint):
+def test_interrupt_reports_the_finished_episodes(root, tmp_path, checkpoint):
     script, out = root / "scripts" / "eval.py", tmp_path / "result.json"
     command = [sys.executable, script, "--checkpoint", checkpoint, "--episodes", "100000", "--json", out]
     process = subprocess.Popen(

@@ -1,10 +1,11 @@
-"""The command line of learning goals: one line for every mistake, and an answer at once."""
+"""`latentplan goals`: what its command line asks for, and errors of one line."""
 
 import dataclasses
 
 import pytest
 
-from latentplan.commands import goals as learn_goals
+from latentplan.commands.flags import read_request
+from latentplan.commands.goals import Request
 from latentplan.config import GoalsConfig
 
 
@@ -19,46 +20,20 @@ from latentplan.config import GoalsConfig
         (("--checkpoint", "nothing", "--minutes", "nan"), ("--minutes", "number", "'nan'")),
         (("--checkpoint", "nothing", "--minutes", "-1"), ("--minutes", "above 0")),
         (("--checkpoint", "nothing", "--entropy-scale", "-1"), ("--entropy-scale ", "at least 0")),
-        (("--checkpoint", "nothing", "--threads", "0"), ("--threads", "at least 1")),
+        (("--checkpoint", "nothing", "--threads", "0"), ("--threads", "[1, 1024]", "got 0")),
         (("--checkpoint", "nothing", "--device", "cud"), ("'cud'", "'cuda'")),
         (("--resume", "nothing"), ("nothing to resume in nothing",)),
         (("--resume", "nothing", "--starts", "3"), ("--starts", "--updates")),
     ],
 )
-def test_mistakes_are_one_line(flags, words, capsys):
-    assert learn_goals.main(list(flags)) == 2
-    captured = capsys.readouterr()
-    assert captured.err.startswith("error: ") and captured.err.count("\n") == 1
-    assert all(word in captured.err for word in words), captured.err
+def test_goals_refuses_bad_flags_in_one_line(flags, words, assert_refused):
+    assert_refused(["goals", *flags], *words)
 
 
-def test_every_setting_has_a_flag_of_its_type():
+def test_goals_has_a_flag_for_every_setting():
     fields = {field.name: field.default for field in dataclasses.fields(GoalsConfig)}
-    flags = [word for name in fields for word in (f"--{name.replace('_', '-')}", "1")]
-    settings = learn_goals.parse_arguments(["--checkpoint", "x", *flags]).settings
+    argv = [word for name in fields for word in (f"--{name.replace('_', '-')}", "1")]
+    settings = read_request(Request, ["--checkpoint", "x", *argv]).settings
     assert settings.keys() == fields.keys()
     for name, default in fields.items():
         assert type(settings[name]) is type(default if default is not None else 1.0)
-
-
-def test_help_lists_the_flags_without_torch(run_python, root):
-    code = (
-        "import runpy, sys\n"
-        f"sys.argv = [{str(root / 'scripts' / 'goals.py')!r}, '--help']\n"
-        "try: runpy.run_path(sys.argv[0], run_name='__main__')\n"
-        "except SystemExit as stop: print('code', stop.code)\n"
-        "print('loaded', sorted({'torch', 'lightning', 'mujoco', 'gymnasium', 'numpy'} & set(sys.modules)))\n"
-    )
-    result = run_python("-c", code)
-    assert "code 0" in result.stdout and "loaded []" in result.stdout, result.stderr
-    for flag in (
-        "--checkpoint",
-        "--updates",
-        "--starts",
-        "--minutes",
-        "--out",
-        "--seed",
-        "--resume",
-        "--device",
-    ):
-        assert f"  {flag} " in result.stdout

@@ -1,4 +1,4 @@
-"""Settings: one source of seeds, an exact round trip, and names in every error."""
+"""Settings: their checks, derived seeds, and the round trip through plain dictionaries."""
 
 import dataclasses
 import hashlib
@@ -30,27 +30,21 @@ CHANGED = Config(
 
 
 @pytest.mark.parametrize("preset", ["cpu", "gpu", None])
-def test_the_latent_has_32_dimensions_in_every_preset(preset):
+def test_every_preset_has_a_latent_of_32_dimensions(preset):
     config = Config() if preset is None else compose({}, {}, preset)
     assert config.model.latent_dim == 32
 
 
-def test_a_run_from_python_learns_as_one_from_the_command_line_does():
-    composed = compose({}, {"env": {"domain": "fish"}}, "cpu")  # a domain without a file of its own
-    for section in ("model", "planner", "learning", "collection", "replay", "evaluation"):
-        assert getattr(Config(), section) == getattr(composed, section)
-
-
 @pytest.mark.parametrize("config", [Config(), CHANGED, compose({}, {}, "cpu"), compose({}, {}, "gpu")])
-def test_settings_survive_plain_dictionaries(config):
+def test_from_dict_inverts_to_dict(config):
     assert from_dict(to_dict(config)) == config
 
 
-def test_absent_settings_take_their_defaults():
+def test_from_dict_takes_defaults_for_absent_settings():
     assert from_dict({"planner": {"horizon": 3}}) == Config(planner=PlannerConfig(horizon=3))
 
 
-def test_unknown_settings_are_named():
+def test_from_dict_names_unknown_settings():
     with pytest.raises(ValueError, match="'plnner'"):
         from_dict({"plnner": {}})
     with pytest.raises(ValueError, match="planner.horizn"):
@@ -71,34 +65,34 @@ def test_unknown_settings_are_named():
         (ModelConfig, "encoder_channels", ()),
     ],
 )
-def test_a_bad_value_names_its_field(kind, name, value):
+def test_config_names_the_field_of_a_bad_value(kind, name, value):
     with pytest.raises(ValueError, match=name):
         kind(**{name: value})
 
 
-def test_episodes_too_short_to_learn_from_are_refused():
+def test_config_refuses_collected_episodes_shorter_than_a_sequence():
     Config(collection=CollectionConfig(episode_decisions=16))
     with pytest.raises(ValueError, match=r"episode_decisions \(15\) must be at least 16, learning.sequence_length"):
         Config(collection=CollectionConfig(episode_decisions=15))
 
 
-def test_settings_cannot_be_written_to():
+def test_config_is_frozen():
     with pytest.raises(dataclasses.FrozenInstanceError):
         Config().planner.horizon = 3
 
 
-def test_a_derived_seed_is_a_digest_of_run_stream_and_counter():
+def test_derive_seed_is_a_digest_of_seed_name_and_counter():
     expected = int.from_bytes(hashlib.sha256(b"3/replay/7").digest()[:4], "little") >> 1
     assert derive_seed(3, "replay", 7) == expected
     assert 0 <= expected < 2**31
 
 
-def test_streams_of_a_run_differ():
+def test_derive_seed_differs_between_seeds_names_and_counters():
     seeds = {derive_seed(seed, name, count) for seed in (0, 1) for name in ("a", "b") for count in (0, 1)}
     assert len(seeds) == 8
 
 
-def test_a_horizon_that_is_given_holds_for_goals_too():
+def test_override_planner_uses_a_given_horizon_for_goals_too():
     trained = {"horizon": 5, "goal_horizon": 20, "num_samples": 64}
     assert override_planner(trained, {"num_samples": 8}) == trained | {"num_samples": 8}
     assert override_planner(trained, {"horizon": 9}) == trained | {"horizon": 9, "goal_horizon": None}

@@ -1,4 +1,4 @@
-"""Outputs are refused before any work is spent on them where they cannot go."""
+"""Files to be written are checked before any work is spent on their content."""
 
 import os
 
@@ -7,25 +7,25 @@ import pytest
 from latentplan.config import UserError, output_file
 
 
-def test_a_file_beside_others_is_where_it_goes(tmp_path):
+def test_output_file_returns_the_path_and_leaves_nothing(tmp_path):
     assert output_file(tmp_path / "result.json", "--json") == tmp_path / "result.json"
     assert not list(tmp_path.iterdir())
 
 
-def test_a_link_leads_to_where_it_goes(tmp_path):
+def test_output_file_returns_the_target_of_a_link(tmp_path):
     (tmp_path / "link.json").symlink_to("target.json")
     assert output_file(tmp_path / "link.json", "--json") == tmp_path / "target.json"
 
 
 @pytest.mark.parametrize("target", ["link.json", "no/where.json"])
-def test_a_link_that_leads_nowhere_is_refused(tmp_path, target):
+def test_output_file_refuses_links_that_lead_nowhere(tmp_path, target):
     (tmp_path / "link.json").symlink_to(target)
     with pytest.raises(UserError, match="--json .*link.json' is a link that leads nowhere"):
         output_file(tmp_path / "link.json", "--json")
 
 
-def test_what_is_no_file_is_not_replaced(tmp_path):
+def test_output_file_refuses_what_is_not_a_regular_file(tmp_path):
     os.mkfifo(tmp_path / "pipe")
-    with pytest.raises(UserError, match="is not a file"):
+    with pytest.raises(UserError, match="is not a regular file"):
         output_file(tmp_path / "pipe", "--json")
     assert (tmp_path / "pipe").is_fifo()

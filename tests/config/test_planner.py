@@ -2,10 +2,8 @@
 
 import json
 
-import pytest
-
-from latentplan.config import Config, PlannerConfig, from_dict
-from latentplan.config.planner import REMOVED, drop_removed
+from latentplan.config import PlannerConfig, from_dict
+from latentplan.config.removed import drop_removed
 
 
 def test_from_dict_loads_the_planner_settings_of_every_shipped_checkpoint(root):
@@ -14,18 +12,9 @@ def test_from_dict_loads_the_planner_settings_of_every_shipped_checkpoint(root):
     for path in paths:
         saved = json.loads(path.read_text())["config"]
         planner = from_dict(saved).planner
-        kept = {name: value for name, value in saved["planner"].items() if name not in REMOVED}
+        kept = drop_removed("planner", saved["planner"])
         assert {name: getattr(planner, name) for name in kept} == kept
         assert planner.method == "cem"
-
-
-@pytest.mark.parametrize("name", REMOVED)
-def test_removed_field_is_refused_with_advice_when_it_has_another_value(name):
-    accepted, advice = REMOVED[name]
-    assert drop_removed({name: accepted, "horizon": 5}) == {"horizon": 5}
-    assert from_dict({"planner": {name: accepted}}) == Config()
-    with pytest.raises(ValueError, match=f"{name} 'policy' is no longer supported: {advice}"):
-        from_dict({"planner": {name: "policy"}})
 
 
 def test_planner_config_has_the_effect_of_the_values_that_older_runs_spelled_out():

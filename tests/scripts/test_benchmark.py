@@ -1,6 +1,7 @@
 """`scripts/benchmark.py`: command line, statistics, tables, and the commands train, decide, render, compile, ablate."""
 
 import csv
+import importlib
 import json
 from dataclasses import replace
 
@@ -19,6 +20,7 @@ from bench.train_update import PARTS, measure_graph, measure_update
 
 from latentplan.agents.actor import ActorAgent
 from latentplan.agents.planning import PlanningAgent
+from latentplan.commands.flags import list_flags
 from latentplan.config import PlannerConfig, UserError
 from latentplan.models import WorldModel
 
@@ -55,6 +57,7 @@ def ablated(tmp_path, checkpoint, arms, *flags):
         (["learn", "--tasks", "walkr-walk"], "'walker'"),
         (["learn", "--frames", "many"], "frames"),
         (["learn", "--seeds", "0,-1"], "--seeds"),
+        (["learn", "--seeds", "0,one"], "--seeds must be whole numbers, separated by ',', got '0,one'"),
     ],
 )
 def test_main_refuses_bad_flags_in_one_line_that_names_the_flag(capsys, arguments, named):
@@ -69,10 +72,28 @@ def test_main_refuses_bad_flags_in_one_line_that_names_the_flag(capsys, argument
 def test_help_lists_every_command_and_every_flag(capsys):
     assert benchmark.main([]) == 0
     overview = capsys.readouterr().out
-    for command in benchmark.COMMANDS:
-        assert command in overview
-        assert benchmark.main([command, "--help"]) == 0
-        assert "  --" in capsys.readouterr().out
+    for name, command in benchmark.COMMANDS.items():
+        assert f"  {name} " in overview and command.summary in overview
+        assert benchmark.main([name, "--help-all"]) == 0
+        text = capsys.readouterr().out
+        for flag in list_flags(importlib.import_module(command.module).Request):
+            assert f"  {flag.names[0]} " in text and flag.setting.meaning
+
+
+def test_every_flag_of_the_benchmarks_keeps_its_default():
+    found = {
+        name: {
+            flag.names[0]: flag.setting.default
+            for flag in list_flags(importlib.import_module(command.module).Request)
+            if "." not in flag.names[0]
+        }
+        for name, command in benchmark.COMMANDS.items()
+    }
+    assert found["train"].items() >= {"--updates": 20, "--domain": None, "--threads": None}.items()
+    assert found["plan"].items() >= {"--samples": 500, "--horizon": 20, "--iterations": 5, "--plans": 30}.items()
+    assert found["soak"].items() >= {"--control-hz": 50.0, "--decisions": 10_000, "--block": 250}.items()
+    assert found["learn"].items() >= {"--seeds": (0, 1), "--thresholds": (250, 500, 750), "--mode": "planner"}.items()
+    assert found["decide"].items() >= {"--batch": 1, "--decisions": 50, "--checkpoint": None}.items()
 
 
 def test_format_table_aligns_columns_and_marks_missing_values():

@@ -85,7 +85,7 @@ def test_check_same_refuses_a_folder_with_other_settings(tmp_path):
 )
 def test_request_refuses_settings_that_its_own_flags_set(tmp_path, capsys, flag, own):
     assert benchmark.main(["learn", flag, "5", "--out", str(tmp_path / "out")]) == 2
-    assert f"{flag} is what {own} says here" in capsys.readouterr().err
+    assert f"{own} sets {flag} here" in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
 
 

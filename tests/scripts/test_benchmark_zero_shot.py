@@ -1,6 +1,7 @@
 """`benchmark.py zero-shot`: goals that an agent was not trained for, played by every agent."""
 
 import json
+from pathlib import Path
 
 import benchmark
 import numpy as np
@@ -13,6 +14,7 @@ from bench.zero_shot import (
     PUSH_PROBABILITY,
     Conditions,
     Job,
+    Request,
     list_jobs,
     play_job,
 )
@@ -91,7 +93,7 @@ def test_plain_gate_acts_by_the_actor_between_plans(checkpoint):
 
 
 def test_list_jobs_lists_each_goal_once_in_order():
-    jobs = list_jobs({"--objectives": "cart > 1; 500: cart < 1 | upright | upright |"})
+    jobs = list_jobs(Request(checkpoint=Path("agent"), objectives="cart > 1; 500: cart < 1 | upright | upright |"))
     assert [job.objective for job in jobs[:: len(OBJECTIVE_PLAYERS)]] == ["cart > 1; 500: cart < 1", "upright"]
 
 

@@ -28,7 +28,7 @@ from latentplan.agents.base import ModelAgent
 from latentplan.agents.checkpoint import load_model, read_info, resolve_checkpoint, save_checkpoint
 from latentplan.agents.planning import PlanningAgent
 from latentplan.config import USER_DOMAIN, DistillConfig, PlannerConfig, UserError, derive_seed, to_dict
-from latentplan.config.planner import drop_removed
+from latentplan.config.removed import drop_removed
 from latentplan.envs import make_env, make_from
 from latentplan.evaluation.episodes import OnStep, Step, episode_seed, iterate_episodes
 from latentplan.evaluation.statistics import confidence_interval
@@ -104,7 +104,7 @@ def resume_distillation(
         raise UserError(f"{saved['source']} is not the agent from which the distillation in {folder} started")
     settings = DistillConfig(**saved["settings"])
     settings = replace(settings, rounds=rounds or settings.rounds, minutes=minutes or settings.minutes)
-    planner = PlannerConfig(**drop_removed(saved["planner"]))
+    planner = PlannerConfig(**drop_removed("planner", saved["planner"]))
     run = _Distillation(Path(saved["source"]), Path(folder), settings, planner, device, make_env)
     run.load(saved)
     return run.run()

@@ -9,8 +9,6 @@ from latentplan.config import LearningConfig
 from latentplan.training.learner.losses import world_model_loss
 from latentplan.training.learner.registry import BEHAVIOUR_LOSSES, WORLD_MODEL_LOSSES, register
 
-REMOVED = {"imitation_scale"}  # until config/learning.py drops the setting
-
 
 def stream():
     return torch.Generator().manual_seed(0)
@@ -20,7 +18,7 @@ def test_every_scale_setting_weighs_a_loss():
     """`entropy_scale` weighs a term within the actor's loss; every other scale belongs to a registered loss."""
     settings = {field.name for field in dataclasses.fields(LearningConfig) if field.name.endswith("_scale")}
     used = {loss.scale for loss in (WORLD_MODEL_LOSSES | BEHAVIOUR_LOSSES).values()}
-    assert settings - REMOVED == (used - {None}) | {"entropy_scale"}
+    assert settings == (used - {None}) | {"entropy_scale"}
 
 
 def test_register_refuses_a_name_that_is_taken_and_a_scale_without_setting():

@@ -1,0 +1,33 @@
+"""`latentplan export`: write the actor as a program: frame, belief and last action in, action and belief out."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+from latentplan.config.parsing import option
+
+
+@dataclass(frozen=True)
+class Request:
+    """What the command line of an export asks for.
+
+    Attributes:
+        checkpoint: Folder of a trained agent, or of a run (its best checkpoint).
+        out: File to write.
+        format: Program of `torch.export`, or ONNX where onnx and onnxscript are installed.
+    """
+
+    checkpoint: Path = option(metavar="DIR")
+    out: Path = option(metavar="FILE")
+    format: Literal["pt2", "onnx"] = "pt2"
+
+
+def run(request: Request) -> int:
+    """Write the program, print its size and return the exit code."""
+    from latentplan.agents.export import export_actor
+
+    path = export_actor(request.checkpoint, request.out, request.format)
+    print(f"wrote {path} ({path.stat().st_size / 2**20:.1f} MiB)")
+    return 0

@@ -1,0 +1,134 @@
+"""The command `latentplan`: its table of commands, help, versions, printed settings and completion."""
+
+import re
+import subprocess
+import sys
+
+import pytest
+import yaml
+
+from latentplan import __version__
+from latentplan.commands.completion import SHELLS
+from latentplan.commands.flags import GENERAL_FLAGS
+from latentplan.commands.main import COMMANDS, main
+from latentplan.config import DistillConfig
+
+HEAVY = "{'torch', 'lightning', 'mujoco', 'dm_control', 'gymnasium', 'cv2', 'numpy'}"
+
+
+@pytest.mark.parametrize("argv", [[], ["-h"], ["--help"]])
+def test_main_lists_every_command(argv, capsys):
+    assert main(argv) == 0
+    text = capsys.readouterr().out
+    for name, command in COMMANDS.items():
+        assert f"  {name} " in text and command.summary in text
+    assert "--help-all" in text and "--print-config" in text and "--print-completion" in text
+
+
+@pytest.mark.parametrize("argv", [["--version"], ["train", "--version"], ["doctor", "--version"]])
+def test_main_prints_the_version(argv, capsys):
+    assert main(argv) == 0
+    assert capsys.readouterr().out == f"latentplan {__version__}\n"
+
+
+@pytest.mark.parametrize(
+    ("argv", "expected"),
+    [
+        (["trian"], "unknown command 'trian'; did you mean 'train'?"),
+        (["qqq"], "unknown command 'qqq'; available: train, eval, distill, goals, export, doctor"),
+        (["--hel"], "unknown command '--hel'"),
+        (["doctor", "--fast"], "unknown flag '--fast'"),
+        (["export", "--out", "actor.pt2"], "flag --checkpoint is missing"),
+        (["export", "--checkpoint", "x", "--out", "a", "--format", "onxx"], "did you mean 'onnx'?"),
+        (["--print-completion", "fish"], "unknown shell 'fish'"),
+        (["--print-completion"], "unknown shell ''"),
+    ],
+)
+def test_main_refuses_unknown_commands_and_flags_in_one_line(argv, expected, capsys):
+    assert main(argv) == 2
+    captured = capsys.readouterr()
+    assert captured.out == "" and captured.err.startswith("error: ") and captured.err.count("\n") == 1
+    assert expected in captured.err
+
+
+def test_help_comes_before_errors_in_other_flags(capsys):
+    assert main(["eval", "--qqq", "--help"]) == 0
+    text = capsys.readouterr().out
+    assert all(f"  {flag} " in text for flag in ("--checkpoint", *GENERAL_FLAGS))
+    assert "--planner.horizon" not in text
+    assert main(["eval", "--help-all"]) == 0
+    assert "  --planner.horizon N " in capsys.readouterr().out
+
+
+def test_no_command_imports_heavy_libraries_before_it_runs(run_python):
+    code = (
+        "import sys\nfrom latentplan.commands.main import COMMANDS, main\n"
+        "for name in COMMANDS:\n"
+        "    assert main([name, '--help']) == main([name, '--help-all']) == 0\n"
+        "    assert main([name, '--no-such-flag', '3']) == 2\n"
+        "assert main(['train', '--domain', 'walkr']) == main(['train', '--planner.horizon', 'x']) == 2\n"
+        "assert main(['train', '--print-config']) == 0\n"
+        f"print('loaded', sorted({HEAVY} & set(sys.modules)))\n"
+    )
+    result = run_python("-c", code)
+    assert result.returncode == 0 and result.stdout.splitlines()[-1] == "loaded []", result.stderr
+
+
+@pytest.mark.parametrize("script", ["train", "eval", "distill", "goals"])
+def test_scripts_run_their_command_from_any_folder(script, run_python, root, tmp_path):
+    result = run_python(root / "scripts" / f"{script}.py", "--device", "cpuu", cwd=tmp_path)
+    assert (result.returncode, result.stdout) == (2, "")
+    assert result.stderr.startswith("error: ") and result.stderr.count("\n") == 1
+    assert "auto, cpu, cuda" in result.stderr or "did you mean" in result.stderr
+
+
+def test_package_runs_as_a_module_under_the_name_of_the_program(run_python):
+    result = run_python("-m", "latentplan", "export", "--help")
+    assert result.returncode == 0
+    assert result.stdout.startswith("usage: latentplan export --checkpoint DIR --out FILE [--name value ...]")
+
+
+def test_print_config_prints_the_resolved_settings_and_does_nothing_else(capsys, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert main(["train", "--domain", "cartpole", "--planner.horizon", "3", "--preset", "cpu", "--print-config"]) == 0
+    printed = yaml.safe_load(capsys.readouterr().out)
+    assert (printed["env"]["task"], printed["planner"]["horizon"]) == ("swingup", 3)
+    assert main(["distill", "--resume", "x", "--rounds", "3", "--print-config"]) == 0
+    printed = yaml.safe_load(capsys.readouterr().out)
+    assert (printed["resume"], printed["settings"]["rounds"]) == ("x", 3)
+    assert printed["settings"]["updates"] == DistillConfig().updates
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_print_config_output_is_a_config_file_that_gives_the_same_settings(capsys, tmp_path):
+    assert main(["train", "--domain", "reacher", "--frames", "1e4", "--preset", "cpu", "--print-config"]) == 0
+    (tmp_path / "config.yaml").write_text(first := capsys.readouterr().out)
+    assert main(["train", "--config", str(tmp_path / "config.yaml"), "--preset", "gpu", "--print-config"]) == 0
+    assert capsys.readouterr().out == first
+
+
+@pytest.mark.parametrize("shell", SHELLS)
+def test_print_completion_names_every_command_and_flag(shell, capsys):
+    pytest.importorskip("shtab")
+    assert main(["--print-completion", shell]) == main([f"--print-completion={shell}"]) == 0
+    text = capsys.readouterr().out
+    for word in (*COMMANDS, "--planner.horizon", "--run-dir", "--constraint", "background", "--help-all"):
+        assert re.search(rf"(?<![\w-]){re.escape(word)}(?![\w-])", text), word
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="needs bash")
+def test_bash_completion_completes_commands_flags_and_values(capsys):
+    pytest.importorskip("shtab")
+    assert main(["--print-completion", "bash"]) == 0
+    cases = {
+        "tr": "train",
+        "eval --mod": "--mode",
+        "eval --mode ba": "background",
+        "train --env.dom": "--env.domain",
+    }
+    script = capsys.readouterr().out
+    for line, expected in cases.items():
+        words = ["latentplan", *line.split()]
+        ask = f"COMP_WORDS=({' '.join(words)}); COMP_CWORD={len(words) - 1}; _shtab_latentplan; echo ${{COMPREPLY[@]}}"
+        result = subprocess.run(["bash", "-c", f"{script}\n{ask}"], capture_output=True, text=True)
+        assert result.stdout.split() == [expected], result.stderr

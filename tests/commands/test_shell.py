@@ -1,0 +1,79 @@
+"""Exit codes, errors of one line, and the device of a command."""
+
+import errno
+import subprocess
+import sys
+
+import pytest
+import torch
+
+from latentplan.commands.shell import ComputeRequest, run_guarded
+from latentplan.config import UserError
+
+
+@pytest.mark.parametrize(
+    ("error", "code", "line"),
+    [
+        (UserError("two\nlines"), 2, "error: two lines\n"),
+        (
+            FloatingPointError("the gradient is not finite\nat update 1"),
+            2,
+            "error: the gradient is not finite at update 1\n",
+        ),
+        (OSError(errno.ENAMETOOLONG, "too long", "a" * 300), 2, f"error: a file name is too long: {'a' * 80}...\n"),
+        (UserError("unicode \ud800 é"), 2, "error: unicode \\ud800 é\n"),
+        (KeyboardInterrupt(), 130, ""),
+    ],
+)
+def test_run_guarded_turns_errors_into_one_line_and_an_exit_code(error, code, line, capsys):
+    def fail(argv):
+        raise error
+
+    assert run_guarded(fail, []) == code
+    assert capsys.readouterr() == ("", line)
+
+
+@pytest.mark.parametrize("error", [ValueError("a bug"), OSError(errno.EIO, "disk")])
+def test_run_guarded_lets_bugs_through(error):
+    def fail(argv):
+        raise error
+
+    with pytest.raises(type(error)):
+        run_guarded(fail, [])
+
+
+@pytest.mark.parametrize("words", [["train.py", "--help"], ["benchmark.py"]])
+def test_scripts_end_silently_when_nobody_reads_their_output(words, root):
+    command = [sys.executable, str(root / "scripts" / words[0]), *words[1:]]
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+    process.stdout.close()
+    complaint = process.stderr.read()
+    assert (process.wait(), complaint) == (141, b"")
+
+
+def test_use_device_sets_the_given_threads_else_those_of_the_command():
+    before = torch.get_num_threads()
+    try:
+        assert ComputeRequest(device="cpu", threads=3).use_device(threads=2) == "cpu"
+        assert torch.get_num_threads() == 3
+        assert ComputeRequest(device="cpu").use_device(threads=2) == "cpu"
+        assert torch.get_num_threads() == 2
+        assert ComputeRequest(device="cpu").use_device() == "cpu"
+        assert torch.get_num_threads() == 2
+    finally:
+        torch.set_num_threads(before)
+
+
+def test_use_device_takes_cuda_where_it_is_usable(monkeypatch):
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    assert ComputeRequest().use_device() == "cpu"
+    with pytest.raises(UserError, match="device 'cuda' is not usable here; give --device cpu"):
+        ComputeRequest(device="cuda").use_device()
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    assert [ComputeRequest(device=name).use_device() for name in ("auto", "cuda", "cpu")] == ["cuda", "cuda", "cpu"]
+
+
+@pytest.mark.parametrize("threads", [0, 1025])
+def test_compute_request_refuses_thread_counts_out_of_range(threads):
+    with pytest.raises(ValueError, match=rf"threads must be in \[1, 1024\], got {threads}"):
+        ComputeRequest(threads=threads)

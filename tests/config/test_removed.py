@@ -1,0 +1,35 @@
+"""Settings that no longer exist: dropped where they had no effect, refused with advice elsewhere."""
+
+import pytest
+
+from latentplan.config import Config, UserError, from_dict, to_dict
+from latentplan.config.files import build_config, read_config, to_yaml
+from latentplan.config.removed import REMOVED, drop_removed
+
+
+@pytest.mark.parametrize("key", REMOVED)
+def test_drop_removed_drops_the_accepted_value_only(key):
+    section, name = key.split(".")
+    assert drop_removed(section, {name: REMOVED[key].accepted, "kept": 1}) == {"kept": 1}
+    with pytest.raises(UserError, match=f"{key} no longer exists, got 'other': {REMOVED[key].advice}"):
+        drop_removed(section, {name: "other"})
+
+
+@pytest.mark.parametrize("key", REMOVED)
+def test_saved_settings_load_when_the_removed_one_had_no_effect(key, tmp_path):
+    section, name = key.split(".")
+    assert name not in to_dict(Config())[section]
+    saved = to_dict(Config())
+    saved[section][name] = REMOVED[key].accepted
+    (tmp_path / "config.yaml").write_text(to_yaml(saved))
+    assert from_dict(saved) == build_config(saved) == read_config(tmp_path / "config.yaml") == Config()
+
+
+@pytest.mark.parametrize("key", REMOVED)
+def test_saved_settings_are_refused_with_advice_when_the_removed_one_had_an_effect(key, tmp_path):
+    section, name = key.split(".")
+    saved = {section: {name: 0.5}}
+    (tmp_path / "config.yaml").write_text(to_yaml(saved))
+    for load in (from_dict, build_config, lambda _: read_config(tmp_path / "config.yaml")):
+        with pytest.raises(UserError, match=REMOVED[key].advice):
+            load(saved)
