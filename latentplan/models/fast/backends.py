@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Hashable, Sequence
+from operator import attrgetter
 from typing import Any
 
 import torch
@@ -14,6 +15,10 @@ from latentplan.models.fast import compiled, one_frame, pointwise, unroll
 from latentplan.models.fast import rollout as rollouts
 from latentplan.models.world_model import WorldModel
 
+ROLLOUT_PARTS = ("dynamics", "reward_head", "value_head", "actor")
+FRAME_PARTS = ("encoder", "dynamics", "actor")
+_version_of = attrgetter("_version")  # a count of writes in place
+
 
 class ConvertedWeights:
     """A converted copy of some weights, made again when one of them was replaced or written to in place.
@@ -22,15 +27,13 @@ class ConvertedWeights:
     weights can hold pointers.
 
     Args:
-        parts: The modules of a model whose weights are converted.
+        parts: Names of the model's modules whose weights are converted.
         convert: Makes the converted weights of a model, with products in a dtype.
     """
 
-    def __init__(
-        self, parts: Callable[[WorldModel], tuple[nn.Module, ...]], convert: Callable[[WorldModel, torch.dtype], Any]
-    ) -> None:
+    def __init__(self, parts: tuple[str, ...], convert: Callable[[WorldModel, torch.dtype], Any]) -> None:
         self._parts, self._convert = parts, convert
-        self._places: tuple[tuple[nn.Module, ...], list[tuple[dict[str, Any], str]]] | None = None
+        self._places: tuple[tuple[nn.Module | None, ...], list[tuple[dict[str, Any], str]]] | None = None
         self._kept: tuple[Hashable, Any] | None = None
 
     def __getstate__(self) -> dict[str, Any]:
@@ -41,7 +44,7 @@ class ConvertedWeights:
         parameters = self._parameters(model)
         if parameters[0].is_inference():  # torch does not count writes to such tensors
             return self._convert(model, dtype)
-        key = (dtype, *((parameter.data_ptr(), parameter._version) for parameter in parameters))
+        key = (dtype, *map(Tensor.data_ptr, parameters), *map(_version_of, parameters))
         kept = self._kept  # read once: another thread may replace it
         if kept is None or kept[0] != key:
             with torch.inference_mode(False):  # tensors made in inference mode could not be used for gradients later
@@ -49,13 +52,13 @@ class ConvertedWeights:
         return kept[1]
 
     def _parameters(self, model: WorldModel) -> list[Tensor]:
-        parts, places = self._parts(model), self._places
-        if places is None or any(one is not other for one, other in zip(places[0], parts, strict=True)):
-            # Kept, because a walk through the modules takes longer than an imagined step.
-            modules = [module for part in parts for module in part.modules()]
-            places = parts, [(module._parameters, name) for module in modules for name in module._parameters]
+        """The parameters of the parts; where they are is kept, because a walk through modules outlasts a step."""
+        parts, places = tuple(map(model._modules.get, self._parts)), self._places
+        if places is None or places[0] != parts:
+            owners = [module._parameters for part in parts if part is not None for module in part.modules()]
+            places = parts, [(owner, name) for owner in owners for name, value in owner.items() if value is not None]
             self._places = places
-        return [owner[name] for owner, name in places[1] if owner[name] is not None]
+        return [owner[name] for owner, name in places[1]]
 
 
 class _ConvertingBackend(Backend):
@@ -63,8 +66,8 @@ class _ConvertingBackend(Backend):
 
     def __init__(self, trunk_dtype: torch.dtype) -> None:
         super().__init__(trunk_dtype)
-        self._rollout_weights = ConvertedWeights(_rollout_parts, _convert_for_rollouts)
-        self._frame_weights = ConvertedWeights(_frame_parts, _convert_for_frames)
+        self._rollout_weights = ConvertedWeights(ROLLOUT_PARTS, _convert_for_rollouts)
+        self._frame_weights = ConvertedWeights(FRAME_PARTS, _convert_for_frames)
 
     @staticmethod
     def can_compute(model: WorldModel) -> bool:
@@ -160,16 +163,8 @@ class GpuBackend(_ConvertingBackend):
         torch._foreach_add_(list(slow), steps)
 
 
-def _rollout_parts(model: WorldModel) -> tuple[nn.Module, ...]:
-    return model.dynamics, model.reward_head, model.value_head, model.actor
-
-
 def _convert_for_rollouts(model: WorldModel, dtype: torch.dtype) -> rollouts.Weights:
     return rollouts.convert_weights(model.dynamics, model.reward_head, model.value_head, model.actor, dtype)
-
-
-def _frame_parts(model: WorldModel) -> tuple[nn.Module, ...]:
-    return model.encoder, model.dynamics, model.actor
 
 
 def _convert_for_frames(model: WorldModel, dtype: torch.dtype) -> one_frame.FrameWeights:
