@@ -36,7 +36,7 @@ def compose(config_file: Layer, flags: Layer, preset: str = "auto") -> Config:
     default = read_layer(config_folder() / "default.yaml")
     chosen = _overlay(default, config_file, flags)
     domain = chosen["env"]["domain"]
-    domains = tuple(find_suite(str(chosen["env"].get("suite", DEFAULT_SUITE))).tasks)
+    domains = tuple(find_suite(chosen["env"].get("suite", DEFAULT_SUITE)).tasks)
     if domain not in domains:
         raise_unknown("domain", domain, domains)
     domain_layer = _read_optional(domain)

@@ -64,13 +64,9 @@ def test_documented_runner_gives_the_actions_of_the_agent_without_this_package(
     runner = next(part for part in text.split("```python\n")[1:] if "torch.export.load" in part).split("```")[0]
     film = np.random.default_rng(0).integers(0, 256, (6, 64, 64, 3), dtype=np.uint8)
     np.save(program.parent / "film.npy", film)
-    before = (
-        "import sys; sys.modules['latentplan'] = None\nimport numpy as np\nactions = []\n"
-        "def play():\n"
-        "    for frame in np.load('film.npy'):\n        yield frame\n        actions.append(action.detach().numpy())\n"
-        "frames = play()\n"
-    )
-    result = run_python("-c", f"{before}{runner}np.save('actions.npy', actions)", cwd=program.parent)
+    before = "import sys; sys.modules['latentplan'] = None\nimport numpy as np\n"
+    actions = f"[action.detach().numpy() for action in control(np.load('film.npy'), {str(program)!r})]"
+    result = run_python("-c", f"{before}{runner}\nnp.save('actions.npy', {actions})", cwd=program.parent)
     assert result.returncode == 0, result.stderr
     agent = load_agent(checkpoint, mode="actor")
     expected = np.stack([agent.act(frame) for frame in film])

@@ -130,8 +130,8 @@ def test_evaluate_agent_repeats_with_the_same_seed():
         (("--json", "a.mp4", "--video", f"../{Path.cwd().name}/a.mp4"), ("--video and --json", "same file")),
         (("--mode", "gated", "--planning-budget", "1.5"), ("--planning-budget", "[0.0, 1.0]", "1.5")),
         (("--threads", "1000000000000"), ("--threads", "[1, 1024]")),
-        (("--objective", "1e200 * 1e200 * cart > 1"), ("1e+200 * 1e+200", "not finite")),
-        (("--constraint", "cart < 1e308 * 1e308"), ("not finite",)),
+        (("--objective", "1e200 * 1e200 * cart > 1"), ("1e200 * 1e200", "too large for a number")),
+        (("--constraint", "cart < 1e308 * 1e308"), ("too large for a number",)),
     ],
 )
 def test_eval_refuses_bad_flags_in_one_line(assert_refused, checkpoint, flags, words):

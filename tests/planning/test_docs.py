@@ -1,4 +1,4 @@
-"""The examples of docs/planning.md run, and its table lists every option."""
+"""The examples of docs/guides/planning.md run, and its table lists every option."""
 
 import dataclasses
 import re

@@ -13,6 +13,7 @@ import sys
 import threading
 import traceback
 from collections.abc import Iterator
+from multiprocessing import resource_tracker
 from multiprocessing.connection import Connection
 from multiprocessing.context import SpawnProcess
 from queue import SimpleQueue
@@ -63,6 +64,7 @@ def start_process() -> tuple[SpawnProcess, Connection]:
     context = multiprocessing.get_context("spawn")
     ours, theirs = context.Pipe()
     process = context.Process(target=_serve, args=(theirs,), name="latentplan-plan", daemon=True)
+    resource_tracker.ensure_running()  # its own start would unblock the signal before the child inherits the mask
     with _interrupts_held():  # the child inherits the blocked signal, and unblocks it once it ignores interrupts
         process.start()
     theirs.close()
@@ -168,9 +170,8 @@ def _interrupts_held() -> Iterator[None]:
 
 def _serve(connection: Connection) -> None:
     """Answers search requests in a process of its own, until the other end of the pipe is closed."""
-    signal.signal(
-        signal.SIGINT, signal.SIG_IGN
-    )  # Ctrl-C reaches the whole process group, and the loop's process handles it
+    # Ctrl-C reaches the whole process group, and the process of the control loop handles it.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
     if hasattr(signal, "pthread_sigmask"):
         signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
     torch.set_num_threads(1)

@@ -12,6 +12,7 @@ from torch import Tensor, nn
 
 from latentplan.config import ModelConfig, from_dict
 from latentplan.models import State, WorldModel
+from latentplan.models.fast import accelerate
 
 DTYPES = {"float32": torch.float32, "bfloat16": torch.bfloat16}
 ELITE_SHARE = 0.1
@@ -77,7 +78,7 @@ def build_model(problem: Problem, dtype: str) -> WorldModel:
         torch.manual_seed(problem.seed)
         model = kind(problem.model_config, problem.action_dim)
         nn.init.normal_(model.reward_head.mlp.output.weight, std=REWARD_SCALE)
-    return model.to(problem.device).eval()
+    return accelerate(model.to(problem.device).eval())
 
 
 def start_state(problem: Problem, batch: int = 1) -> State:
