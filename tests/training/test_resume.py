@@ -13,7 +13,7 @@ import torch
 from latentplan.training import callbacks, resume, train
 from latentplan.training.collection.process import LocalWorker
 from latentplan.training.learner.registry import WORLD_MODEL_LOSSES, register
-from latentplan.training.train import INTERRUPTED, _Run
+from latentplan.training.run import INTERRUPTED, _Run
 from tests.training.run_folder import epochs_of, rows_of, saved_state
 
 

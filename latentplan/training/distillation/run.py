@@ -40,7 +40,7 @@ from latentplan.training.distillation.labels import Demonstrations, first_action
 from latentplan.training.distillation.student import Student
 from latentplan.training.folder import DISTILLATION_FILE, lock_folder, refuse_used
 from latentplan.training.state import INTERRUPTED, save_whole
-from latentplan.training.train import Result
+from latentplan.training.run import Result
 
 NUM_STAGES = 3  # per round: collect, train, select
 NO_ROUND = -1  # stands for the actor with which the distillation began

@@ -23,7 +23,7 @@ from latentplan.training.folder import GOALS_FILE, lock_folder, refuse_used
 from latentplan.training.goal_conditioning.learner import GoalLearner
 from latentplan.training.goal_conditioning.play import play
 from latentplan.training.state import INTERRUPTED, save_whole
-from latentplan.training.train import Result
+from latentplan.training.run import Result
 
 SAVE_SECONDS = 300.0
 PLAYED_FILE = "played.json"  # beside a played replay: which agent played it, and with which settings
