@@ -11,6 +11,7 @@ from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any
 
 import torch
+from einops import rearrange
 from torch import Tensor
 
 from latentplan.models.dynamics import Gaussian, State
@@ -22,8 +23,8 @@ if TYPE_CHECKING:
 class Backend:
     """Computes a world model in plain torch.
 
-    Every method takes the model as its first argument, so that copies of a model can share a backend. A backend can be
-    copied and pickled with its model.
+    Methods that read weights take the model as their first argument, so that copies of a model can share a backend. A
+    backend can be copied and pickled with its model.
 
     Args:
         trunk_dtype: Precision of the matrix products outside the last layers of heads.
@@ -94,7 +95,39 @@ class Backend:
         mean, std = model.actor(state.features)
         return mean, std
 
-    # For learners, with gradients.
+    # For learners, with gradients where weights take part.
+
+    def can_record(self, model: WorldModel) -> bool:
+        """Whether a learner can record an update of the model as a CUDA graph, and replay the graph."""
+        return model.device.type == "cuda"
+
+    def shift_frames(self, frames: Tensor, offsets: Tensor, pixels: int) -> Tensor:
+        """Sequences shifted by whole pixels, with repeated borders.
+
+        On a GPU nothing is read back to the host, as a CUDA graph requires.
+
+        Args:
+            frames: (batch, time, height, width, channel).
+            offsets: Shift of each sequence down and right, plus `pixels`, in [0, 2 * pixels], (batch, 2).
+            pixels: Largest shift.
+
+        Returns:
+            Frames of the same shape: row `r` and column `c` hold the old row `r + down` and column `c + right`, with
+            `down` and `right` the offsets minus `pixels`.
+        """
+        height, width = frames.shape[2:4]
+        rows = _shifted_places(height, offsets[:, 0], pixels)
+        columns = _shifted_places(width, offsets[:, 1], pixels)
+        frames = frames.gather(2, rearrange(rows, "batch height -> batch 1 height 1 1").expand(frames.shape))
+        return frames.gather(3, rearrange(columns, "batch width -> batch 1 1 width 1").expand(frames.shape))
+
+    def turn_frames(self, frames: Tensor, amounts: Tensor) -> Tensor:
+        """Sequences (batch, time, side, side, channel) turned by quarter turns (batch,) in [0, 3].
+
+        On a GPU nothing is read back to the host, as a CUDA graph requires.
+        """
+        turned = torch.stack([torch.rot90(frames, amount, (2, 3)) for amount in range(4)])
+        return turned[amounts, torch.arange(len(frames), device=frames.device)]
 
     def observe(
         self, model: WorldModel, embeddings: Tensor, actions: Tensor, deter: Tensor, noise: Tensor
@@ -121,6 +154,12 @@ class Backend:
         """Move each of the slow tensors by a share in [0, 1] of its distance to the fast one, in place."""
         for one, other in zip(slow, fast, strict=True):
             one.lerp_(other, rate)
+
+
+def _shifted_places(size: int, offset: Tensor, pixels: int) -> Tensor:
+    """The place in [0, size) that each place of a shifted axis comes from, (batch, size)."""
+    places = torch.arange(size, device=offset.device) + (offset[:, None] - pixels)
+    return places.clamp(0, size - 1)
 
 
 def _advance_by_mean(model: WorldModel, state: State, action: Tensor) -> State:

@@ -75,6 +75,19 @@ def learner_calls(model: WorldModel, learning: LearningConfig) -> Calls:
     }
 
 
+def augmentation_calls(model: WorldModel, learning: LearningConfig) -> Calls:
+    """Shifts and quarter turns of replayed frames."""
+    batch, pixels = learning.batch_size, max(1, learning.random_shift)
+    size = (batch, learning.sequence_length + 1, 64, 64, 3)
+    frames = torch.randint(0, 256, size, dtype=torch.uint8, device=model.device)
+    offsets = torch.randint(2 * pixels + 1, (batch, 2), device=model.device)
+    amounts = torch.randint(4, (batch,), device=model.device)
+    return {
+        "shifted frames, by slices": lambda model: model.backend.shift_frames(frames, offsets, pixels),
+        "turned frames, by slices": lambda model: model.backend.turn_frames(frames, amounts),
+    }
+
+
 def _states(model: WorldModel, rows: int) -> State:
     sizes = (model.config.deter_dim, model.config.latent_dim)
     return State(*(torch.randn(rows, size, device=model.device).tanh() for size in sizes))

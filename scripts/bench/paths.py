@@ -119,7 +119,7 @@ def _paths(
     """Name, call, reference, fast backend and surroundings of each path that runs on the device."""
     import torch
 
-    from bench.path_calls import frame_calls, learner_calls, planner_calls
+    from bench.path_calls import augmentation_calls, frame_calls, learner_calls, planner_calls
     from latentplan.models.backend import Backend
     from latentplan.models.fast import GpuBackend, accelerate
 
@@ -141,6 +141,8 @@ def _paths(
                 if kind == "compiled call" or name.startswith(("rollout", "proposals")):
                     yield f"{name}, {kind}", call, Backend(precision), backend(), context
     for name, call in frame_calls(model).items():
+        yield name, call, Backend(precision), backend(), nullcontext
+    for name, call in augmentation_calls(model, learning).items() if device.type == "cpu" else ():
         yield name, call, Backend(precision), backend(), nullcontext
     for name, call in learner_calls(model, learning).items():
         # Both in float32, as on a GPU, so that only the path differs.

@@ -12,6 +12,7 @@ from torch import Tensor, nn
 from latentplan.models.backend import Backend
 from latentplan.models.dynamics import Gaussian, Rssm, State
 from latentplan.models.fast import compiled, one_frame, pointwise, unroll
+from latentplan.models.fast import frames as sliced_frames
 from latentplan.models.fast import rollout as rollouts
 from latentplan.models.world_model import WorldModel
 
@@ -103,7 +104,10 @@ class _ConvertingBackend(Backend):
 
 
 class CpuBackend(_ConvertingBackend):
-    """Rollouts, steps and values in one compiled call each, where the processor multiplies bfloat16; else torch."""
+    """Rollouts, steps and values in one compiled call each, where the processor multiplies bfloat16; else torch.
+
+    Augmented frames are copied slice by slice.
+    """
 
     def __init__(self) -> None:
         super().__init__(torch.bfloat16)
@@ -119,6 +123,14 @@ class CpuBackend(_ConvertingBackend):
         """See `Backend.value`."""
         packed = self._packed(model) if state.deter.ndim == 2 else None
         return super().value(model, state) if packed is None else compiled.value(packed, *state)
+
+    def shift_frames(self, frames: Tensor, offsets: Tensor, pixels: int) -> Tensor:
+        """See `Backend.shift_frames`."""
+        return sliced_frames.shift_by_slices(frames, offsets, pixels)
+
+    def turn_frames(self, frames: Tensor, amounts: Tensor) -> Tensor:
+        """See `Backend.turn_frames`."""
+        return sliced_frames.turn_by_slices(frames, amounts)
 
     def _packed(self, model: WorldModel) -> compiled.Packed | None:
         """Weights for compiled calls; None if torch has to compute, or if gradients could be required."""

@@ -23,12 +23,12 @@ WARM_UP_UPDATES = 3  # before the recording, while libraries choose kernels and 
 
 
 class GraphedLearner(Learner):
-    """Learns as `Learner` does, in one thread and one CUDA graph that is recorded once and then replayed.
+    """Learns as `Learner` does, but in one thread, by replaying one recorded CUDA graph for each update.
 
     `training_step` takes rows of replay, (batch, time + 1), instead of a batch. The graph gathers and augments the
     sequences, computes both losses, steps both optimizers, updates the slow target and the averages, and stores the new
     beliefs. The graph reads nothing back to the host, so an update cannot raise: a gradient that is not finite changes
-    no weights, and `catch_up` reports the skipped update. On a CPU the same update runs without a recording.
+    no weights, and `catch_up` reports the skipped update. On a CPU the same update runs without a graph.
 
     Args:
         model: The world model with actor and value head.
@@ -36,8 +36,8 @@ class GraphedLearner(Learner):
         discount: Discount per decision.
         replay: The replay, on the model's device.
         seed: Seed of the noise in posterior, prior and actor samples.
-        prepare: Applied to gathered sequences; recorded in the graph, so its effect may change only together with
-            `reset_value_head`, which starts a new recording.
+        prepare: Applied to gathered sequences. The graph records this function, so its effect may change only together
+            with `reset_value_head`, which starts a new recording.
     """
 
     skipped: Tensor
@@ -58,32 +58,32 @@ class GraphedLearner(Learner):
         self._generator: torch.Generator | None = None
         self._graph: torch.cuda.CUDAGraph | None = None
         self._outputs: dict[str, Tensor] = {}
-        self._written = [*self.model.parameters(), *self.averaged.parameters()]
-        self._run_before, self._since_report = 0, 0
+        self._recorded_parameters = [*self.model.parameters(), *self.averaged.parameters()]
+        self._num_warm_up_updates, self._updates_since_report = 0, 0
 
     def training_step(self, rows: Tensor, batch_index: int) -> None:  # type: ignore[override]
         """Update world model and behaviour from the sequences at rows of replay, (batch, time + 1)."""
         if self._generator is None:
             self._generator = torch.Generator(self.device)
         self._rows.copy_(rows)
-        records = self.device.type == "cuda" and self._graph is None and self._run_before == WARM_UP_UPDATES
-        if records:
+        can_record = self.model.backend.can_record(self.model)
+        if can_record and self._graph is None and self._num_warm_up_updates == WARM_UP_UPDATES:
             self._graph = self._record(self._generator)
         self._generator.manual_seed(derive_seed(self.seed, "update", self.updates))
         if self._graph is not None:
             self._graph.replay()
             # Caches of weights watch the version counter, which a replayed graph does not increment.
-            torch.autograd.graph.increment_version(self._written)
-        elif self.device.type == "cuda":
-            self._run_aside()
+            torch.autograd.graph.increment_version(self._recorded_parameters)
+        elif can_record:
+            self._warm_up(self._generator)
         else:
             self._outputs = self.update(self._generator)
         self.updates += 1
-        self._since_report += 1
+        self._updates_since_report += 1
         self.metrics |= self._outputs
 
     def update(self, generator: torch.Generator) -> dict[str, Tensor]:
-        """The recorded update; returns losses and gradient norms by name."""
+        """Computes one update, the part that the graph records; returns losses and gradient norms by name."""
         batch = self.prepare(self.replay.gather(self._rows))
         learned, batch, is_unturned = self._learn_model(batch, generator)
         is_finite = torch.isfinite(learned.parts["model_grad_norm"])
@@ -94,13 +94,13 @@ class GraphedLearner(Learner):
         return parts
 
     def catch_up(self) -> None:
-        """Warn of updates skipped since the last call; behaviour needs no further update.
+        """Warn of updates skipped since the last call; no behaviour update is outstanding.
 
         Raises:
             FloatingPointError: Every update since the last call was skipped.
         """
-        updates, skipped = self._since_report, int(self.skipped)
-        self._since_report = 0
+        updates, skipped = self._updates_since_report, int(self.skipped)
+        self._updates_since_report = 0
         self.skipped.zero_()
         if skipped == 0:
             return
@@ -110,22 +110,21 @@ class GraphedLearner(Learner):
         warnings.warn(f"{report}: these updates were skipped", RuntimeWarning, stacklevel=2)
 
     def reset_value_head(self) -> None:
-        """Reset as `Learner` does, and record anew, because the recorded graph uses the old optimizer state."""
+        """Reset as `Learner` does, and drop the graph, because it uses the old optimizer state."""
         super().reset_value_head()
-        self._graph, self._run_before = None, 0
+        self._graph, self._num_warm_up_updates = None, 0
 
     def _descend(self, optimizer: torch.optim.Optimizer, loss: Tensor) -> Tensor:
         return descend_if_finite(optimizer, loss, self.config.max_grad_norm)
 
-    def _run_aside(self) -> None:
+    def _warm_up(self, generator: torch.Generator) -> None:
         """Run one update in a side stream, which CUDA requires of the updates before a recording."""
-        assert self._generator is not None
         stream, own = torch.cuda.current_stream(self.device), torch.cuda.Stream(self.device)
         own.wait_stream(stream)
         with torch.cuda.stream(own):
-            self._outputs = self.update(self._generator)
+            self._outputs = self.update(generator)
         stream.wait_stream(own)
-        self._run_before += 1
+        self._num_warm_up_updates += 1
 
     def _record(self, generator: torch.Generator) -> torch.cuda.CUDAGraph:
         graph = torch.cuda.CUDAGraph()
@@ -136,16 +135,19 @@ class GraphedLearner(Learner):
 
 
 def make_learner(model: WorldModel, config: Config, discount: float, replay: Replay, curriculum: Curriculum) -> Learner:
-    """The learner that the settings select: graphed on a GPU with `learning.cuda_graph`, else plain.
+    """Makes the learner that the settings select.
+
+    A model whose updates can be recorded gets a `GraphedLearner` if `learning.cuda_graph` is set; every other model gets
+    a `Learner`.
 
     Args:
         model: The world model, on its device.
         config: Settings of the run.
         discount: Discount per decision.
         replay: Replay of the run.
-        curriculum: Chooses the rewards to learn.
+        curriculum: Replaces the rewards of replayed sequences.
     """
     settings, seed = config.learning, derive_seed(config.run.seed, "learner")
-    if settings.cuda_graph and model.device.type == "cuda":
+    if settings.cuda_graph and model.backend.can_record(model):
         return GraphedLearner(model, settings, discount, replay, seed, curriculum)
     return Learner(model, settings, discount, replay, seed)

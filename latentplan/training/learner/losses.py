@@ -1,7 +1,7 @@
-"""The losses: of the world model on replayed sequences, and of behaviour on imagined rollouts.
+"""The losses of the world model on replayed sequences, and of behaviour on imagined rollouts.
 
-A loss is one function, registered under the name of its column in metrics.csv and with the setting of `LearningConfig`
-that weighs it. A new loss needs nothing else than its function here and its setting in `config/learning.py`.
+A loss is one function, registered with the name of its column in metrics.csv and with the setting of `LearningConfig`
+that weighs it. A new loss needs only its function here and its setting in `config/learning.py`.
 """
 
 from __future__ import annotations
@@ -109,7 +109,7 @@ class Behaviour(NamedTuple):
 
 
 class Learned(NamedTuple):
-    """Results of a pass over a batch.
+    """Results of a pass of the world model over a batch.
 
     Attributes:
         loss: Loss of the world model, a scalar.
@@ -127,11 +127,11 @@ class Learned(NamedTuple):
 def world_model_loss(model: WorldModel, batch: Batch, config: LearningConfig, generator: torch.Generator) -> Learned:
     """The loss of the world model over a batch of sequences, and its posterior and open-loop states.
 
-    Rows beyond a terminal state (see `Batch.within`) have no weight. With `random_shift` the encoder reads shifted
-    frames but the decoder reconstructs the unshifted ones, so that the latent need not hold the shift.
+    Frames beyond a terminal state (see `Batch.within`) have no weight. With `random_shift` the encoder reads shifted
+    frames but the decoder reconstructs the unshifted frames, so that the latent need not hold the shift.
     """
     size, frames_per_sequence = batch.frames.shape[:2]
-    moved = random_shift(batch.frames, config.random_shift, generator)
+    moved = random_shift(model.backend, batch.frames, config.random_shift, generator)
     with model.trunk_precision(cache=False):
         embeddings = model.encoder(moved.flatten(0, 1)).unflatten(0, (size, frames_per_sequence))
     noise = torch.randn(
@@ -196,21 +196,21 @@ def _continuation(predicted: Prediction) -> Tensor:
 
 @register(WORLD_MODEL_LOSSES, "dynamics", "dynamics_scale")
 def _dynamics(predicted: Prediction) -> Tensor:
-    """KL balancing (Hafner et al. 2023): this half pulls the prior to the posterior, above the free nats."""
+    """KL from posterior to prior above the free nats, which moves only the prior (KL balancing, Hafner et al. 2023)."""
     divergence = _free_kl(_detached(predicted.posterior), predicted.prior, predicted.config.free_nats)
     return mean_within(divergence, predicted.is_seen)
 
 
 @register(WORLD_MODEL_LOSSES, "representation", "representation_scale")
 def _representation(predicted: Prediction) -> Tensor:
-    """KL balancing (Hafner et al. 2023): this half pulls the posterior to the prior, above the free nats."""
+    """The same KL, which moves only the posterior (KL balancing, Hafner et al. 2023)."""
     divergence = _free_kl(predicted.posterior, _detached(predicted.prior), predicted.config.free_nats)
     return mean_within(divergence, predicted.is_seen)
 
 
 @register(WORLD_MODEL_LOSSES, "overshooting", "overshooting_scale")
 def _overshooting(predicted: Prediction) -> Tensor:
-    """Latent overshooting (Hafner et al. 2019, section 4): pulls open-loop priors to the posteriors."""
+    """KL from posteriors to open-loop priors, which moves only the priors (Hafner et al. 2019, section 4)."""
     return predicted.open_loop_divergence
 
 
@@ -227,7 +227,7 @@ def _probe(predicted: Prediction) -> Tensor:
 
 @register(BEHAVIOUR_LOSSES, "actor")
 def _actor(behaviour: Behaviour) -> Tensor:
-    """Minus the normalised return and the weighted entropy; the gradient flows through the dynamics."""
+    """Negative sum of normalised return and weighted entropy; the gradient flows through the dynamics."""
     entropies = behaviour.config.entropy_scale * behaviour.imagined.entropies
     return -(behaviour.reach * (behaviour.returns / behaviour.return_scale + entropies)).mean()
 
@@ -250,23 +250,35 @@ def _replayed_value(behaviour: Behaviour) -> Tensor:
 def imagine(
     model: WorldModel, start: State, horizon: int, generator: torch.Generator, decay: float = 1.0
 ) -> Imagination:
-    """Roll the actor out in the model for `horizon` steps from rows of states; see `Dynamics.imagine`."""
-    stacked, std = model.backend.imagine(model, start, *draw_noise(model, horizon, len(start.deter), generator), decay)
-    rewards = model.reward_head.mean(model.reward_head(stacked[1:]))
-    continues = torch.sigmoid(model.continue_head(stacked[1:])).squeeze(-1)
-    return Imagination(stacked, rewards, continues, entropy(std))
+    """Imagined rollouts of the actor, with the rewards, continuation and entropies that the losses need.
+
+    Args:
+        model: The world model, with the actor that chooses the actions.
+        start: States from which the rollouts start, (rows, ...).
+        horizon: Model steps.
+        generator: Random stream of the actions and latents.
+        decay: Share of a state's gradient that a step passes back to the state before.
+    """
+    features, std = model.backend.imagine(model, start, *draw_noise(model, horizon, len(start.deter), generator), decay)
+    rewards = model.reward_head.mean(model.reward_head(features[1:]))
+    continues = torch.sigmoid(model.continue_head(features[1:])).squeeze(-1)
+    return Imagination(features, rewards, continues, entropy(std))
 
 
 def draw_noise(model: WorldModel, horizon: int, rows: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:
-    """Standard normal, for actions and latents, (horizon, rows, ...) each."""
+    """Standard normal draws for imagined rollouts.
+
+    Returns:
+        Noise of the actions, (horizon, rows, action), and of the latents, (horizon, rows, latent).
+    """
     sizes = [model.action_dim, model.config.latent_dim]
     draws = torch.randn(horizon, rows, sum(sizes), generator=generator, device=model.device)
-    action_noise, noise = draws.split(sizes, -1)
-    return action_noise, noise
+    action_noise, latent_noise = draws.split(sizes, -1)
+    return action_noise, latent_noise
 
 
 def entropy(std: Tensor) -> Tensor:
-    """Of Gaussian actions with a std (..., action), in nats, (...)."""
+    """Entropy in nats of Gaussian actions, (...), for their std (..., action)."""
     return (std.log() + HALF_LOG_2_PI_E).sum(-1)
 
 
@@ -275,12 +287,12 @@ def lambda_return(rewards: Tensor, discounts: Tensor, values: Tensor, lambda_: f
 
     Args:
         rewards: rewards[t] arrives with state t + 1, (time, ...).
-        discounts: Of state t + 1 on, zero where the episode ended, (time, ...).
-        values: Of state t + 1, (time, ...).
-        lambda_: 0 gives one-step targets, 1 the whole return.
+        discounts: discounts[t] weighs the return from state t + 1 on, (time, ...); 0 where the episode ended.
+        values: values[t] is the value of state t + 1, (time, ...).
+        lambda_: Weight in [0, 1] of longer returns: 0 gives one-step targets, 1 the whole return.
 
     Returns:
-        The return from state t on, (time, ...).
+        Returns from state t on, (time, ...).
     """
     following, returns = values[-1], []
     steps = zip(rewards.unbind(), discounts.unbind(), values.unbind(), strict=True)
@@ -316,10 +328,14 @@ def imitation_loss(actor: Actor, features: Tensor, mean: Tensor, std: Tensor) ->
 def _predict_open_loop(
     model: WorldModel, batch: Batch, states: State, posterior: Gaussian, config: LearningConfig
 ) -> tuple[Tensor, Tensor]:
-    """KL and features of open-loop predictions: from actions alone, as a planner predicts.
+    """Predicts latents from actions alone, as a planner does, and compares them with the posteriors.
 
-    Each prediction starts from every `overshooting_horizon`-th posterior and applies the true actions, with the mean of
-    the prior as the latent. The KL compares each prior with the posterior of the same frame.
+    Predictions start from every `overshooting_horizon`-th posterior and apply the true actions, with the mean of the
+    prior as the latent.
+
+    Returns:
+        Mean KL of the priors to the posteriors of the same frames, a scalar, and the features of the predicted states,
+        (batch, reached, feature).
     """
     length = batch.actions.shape[1]
     horizon = min(config.overshooting_horizon, length)
@@ -338,7 +354,7 @@ def _predict_open_loop(
 
 
 def mean_within(values: Tensor, within: Tensor) -> Tensor:
-    """Mean of the values at which `within`, of the same shape, is 1 rather than 0; 0 if there is none."""
+    """Mean of the values where `within` is 1, or 0 if `within` is 0 everywhere; both have the same shape."""
     return (values * within).sum() / within.sum().clamp_min(1.0)
 
 

@@ -25,18 +25,18 @@ from latentplan.training.learner.losses import (
     weighted_sum,
     world_model_loss,
 )
-from latentplan.training.learner.optimization import average, descend, keep_freed_memory, return_scale
+from latentplan.training.learner.optimization import descend, keep_freed_memory, return_scale, update_average
 from latentplan.training.learner.snapshot import Snapshot
 
-MODEL, BEHAVIOUR = 0, 1  # the two halves of an update, of its parameters and of its optimizers
+MODEL, BEHAVIOUR = 0, 1  # indices of the two halves of an update: their parameters, optimizers and average counts
 
 
 class Learner(lightning.LightningModule):
     """Learns a world model from replayed sequences, and an actor and a value head from imagined rollouts.
 
     Behaviour learns in a second thread from a snapshot of the model after its latest update, while the model makes its
-    next update. The two threads wait for each other after every update, so results do not depend on timing. `catch_up`
-    ends an epoch.
+    next update. The two threads wait for each other after every update, so results do not depend on timing. At the end
+    of an epoch `catch_up` makes the behaviour update that is still outstanding.
 
     Agents act, are evaluated and are saved with the weights of `averaged`, a running average over the latest updates:
     under constant learning rates the learned weights themselves keep fluctuating.
@@ -45,7 +45,7 @@ class Learner(lightning.LightningModule):
         model: The world model with actor and value head.
         config: Settings of losses and optimizers.
         discount: Discount per decision.
-        replay: Takes the refreshed beliefs after each update.
+        replay: Stores the refreshed beliefs after each update.
         seed: Seed of the noise in posterior, prior and actor samples.
 
     Attributes:
@@ -74,7 +74,7 @@ class Learner(lightning.LightningModule):
     def configure_optimizers(self) -> list[torch.optim.Optimizer]:
         """One Adam for the world model, and one for actor and value head."""
         rates = (self.config.model_learning_rate, self.config.behaviour_learning_rate)
-        capturable = self.device.type == "cuda"
+        capturable = self.model.backend.can_record(self.model)
         return [
             torch.optim.Adam(parameters, lr=rate, eps=1e-6, fused=True, capturable=capturable)
             for parameters, rate in zip(_halves(self.model), rates, strict=True)
@@ -130,24 +130,28 @@ class Learner(lightning.LightningModule):
             self.metrics |= behaviour.result()
 
     def _learn_model(self, batch: Batch, generator: torch.Generator) -> tuple[Learned, Batch, Tensor]:
-        """One model update; also the augmented batch, and which of its sequences were not turned, bool (batch,)."""
-        batch, is_unturned = quarter_turns(batch, self.config.turned_share, generator)
+        """Update the world model once.
+
+        Returns:
+            The results of the pass, the augmented batch, and which of its sequences were not turned, bool (batch,).
+        """
+        batch, is_unturned = quarter_turns(self.model.backend, batch, self.config.turned_share, generator)
         learned = world_model_loss(self.model, batch, self.config, generator)
         learned.parts["model_grad_norm"] = self._descend(self._optimizers()[MODEL], learned.loss)
-        self._average(MODEL)
+        self._update_average(MODEL)
         return learned._replace(loss=learned.loss.detach()), batch, is_unturned
 
     def _learn_behaviour(self, learned: Learned, batch: Batch, generator: torch.Generator) -> dict[str, Tensor]:
         loss, parts = self._behaviour_loss(learned, batch, generator)
         parts["behaviour_grad_norm"] = self._descend(self._optimizers()[BEHAVIOUR], loss)
-        self._average(BEHAVIOUR)
+        self._update_average(BEHAVIOUR)
         target, values = self.target_value.parameters(), self.model.value_head.parameters()
         self.model.backend.move_towards([*target], [*values], self.config.target_rate)
         return parts
 
-    def _average(self, half: int) -> None:
+    def _update_average(self, half: int) -> None:
         running, latest = _halves(self.averaged)[half], _halves(self.model)[half]
-        average(self.model.backend, running, latest, self.averaged_updates[half], self.config.average_rate)
+        update_average(self.model.backend, running, latest, self.averaged_updates[half], self.config.average_rate)
 
     def _optimizers(self) -> list[torch.optim.Optimizer]:
         optimizers = self.optimizers(use_pl_optimizer=False)
@@ -164,31 +168,31 @@ class Learner(lightning.LightningModule):
         first = torch.arange(min(config.imagination_starts, len(order)), device=self.device)
         chosen = order.argsort()[first % continues.sum().long()]  # terminal states start no rollout
         with self.model.trunk_precision(cache=False):
-            dream = imagine(
+            imagined = imagine(
                 self.snapshot.model,
                 State(flat.deter[chosen], flat.stoch[chosen]),
                 config.imagination_horizon,
                 generator,
                 config.gradient_decay,
             )
-            values = self.target_value.mean(self.target_value(dream.features[1:]))
-        discounts = self.discount * dream.continues
-        returns = self.model.backend.call(lambda_return, dream.rewards, discounts, values, config.lambda_)
+            values = self.target_value.mean(self.target_value(imagined.features[1:]))
+        discounts = self.discount * imagined.continues
+        returns = self.model.backend.call(lambda_return, imagined.rewards, discounts, values, config.lambda_)
         reach = torch.cat([torch.ones_like(discounts[:1]), discounts[:-1]]).cumprod(0).detach()
         scale = return_scale(self.return_range, returns.detach())
         with self.model.trunk_precision(cache=False):
             replayed = self._replayed(learned, batch)
-        behaviour = Behaviour(self.model, config, dream, returns, reach, scale, replayed)
+        behaviour = Behaviour(self.model, config, imagined, returns, reach, scale, replayed)
         loss, parts = weighted_sum(BEHAVIOUR_LOSSES, behaviour, config)
         parts["imagined_return"] = returns[0].detach().mean()
-        parts["entropy"] = dream.entropies.detach().mean()
+        parts["entropy"] = imagined.entropies.detach().mean()
         return loss, parts
 
     def _replayed(self, learned: Learned, batch: Batch) -> Replayed:
         """Posterior states and open-loop states of a batch, with the returns of its replayed rewards.
 
-        A planner values states that it predicts in open loop. Open-loop states therefore learn the same returns, so
-        that the drift of a prediction does not look like a gain.
+        A planner values states that it predicts in open loop. The value of an open-loop state therefore learns the same
+        return as that of the posterior state, so that a planner does not take the drift of predictions for a gain.
         """
         features = learned.states.features.transpose(0, 1)
         predicted = learned.open_loop.transpose(0, 1)
@@ -208,7 +212,15 @@ class Learner(lightning.LightningModule):
 
 
 def is_refreshed(batch: Batch, chosen: Tensor) -> Tensor:
-    """Frames whose stored beliefs are replaced, bool (batch, time + 1): those of chosen sequences, up to their end."""
+    """Frames whose stored beliefs are replaced: those of chosen sequences, up to the end of the episode.
+
+    Args:
+        batch: Sequences.
+        chosen: Sequences whose beliefs are replaced, bool (batch,).
+
+    Returns:
+        Whether each frame's belief is replaced, bool (batch, time + 1).
+    """
     return chosen[:, None] & torch.nn.functional.pad(batch.within, (1, 0), value=1.0).bool()
 
 

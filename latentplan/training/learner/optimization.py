@@ -68,16 +68,21 @@ def load_optimizer_state(optimizer: torch.optim.Optimizer, saved: dict[str, Any]
 
 
 @torch.no_grad()
-def average(backend: Backend, running: Sequence[Tensor], latest: Sequence[Tensor], count: Tensor, rate: float) -> None:
-    """Take the latest parameters into a running average over about the last tenth of all, and no more than 1 / rate.
+def update_average(
+    backend: Backend, running: Sequence[Tensor], latest: Sequence[Tensor], count: Tensor, rate: float
+) -> None:
+    """Updates a running average of parameters in place.
+
+    Update number n gets the weight 10 / n, but at least `rate` and at most 1. The average therefore covers about the
+    last tenth of all updates, and no more than the last 1 / rate updates.
 
     Args:
         backend: Computes the average.
-        running: The average.
-        latest: The parameters as they are now.
-        count: How many there have been before, a scalar; grows by one. On the parameters' device, so that a CUDA graph
-            can record this.
-        rate: The least weight of the latest; with 1 there is no averaging.
+        running: Averaged parameters.
+        latest: Parameters after the latest update, in the same order.
+        count: Number of updates before the latest, a scalar that increases by one. The count is a tensor on the
+            parameters' device, so that a CUDA graph can record this function.
+        rate: Smallest weight of the latest parameters, in [0, 1]; with 1 the average equals them.
     """
     count += 1.0
     backend.move_towards(running, latest, (1.0 / (AVERAGED_SHARE * count)).clamp(rate, 1.0))
@@ -87,8 +92,8 @@ def return_scale(range_so_far: Tensor, returns: Tensor) -> Tensor:
     """Running spread of returns between their 5th and 95th percentile, at least 1 (Hafner et al. 2023, eq. 7).
 
     Args:
-        range_so_far: Running spread, a scalar that starts at 0; updated in place. A spread that is not finite leaves it
-            unchanged; the loss of such returns is not finite either.
+        range_so_far: Running spread, a scalar that starts at 0; updated in place. Returns whose spread is not finite
+            leave it unchanged, and make the loss not finite as well.
         returns: Returns, of any shape.
     """
     flat = returns.flatten()
@@ -98,10 +103,13 @@ def return_scale(range_so_far: Tensor, returns: Tensor) -> Tensor:
 
 
 def keep_freed_memory() -> bool:
-    """Makes the C library keep freed memory for the next update; returns whether the library could do so.
+    """Makes the C library keep freed memory for the next update, which allocates the same large tensors again.
 
-    Every update allocates the same large tensors. By default glibc returns such blocks to the system at once, and the
-    system clears every page before its next use (mallopt(3): M_MMAP_THRESHOLD, M_TRIM_THRESHOLD).
+    By default glibc returns large blocks to the system at once, and the system clears every page before its next use
+    (mallopt(3): M_MMAP_THRESHOLD, M_TRIM_THRESHOLD).
+
+    Returns:
+        Whether the C library accepted the thresholds.
     """
     mallopt = getattr(ctypes.CDLL(None), "mallopt", None) if os.name == "posix" else None
     return mallopt is not None and all(mallopt(option, size) == 1 for option, size in _KEPT_BYTES.items())

@@ -14,6 +14,8 @@ SIZES = ModelConfig(
     deter_dim=64, hidden_dim=96, latent_dim=32, num_bins=31, encoder_channels=(8, 8, 12), decoder_channels=2
 )
 
+FRAME_SEQUENCES = torch.randint(0, 256, (3, 2, 64, 64, 3), dtype=torch.uint8, generator=torch.Generator().manual_seed(0))
+
 
 def build(backend):
     torch.manual_seed(0)
@@ -113,6 +115,14 @@ def moved(rate):
     return move
 
 
+def frames_shifted(model):
+    return model.backend.shift_frames(FRAME_SEQUENCES, torch.tensor([[0, 8], [4, 4], [7, 1]]), 4)
+
+
+def frames_turned(model):
+    return model.backend.turn_frames(FRAME_SEQUENCES, torch.tensor([0, 3, 2]))
+
+
 # Float32 sums in another order differ in their last bits: 1e-5 of a number near 1, and ten times that in a gradient,
 # which sums over rows and steps. Rewards are means over bins of up to 8,100, so their last bits are near 1e-3.
 EXACT, EXACT_GRADIENT, EXACT_REWARD = 1e-5, 2e-4, 2e-3
@@ -130,7 +140,8 @@ LEARNING = {
     "move by a number": (moved(0.25), EXACT),
     "move by a tensor": (moved(torch.tensor(0.25)), EXACT),
 }
-CASES = {CpuBackend: FRAMES | PLANS, GpuBackend: FRAMES | PLANS | LEARNING}
+AUGMENTATION = {"shifted frames": (frames_shifted, 0.0), "turned frames": (frames_turned, 0.0)}
+CASES = {CpuBackend: FRAMES | PLANS | AUGMENTATION, GpuBackend: FRAMES | PLANS | LEARNING}
 
 
 @pytest.mark.parametrize(("kind", "path"), [(kind, path) for kind, paths in CASES.items() for path in paths])

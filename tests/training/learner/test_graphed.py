@@ -10,7 +10,6 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from latentplan.config import Config, LearningConfig, ReplayConfig, UserError
 from latentplan.models import WorldModel
 from latentplan.replay.buffer import Replay, Rows
-from latentplan.training.learner import augmentation
 from latentplan.training.learner.graphed import WARM_UP_UPDATES, GraphedLearner
 from latentplan.training.learner.module import Learner
 from latentplan.training.learner.optimization import load_optimizer_state
@@ -138,9 +137,7 @@ class NothingRead(TorchDispatchMode):
 
 @pytest.fixture
 def watched(tiny, monkeypatch):
-    """A learner after one update, with the GPU's versions of the augmentations."""
-    for name in ("shift", "turn"):
-        monkeypatch.setattr(augmentation, f"{name}_by_slices", getattr(augmentation, f"{name}_by_index"))
+    """A learner after one update."""
     quantile = torch.quantile
 
     def marked(*arguments):
