@@ -24,8 +24,8 @@ class ReplayBatches(IterableDataset[Batch | Tensor]):
     Args:
         replay: Source of the sequences.
         config: Settings of the run.
-        curriculum: Chooses the rewards of the sequences.
-        learner: Receives the batches; its number of updates seeds the draws, so that a resumed run draws new ones.
+        curriculum: Replaces the rewards of the sequences.
+        learner: Receives the batches; its number of updates seeds the draws, so that a resumed run draws new batches.
     """
 
     def __init__(self, replay: Replay, config: Config, curriculum: Curriculum, learner: Learner) -> None:
@@ -38,20 +38,18 @@ class ReplayBatches(IterableDataset[Batch | Tensor]):
 
     def __iter__(self) -> Iterator[Batch | Tensor]:
         """Draws the batches of this epoch one by one."""
-        if (
-            self.curriculum.state.interrupted and not self.replay.written.any()
-        ):  # the run stopped before it collected anything
-            return
+        if self.curriculum.state.interrupted and not self.replay.written.any():
+            return  # the run was interrupted before it collected anything
         learning = self.config.learning
         rng = np.random.default_rng(derive_seed(self.config.run.seed, "batches", self.learner.updates))
-        gathers = isinstance(self.learner, GraphedLearner)
+        takes_rows = isinstance(self.learner, GraphedLearner)
         for _ in range(self.length):
             rows = self.replay.draw(learning.batch_size, learning.sequence_length, rng)
-            yield rows if gathers else self.curriculum(self.replay.gather(rows))
+            yield rows if takes_rows else self.curriculum(self.replay.gather(rows))
 
 
 class ReplayData(lightning.LightningDataModule):
-    """Serves `ReplayBatches` unchanged, since they are batches on the right device already.
+    """Serves `ReplayBatches` unchanged, because their batches are already on the right device.
 
     Args:
         batches: The batches of every epoch.

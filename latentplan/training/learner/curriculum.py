@@ -1,7 +1,7 @@
-"""Curriculum: replayed rewards of another task come first, and the run's own reward afterwards.
+"""Curriculum: the agent first learns the rewards of another task, and the run's own rewards afterwards.
 
-The simulator labels every frame with the rewards of all tasks of the domain and with named quantities, so that the same
-experience serves every reward.
+The simulator labels every frame with the rewards of all tasks of the domain and with named quantities, from which the
+rewards of other tasks are computed for frames that are in replay.
 """
 
 from __future__ import annotations
@@ -28,15 +28,16 @@ if TYPE_CHECKING:
 class Curriculum(lightning.Callback):
     """Replaces replayed rewards by those of `learning.curriculum_task` for `learning.curriculum_frames` frames.
 
-    The value head is then reset: old values of states that the agent no longer visits would stay high and attract it.
+    The value head is then reset. Otherwise the old values of states that the agent no longer visits would stay high and
+    attract the agent.
 
     Args:
-        config: Settings of the run. Nothing is replaced if the curriculum's task is the run's own task or objective.
+        config: Settings of the run. Rewards stay unchanged if the curriculum's task is the run's own task or objective.
         labels: Quantities that label each frame, in the order of their columns, and their scales.
         state: Clocks of the run.
 
     Attributes:
-        note: Text about the curriculum for the run's task line; empty without another task.
+        note: Text about the curriculum for the task line that a run prints at its start; empty without another task.
 
     Raises:
         UserError: `learning.curriculum_task` is neither a task nor an expression over the labels.
@@ -47,19 +48,20 @@ class Curriculum(lightning.Callback):
         self._frames, self._repeat = config.learning.curriculum_frames, config.env.action_repeat
         self._terms: tuple[tuple[float, Node], ...] = ()
         self._columns, self.note = {name: column for column, name in enumerate(labels)}, ""
-        first = config.learning.curriculum_task
+        task = config.learning.curriculum_task
         own = config.env.task if config.env.objective is None else config.env.objective
-        if self._frames > 0 and first not in (None, own):
-            self._terms = _read(first, labels)
-            self.note = f"; first {first}, for {self._frames:,} frames"
+        if self._frames > 0 and task not in (None, own):
+            self._terms = _parse_task(task, labels)
+            self.note = f"; first {task}, for {self._frames:,} frames"
 
     def __call__(self, batch: Batch) -> Batch:
-        """The batch with the rewards that are due at the present number of frames."""
+        """The batch with the rewards of the curriculum's task, or the same batch once the curriculum is over."""
         if not self._terms or self._is_over():
             return batch
         values = {name: batch.labels[..., column] for name, column in self._columns.items()}
-        paid = sum(weight * evaluate(node, values.__getitem__, scoring_degree) for weight, node in self._terms)
-        return batch._replace(rewards=summed_reward(torch.as_tensor(paid).expand(batch.labels.shape[:2]), self._repeat))
+        per_step = sum(weight * evaluate(node, values.__getitem__, scoring_degree) for weight, node in self._terms)
+        per_step = torch.as_tensor(per_step).expand(batch.labels.shape[:2])  # (batch, time + 1)
+        return batch._replace(rewards=summed_reward(per_step, self._repeat))
 
     def on_train_epoch_start(self, trainer: lightning.Trainer, learner: Learner) -> None:  # type: ignore[override]
         """Reset the value head in the first epoch that learns the run's own reward."""
@@ -71,7 +73,7 @@ class Curriculum(lightning.Callback):
         return self.state.env_frames >= self._frames
 
 
-def _read(text: str, labels: Mapping[str, float]) -> tuple[tuple[float, Node], ...]:
+def _parse_task(text: str, labels: Mapping[str, float]) -> tuple[tuple[float, Node], ...]:
     """Weighted terms of the reward, from a task's name or from an expression over quantities."""
     if TASK_PREFIX + text in labels:
         return ((1.0, Name(TASK_PREFIX + text)),)

@@ -33,7 +33,7 @@ BEHAVIOUR_LOSSES: dict[str, Loss] = {}  # functions of a `Behaviour`
 def register(
     losses: dict[str, Loss], name: str, scale: str | None = None, *, is_recorded: bool = True
 ) -> Callable[[Callable[[Any], Tensor]], Callable[[Any], Tensor]]:
-    """A decorator that adds a function to one of the two dictionaries of losses.
+    """Returns a decorator that adds a function to one of the two dictionaries of losses.
 
     Args:
         losses: `WORLD_MODEL_LOSSES` or `BEHAVIOUR_LOSSES`.
