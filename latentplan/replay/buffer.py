@@ -1,8 +1,8 @@
-"""Replay: episodes in, sequence batches out.
+"""The replay: stores collected episodes row by row, and returns batches of sequences.
 
-Each environment writes its own lane, one row per frame. A row holds the frame, the deterministic state of the belief at
-that frame, the action taken there, and the reward and continuation that arrived with the next frame. The last row of an
-episode has no action. Of a sequence in a batch, observations are one longer than actions; see `Batch`.
+Each environment has its own lane of rows, one row per frame. A row holds the frame, the deterministic state of the
+belief at that frame, the action taken there, and the reward and continuation that arrived with the next frame. The last
+row of an episode has no action. A sequence in a batch has one frame more than actions; see `Batch`.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ FRAME_SHAPE = (64, 64, 3)
 FRAME_BYTES = 64 * 64 * 3
 SAMPLING_ROUNDS = 1000
 COLUMNS = ("deter", "actions", "rewards", "continues", "labels")
-LOADED_AT_ONCE = 1024
+FRAMES_PER_READ = 1024
 
 
 @dataclass
@@ -38,7 +38,7 @@ class Rows:
         rewards: Rewards that arrived with the next frame, float32 (n,).
         continues: 1 unless the episode ended in a terminal state with the next frame, float32 (n,).
         is_first: Whether an episode starts at this row, bool (n,).
-        labels: True quantities at each frame, float32 (n, label); none of them without a simulator that tells.
+        labels: True quantities at each frame, float32 (n, label); (n, 0) if the simulator reports none.
     """
 
     frames: np.ndarray
@@ -56,11 +56,11 @@ class Batch(NamedTuple):
     Attributes:
         frames: uint8 (batch, time + 1, 64, 64, 3).
         deter: Deterministic state of the belief at the first frame, float32 (batch, deter).
-        actions: actions[t] was taken at frames[t], (batch, time, action).
+        actions: actions[t] in [-1, 1] was taken at frames[t], (batch, time, action).
         rewards: rewards[t] arrived with frames[t + 1], (batch, time).
-        continues: 1 where the episode went on at frames[t + 1], 0 where that is a terminal state, (batch, time).
+        continues: continues[t] is 0 if frames[t + 1] shows a terminal state, else 1, (batch, time).
         labels: True quantities at each frame, (batch, time + 1, label).
-        rows: Where each frame lives in replay, (batch, time + 1), for `Replay.refresh`.
+        rows: Row of the replay that holds each frame, int64 (batch, time + 1); `Replay.refresh` takes these rows.
     """
 
     frames: Tensor
@@ -139,8 +139,9 @@ class Replay:
     def draw(self, batch_size: int, sequence_length: int, rng: np.random.Generator) -> Tensor:
         """Rows of uniformly drawn sequences, (batch, time + 1).
 
-        A sequence lies within one episode, or reaches beyond its terminal state. Without the second case a single start
-        would reach the transition to a terminal state, while `sequence_length` starts reach any other transition.
+        A sequence lies within one episode, or continues in the next episode after a terminal state. Without the second
+        kind only one sequence would contain the transition to a terminal state, while `sequence_length` sequences
+        contain any other transition.
 
         Args:
             batch_size: Number of sequences.
@@ -156,7 +157,7 @@ class Replay:
         return torch.as_tensor(positions, device=self.device)
 
     def gather(self, rows: Tensor) -> Batch:
-        """The sequences at rows (batch, time + 1); nothing is read back from the device."""
+        """The sequences at rows (batch, time + 1); no value is read back from the device."""
         acted = rows[:, :-1]
         return Batch(
             frames=self.frames[rows],
@@ -172,13 +173,13 @@ class Replay:
         """Replaces the stored beliefs of some rows by newer beliefs.
 
         Args:
-            rows: Indices in the replay, (batch, time). Of a row that occurs twice the last chosen belief counts.
+            rows: Indices in the replay, (batch, time). A row that occurs more than once gets its last chosen belief.
             deter: The newer beliefs, (batch, time, deter).
             chosen: The beliefs to store, bool (batch, time).
         """
         index = rows.flatten().to(self.device)
         is_chosen = chosen.to(self.device).flatten()
-        # Every occurrence writes the value of the last one chosen: parallel writes to one place have no order.
+        # Parallel writes to one row have no order, so every occurrence of a row writes the row's last chosen belief.
         in_order, order = (2 * index + is_chosen).sort(stable=True)
         last = order[torch.searchsorted(in_order, 2 * index + 1, right=True) - 1]
         newer = deter.flatten(0, 1).to(self.deter)[last]
@@ -191,7 +192,7 @@ class Replay:
         after a change of the capacity writes all rows.
 
         Args:
-            folder: Folder of the replay, made where it is missing.
+            folder: Folder of the replay; created if it is missing.
         """
         folder.mkdir(parents=True, exist_ok=True)
         for lane in range(self.num_lanes):
@@ -210,7 +211,7 @@ class Replay:
         self._saved = self.written.copy()
 
     def load(self, folder: Path) -> None:
-        """Restores the rows that `save` wrote; where the capacity is smaller now, the newest of them.
+        """Restores the rows that `save` wrote, or only the newest rows if the capacity is smaller now.
 
         Raises:
             UserError: The folder holds no complete replay, or its lanes, actions, beliefs or labels have other sizes.
@@ -239,17 +240,25 @@ class Replay:
             self._load_frames(folder / f"frames_{lane}.u8", min(written, saved_size), old, index)
 
     def _load_frames(self, path: Path, count: int, slots: np.ndarray, index: Tensor) -> None:
-        """Copies the frames at `slots` of a file of `count` frames to the rows `index` of this replay."""
+        """Copies frames of a file into this replay.
+
+        Args:
+            path: File of `count` frames.
+            count: Number of frames that the file must hold.
+            slots: Places of the copied frames in the file, (n,).
+            index: Rows of this replay that receive the frames, (n,).
+        """
         if count == 0:
             return
         if not path.exists() or path.stat().st_size < count * FRAME_BYTES:
             raise UserError(f"{path} is damaged: it must hold {count:,} frames")
         stored = np.memmap(path, np.uint8, "r", shape=(count, *FRAME_SHAPE))
-        for start in range(0, len(slots), LOADED_AT_ONCE):
-            part = slice(start, start + LOADED_AT_ONCE)
+        for start in range(0, len(slots), FRAMES_PER_READ):
+            part = slice(start, start + FRAMES_PER_READ)
             self.frames[index[part]] = torch.from_numpy(stored[slots[part]]).to(self.device)
 
     def _draw_starts(self, count: int, length: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+        """Lane and first position of `count` sequences of `length` decisions, (count,) each."""
         held = np.minimum(self.written, self.lane_size)
         oldest = self.written - held
         lanes, starts = np.empty(0, np.int64), np.empty(0, np.int64)
@@ -263,12 +272,12 @@ class Replay:
         for _ in range(SAMPLING_ROUNDS):
             lane = rng.choice(self.num_lanes, size=2 * count, p=held / held.sum())
             offset = rng.integers(0, held[lane])
-            start, left = oldest[lane] + offset, held[lane] - offset
+            start, num_following = oldest[lane] + offset, held[lane] - offset
             steps = (start[:, None] + np.arange(length + 1)) % self.lane_size
             is_same = self.episode[lane[:, None], steps] == self.episode[lane[:, None], steps[:, :1]]
             last = is_same.cumprod(1).sum(1) - 1  # steps until the last row of the episode, at most the length
-            ends = self.is_end[lane, steps[np.arange(len(last)), last - 1]] & (last > 0)
-            keep = (last < left) & ((last == length) | ends)
+            is_terminal = self.is_end[lane, steps[np.arange(len(last)), last - 1]] & (last > 0)
+            keep = (last < num_following) & ((last == length) | is_terminal)
             lanes, starts = np.concatenate([lanes, lane[keep]]), np.concatenate([starts, start[keep]])
             if len(starts) >= count:
                 return lanes[:count], starts[:count]
@@ -281,7 +290,7 @@ def read_saved(path: Path, device: torch.device | str = "cpu", keys: Sequence[st
     Args:
         path: The file.
         device: Device of the tensors.
-        keys: Keys that the object, then a dictionary, must have.
+        keys: If any are given, the object must be a dictionary with these keys.
 
     Raises:
         UserError: The file is damaged, or lacks one of the keys.

@@ -1,4 +1,4 @@
-"""The memory that is free for a replay."""
+"""Free memory for a replay."""
 
 from __future__ import annotations
 
@@ -41,12 +41,12 @@ def check_memory(num_bytes: int, device: torch.device) -> None:
 
 
 def free_memory() -> int:
-    """Bytes of free main memory within a container's limit; `sys.maxsize` where the system does not say."""
-    return min(_machine_memory(), _left_of_limit())
+    """Bytes of free main memory within the limit of a container; `sys.maxsize` if the system reports neither."""
+    return min(_machine_memory(), _cgroup_memory())
 
 
 def _machine_memory() -> int:
-    """Bytes of available memory of the machine; without /proc its total memory."""
+    """Bytes of available memory of the machine, or of its total memory on a system without /proc."""
     if MEMORY_FACTS.exists():
         for line in MEMORY_FACTS.read_text().splitlines():
             if line.startswith("MemAvailable:"):
@@ -56,12 +56,12 @@ def _machine_memory() -> int:
     return sys.maxsize
 
 
-def _left_of_limit() -> int:
-    """Bytes left by the control group (version 2) of a container; inactive file pages count as free."""
+def _cgroup_memory() -> int:
+    """Bytes that a container's control group (version 2) leaves; inactive file pages count as free."""
     try:
         limit = (LIMIT_FACTS / "memory.max").read_text().strip()
         used = int((LIMIT_FACTS / "memory.current").read_text())
         pages = dict(line.split() for line in (LIMIT_FACTS / "memory.stat").read_text().splitlines())
     except OSError:
-        return sys.maxsize  # no such limit
+        return sys.maxsize  # the process is in no limited control group of version 2
     return sys.maxsize if limit == "max" else max(0, int(limit) - used + int(pages.get("inactive_file", 0)))
