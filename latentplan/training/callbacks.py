@@ -32,15 +32,16 @@ CLOCKS = ("env_frames", "decisions", "updates", "minutes")
 COLUMNS = (*CLOCKS, "episode_return", "planner_return", "actor_return", "planner_minus_actor")  # losses follow these
 
 
-class Experience(lightning.Callback):
+class Collect(lightning.Callback):
     """Collects one round of experience per epoch, and evaluates the agent when an evaluation is due.
 
-    This callback asks the worker for a round when an epoch starts, and takes the result when the next epoch starts. A
-    worker in another process therefore acts while the learner learns, with the averaged weights of the epoch's start.
+    This callback requests a round from the worker when an epoch starts, and stores the result when the next epoch
+    starts. A worker in another process therefore acts while the learner learns, with the averaged weights that the
+    learner had when the epoch started.
 
     Args:
         config: Settings of the run.
-        replay: Where collected rows go.
+        replay: Stores the collected rows.
         state: Clocks of the run, which this callback advances.
         worker: Collects and evaluates.
         videos: Folder for the films of evaluations.
@@ -54,70 +55,71 @@ class Experience(lightning.Callback):
         self.config, self.replay, self.state, self.worker, self.videos = config, replay, state, worker, videos
         self.episode_returns: list[float] = []
         self.evaluated_weights: dict[str, np.ndarray] = {}
-        self._asked_evaluation: tuple[dict[str, Any], dict[str, np.ndarray]] | None = None
-        self._asked_round = False
+        self._pending_evaluation: tuple[dict[str, Any], dict[str, np.ndarray]] | None = None  # its clocks and weights
+        self._is_round_pending = False
 
     def on_train_epoch_start(self, trainer: lightning.Trainer, learner: Learner) -> None:  # type: ignore[override]
-        """Take the results asked for one epoch ago, and ask for the next round and evaluation."""
+        """Store the results that were requested one epoch ago, and request the next round and evaluation."""
         settings, state = self.config.collection, self.state
         while (missing := min(settings.prefill_decisions - state.decisions, self._decisions_left())) > 0:
             self.worker.submit("collect", None, "random", missing, state.rounds)
-            self._asked_round = True
-            self.take()
+            self._is_round_pending = True
+            self.store_results()
             if state.interrupted:
                 trainer.should_stop = True
                 return
         weights = weights_of(learner.averaged)
-        if not self._asked_round and state.rounds == state.learned_rounds:  # a resumed run has no new experience yet
-            self._ask_round(weights)
-        self.take()
+        has_new_rows = state.rounds != state.learned_rounds  # false when a run was resumed after a finished epoch
+        if not (self._is_round_pending or has_new_rows):
+            self._request_round(weights)
+        self.store_results()
         if state.interrupted:
             return
-        self._ask_round(weights)
-        if self._asked_round and state.env_frames >= state.next_evaluation:
-            self._ask_evaluation(learner.updates, weights)
+        self._request_round(weights)
+        if self._is_round_pending and state.env_frames >= state.next_evaluation:
+            self._request_evaluation(learner.updates, weights)
 
     def on_train_epoch_end(self, trainer: lightning.Trainer, learner: Learner) -> None:  # type: ignore[override]
-        """Finish the behaviour update that still runs, before other callbacks read the learner."""
+        """Make the outstanding behaviour update, before other callbacks read the learner."""
         learner.catch_up()
         if not self.state.interrupted:
             self.state.learned_rounds = self.state.rounds
 
-    def take(self) -> None:
-        """Wait for the round and the evaluation that were asked for, and store their results.
+    def store_results(self) -> None:
+        """Wait for the requested round and evaluation, and store their results.
 
-        A signal to the whole process group also ends the worker. An interrupted run therefore drops the requests that
-        the worker cannot answer; the resumed run makes them again.
+        A signal to the whole process group also ends the worker. An interrupted run therefore drops requests that the
+        worker cannot answer; the resumed run makes the same requests again.
         """
         try:
-            self._take()
+            self._store_results()
         except RuntimeError:
             if not self.state.interrupted:
                 raise
-            self._asked_round, self._asked_evaluation = False, None
+            self._is_round_pending, self._pending_evaluation = False, None
 
-    def _take(self) -> None:
-        if self._asked_round:
-            self._take_round()
-            self._asked_round = False
-        if self._asked_evaluation is not None:
+    def _store_results(self) -> None:
+        if self._is_round_pending:
+            self._store_round()
+            self._is_round_pending = False
+        if self._pending_evaluation is not None:
             returns = self.worker.result()
-            clocks, self.evaluated_weights = self._asked_evaluation
+            clocks, self.evaluated_weights = self._pending_evaluation
             entry = clocks | {mode: float(np.mean(values)) for mode, values in returns.items()}
             self.state.evaluations.append(entry)
-            # The date moves on only now, so that an evaluation cut off by an interruption is due again.
+            # Set only now, so that a resumed run repeats an evaluation that was interrupted.
             every = self.config.evaluation.every_frames
             self.state.next_evaluation = (entry["env_frames"] // every + 1) * every
-            self._asked_evaluation = None
+            self._pending_evaluation = None
 
-    def _ask_round(self, weights: dict[str, np.ndarray]) -> None:
-        """Ask for the next round, if the budget has frames left."""
+    def _request_round(self, weights: dict[str, np.ndarray]) -> None:
+        """Request the next round, if the budget has frames left."""
         settings, state = self.config.collection, self.state
         decisions = min(settings.round_decisions, self._decisions_left())
         if decisions > 0:
             behaviour, goal = choose_behaviour(settings, state.rounds, state.env_frames)
             self.worker.submit("collect", weights, behaviour, decisions, state.rounds, goal)
-            self._asked_round = True
+            self._is_round_pending = True
 
     def _decisions_left(self) -> int:
         frames = self.config.run.frames
@@ -125,14 +127,14 @@ class Experience(lightning.Callback):
             return sys.maxsize
         return -(-(frames - self.state.env_frames) // self.config.env.action_repeat)
 
-    def _ask_evaluation(self, updates: int, weights: dict[str, np.ndarray]) -> None:
+    def _request_evaluation(self, updates: int, weights: dict[str, np.ndarray]) -> None:
         state, settings = self.state, self.config.evaluation
         clocks = {"env_frames": state.env_frames, "decisions": state.decisions, "updates": updates}
-        self._asked_evaluation = clocks | {"minutes": round(state.minutes, 3)}, weights
+        self._pending_evaluation = clocks | {"minutes": round(state.minutes, 3)}, weights
         film = self.videos / f"{state.env_frames:09d}.webm" if settings.video else None
         self.worker.submit("evaluate", settings.episodes, film)
 
-    def _take_round(self) -> None:
+    def _store_round(self) -> None:
         collected: Collected = self.worker.result()
         for lane, rows in enumerate(collected.rows):
             self.replay.add(lane, rows)
@@ -185,7 +187,7 @@ class MetricsFile:
         self.path, self.columns = path, tuple(columns)
 
     def append(self, row: Mapping[str, float]) -> None:
-        """Add one row; a name of the header that the row lacks stays empty."""
+        """Add one row; columns for which the row has no figure stay empty."""
         header = self._read_header()
         columns = list(dict.fromkeys([*(header or self.columns), *row]))
         if columns != header:
@@ -228,12 +230,12 @@ class Record(lightning.Callback):
     Args:
         path: Path of metrics.csv.
         state: Clocks and evaluations of the run.
-        experience: Source of the returns of collected episodes.
+        collect: Source of the returns of collected episodes.
         progress: Display of the run.
     """
 
-    def __init__(self, path: Path, state: RunState, experience: Experience, progress: Progress) -> None:
-        self.file, self.state, self.experience, self.progress = MetricsFile(path, COLUMNS), state, experience, progress
+    def __init__(self, path: Path, state: RunState, collect: Collect, progress: Progress) -> None:
+        self.file, self.state, self.collect, self.progress = MetricsFile(path, COLUMNS), state, collect, progress
         self._num_written_evaluations = len(state.evaluations)
 
     def on_fit_start(self, trainer: lightning.Trainer, learner: Learner) -> None:  # type: ignore[override]
@@ -251,10 +253,10 @@ class Record(lightning.Callback):
         state = self.state
         clocks = {"env_frames": state.env_frames, "decisions": state.decisions, "updates": learner.updates}
         row: dict[str, float] = clocks | {"minutes": round(state.minutes, 3)}
-        if self.experience.episode_returns:
-            row["episode_return"] = float(np.mean(self.experience.episode_returns))
+        if self.collect.episode_returns:
+            row["episode_return"] = float(np.mean(self.collect.episode_returns))
             self.progress.episode_return = row["episode_return"]
-            self.experience.episode_returns.clear()
+            self.collect.episode_returns.clear()
         for name in sorted(learner.metrics, key=lambda name: name.endswith("_grad_norm")):  # losses, then the norms
             row[name] = float(learner.metrics[name])
         self._append(trainer, row)
@@ -280,22 +282,22 @@ class Save(lightning.Callback):
     Args:
         folder: Folder of the run.
         config: Settings of the run.
-        experience: Source of the evaluated weights and of the replay.
+        collect: Source of the evaluated weights and of the replay.
         state: Clocks and evaluations of the run.
-        facts: Facts of the run that every saved agent carries.
-        optimizers: States that the optimizers were loaded with; saved again if the run ends before it learns.
+        facts: Facts of the run that are saved with every agent.
+        optimizers: States that the optimizers were loaded with; saved again if the run ends before its first update.
     """
 
     def __init__(
         self,
         folder: Path,
         config: Config,
-        experience: Experience,
+        collect: Collect,
         state: RunState,
         facts: dict[str, Any],
         optimizers: list[Any],
     ) -> None:
-        self.folder, self.config, self.experience, self.state, self.facts = folder, config, experience, state, facts
+        self.folder, self.config, self.collect, self.state, self.facts = folder, config, collect, state, facts
         self._loaded_optimizers = optimizers
         self._num_seen_evaluations = len(state.evaluations)
         self._saved_minutes = state.minutes
@@ -317,7 +319,7 @@ class Save(lightning.Callback):
         if (latest := self.state.evaluations[-1])["planner"] > self.state.best_return:
             self.state.best_return = latest["planner"]
             evaluated = copy.deepcopy(learner.averaged)
-            weights = self.experience.evaluated_weights
+            weights = self.collect.evaluated_weights
             evaluated.load_state_dict({name: torch.from_numpy(value) for name, value in weights.items()})
             self.save_agent("best", evaluated, {name: latest[name] for name in ("env_frames", "updates", "minutes")})
         return True
@@ -332,10 +334,10 @@ class Save(lightning.Callback):
         """Save the state from which the run resumes."""
         optimizers = [optimizer.state_dict() for optimizer in trainer.optimizers] or self._loaded_optimizers
         saved = {"weights": learner.state_dict(), "updates": learner.updates}
-        save_state(self.folder / "resume", self.state, saved, optimizers, self.experience.replay)
+        save_state(self.folder / "resume", self.state, saved, optimizers, self.collect.replay)
 
     def save_agent(self, name: str, model: WorldModel, info: dict[str, Any]) -> None:
-        """Save an agent in `checkpoints/<name>`, with its own facts beside the facts of the run."""
+        """Save an agent in `checkpoints/<name>`, with the facts in `info` and the facts of the run."""
         facts = self.facts | info | {"metrics": self.state.evaluations}
         save_checkpoint(self.folder / "checkpoints" / name, model, self.config, facts)
 
@@ -379,11 +381,11 @@ class Stop(lightning.Callback):
 
     def on_train_batch_end(self, trainer: lightning.Trainer, *_: Any) -> None:  # type: ignore[override]
         """Stop between two updates when the minutes are spent or the user interrupted."""
-        if self.state.interrupted or self._is_late():
+        if self.state.interrupted or self._is_time_spent():
             trainer.should_stop = True
 
     def on_train_epoch_end(self, trainer: lightning.Trainer, learner: lightning.LightningModule) -> None:
-        """Stop when the learner has learned from the last round."""
+        """Stop after the epoch that learned from the last round."""
         if self.is_spent():
             trainer.should_stop = True
 
@@ -395,9 +397,9 @@ class Stop(lightning.Callback):
     def is_spent(self) -> bool:
         """Whether the budget of frames or minutes is used up."""
         frames = self.run.frames
-        return self._is_late() or (frames is not None and self.state.env_frames >= frames)
+        return self._is_time_spent() or (frames is not None and self.state.env_frames >= frames)
 
-    def _is_late(self) -> bool:
+    def _is_time_spent(self) -> bool:
         return self.run.minutes is not None and self.state.minutes >= self.run.minutes
 
     def _interrupt(self, number: int, frame: Any) -> None:

@@ -21,7 +21,7 @@ class Progress:
         run: Budget of the run, from which the remaining time is estimated.
 
     Attributes:
-        console: For lines that stay.
+        console: Prints lines that stay.
         episode_return: Mean return of the latest collected episodes, or None.
     """
 
@@ -45,14 +45,14 @@ class Progress:
             self._live.stop()
 
     def update(self, state: RunState, updates: int) -> None:
-        """Show clocks and speed, unless the last line is too recent."""
+        """Show clocks and speed, unless the last line was shown less than a pause ago."""
         now = time.monotonic()
         pause = SECONDS_IN_A_LOG if self._live is None else SECONDS_ON_A_TERMINAL
         if now - self._last_time < pause:
             return
         self._rate = (updates - self._last_updates) / (now - self._last_time)
         self._last_time, self._last_updates = now, updates
-        line = self._line(state)
+        line = self._format_line(state)
         if self._live is None:
             self.console.print(line)
         else:
@@ -67,7 +67,7 @@ class Progress:
             f"planner {planner:6.1f}  actor {actor:6.1f}  difference {planner - actor:+6.1f}"
         )
 
-    def _line(self, state: RunState) -> str:
+    def _format_line(self, state: RunState) -> str:
         left = [self.run.minutes - state.minutes] if self.run.minutes else []
         if self.run.frames and state.env_frames:
             left.append(state.minutes * (self.run.frames / state.env_frames - 1.0))
@@ -100,7 +100,7 @@ class StatusLine:
             self._live.stop()
 
     def update(self, line: str) -> None:
-        """Show the present activity, unless the last line in the log is too recent."""
+        """Show a line about the present activity; in a log only if the last line is 30 seconds old."""
         if self._live is not None:
             self._live.update(line)
         elif time.monotonic() - self._last_time >= SECONDS_IN_A_LOG:

@@ -1,4 +1,4 @@
-"""The folder of a run: refuse folders in use, and lock a folder while a process learns in it."""
+"""The folder of a run: refusal of folders in use, and a lock while a process learns in the folder."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def refuse_used(folder: Path, own_file: str, flag: str) -> None:
 
     Args:
         folder: Where a new run or agent is about to be written.
-        own_file: The file in `CONTENTS` from which the caller could resume; the message then names `--resume`.
+        own_file: The file in `CONTENTS` from which the caller can resume; if it exists, the message names `--resume`.
         flag: The flag that chooses another folder.
 
     Raises:

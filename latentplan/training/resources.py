@@ -28,16 +28,15 @@ def choose_device(run: RunConfig) -> torch.device:
 
 
 def choose_threads(overlap: bool) -> int:
-    """Threads of each half of an update, so that no two busy threads share a core.
+    """CPU threads of each half of an update: of the world model, and of the behaviour, which learn at the same time.
 
-    The world model and the behaviour learn side by side with this many threads each. With `overlap` one core is left to
-    the collection process.
+    No two busy threads share a core. With `overlap` one core is left to the collection process.
     """
     return max(1, (_count_cores() - overlap) // 2)
 
 
-def collector_threads(device: torch.device) -> int:
-    """Threads of the collection process beside a learner: one beside a CPU learner, up to 4 beside a GPU learner."""
+def choose_collector_threads(device: torch.device) -> int:
+    """CPU threads of the collection process: one if the learner uses the CPU, up to 4 if the learner uses a GPU."""
     return 1 if device.type == "cpu" else min(max(1, _count_cores() // 4), COLLECTOR_THREADS)
 
 
@@ -48,12 +47,12 @@ def set_up_torch(threads: int, device: torch.device) -> None:
         torch.set_float32_matmul_precision("high")  # TF32, which has three more bits than bfloat16
 
 
-def replay_capacity(config: Config, saved: Path) -> int:
+def choose_replay_capacity(config: Config, saved: Path) -> int:
     """Rows of the replay: `replay.capacity`, or else enough for everything that the run collects.
 
     Args:
         config: Settings of the run.
-        saved: Folder of the saved replay, if there is one: the capacity never drops below the saved rows.
+        saved: Folder of the saved replay, which may be missing. Without `replay.capacity` all saved rows fit.
     """
     if config.replay.capacity is not None:
         return config.replay.capacity

@@ -22,7 +22,7 @@ from latentplan.envs import default_task
 from latentplan.models import WorldModel
 from latentplan.models.fast import accelerate
 from latentplan.replay.buffer import Replay
-from latentplan.training.callbacks import Experience, Record, Restore, Save, Stop, weights_of
+from latentplan.training.callbacks import Collect, Record, Restore, Save, Stop, weights_of
 from latentplan.training.collection.collector import Description, EnvFactory
 from latentplan.training.collection.process import Worker, make_worker
 from latentplan.training.console import Progress
@@ -30,8 +30,8 @@ from latentplan.training.folder import lock_folder, refuse_used
 from latentplan.training.learner.batches import ReplayBatches, ReplayData
 from latentplan.training.learner.curriculum import Curriculum
 from latentplan.training.learner.graphed import make_learner
-from latentplan.training.resources import choose_device, choose_threads, replay_capacity, set_up_torch
-from latentplan.training.state import INTERRUPTED, RunState, load_state, restore
+from latentplan.training.resources import choose_device, choose_replay_capacity, choose_threads, set_up_torch
+from latentplan.training.state import INTERRUPTED, RunState, load_state, restore_learner
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -138,7 +138,7 @@ def _start(config: Config, folder: Path, make_env: EnvFactory | None, *, resume:
 
 
 class _Run:
-    """The parts of a run: worker, replay, learner, curriculum and display."""
+    """A run with its worker, replay, learner, curriculum and display."""
 
     def __init__(self, config: Config, folder: Path, make_env: EnvFactory | None, *, resume: bool) -> None:
         self.config, self.folder = config, folder
@@ -160,11 +160,16 @@ class _Run:
             torch.manual_seed(derive_seed(config.run.seed, "weights"))
             model = WorldModel(config.model, self.description.action_dim, self.description.labels).to(self.device)
         accelerate(model)
-        on = self.device if config.replay.on_device else torch.device("cpu")
+        replay_device = self.device if config.replay.on_device else torch.device("cpu")
         saved_replay = self.folder / "resume" / "replay"
-        capacity, num_labels = replay_capacity(config, saved_replay), len(model.labels)
-        sizes = (capacity, model.action_dim, config.model.deter_dim, config.env.num_envs)
-        self.replay = Replay(*sizes, on, num_labels)
+        self.replay = Replay(
+            choose_replay_capacity(config, saved_replay),
+            model.action_dim,
+            config.model.deter_dim,
+            config.env.num_envs,
+            replay_device,
+            len(model.labels),
+        )
         self.state, saved = RunState(), None
         self._saved_optimizers: list[Any] = []
         if resume:
@@ -173,7 +178,7 @@ class _Run:
         self.curriculum = Curriculum(config, model.labels, self.state)
         self.learner = make_learner(model, config, self.description.discount, self.replay, self.curriculum)
         if saved is not None:
-            restore(self.learner, saved, self.folder)
+            restore_learner(self.learner, saved, self.folder)
 
     def execute(self) -> Result:
         """Learn until the budget is spent or the user interrupts, then evaluate."""
@@ -184,14 +189,14 @@ class _Run:
 
     def _execute(self) -> Result:
         config = self.config
-        self._announce()
+        self._print_settings()
         videos = self.folder / "videos"
         videos.mkdir(exist_ok=True)
-        experience = Experience(config, self.replay, self.state, self.worker, videos)
-        save = Save(self.folder, config, experience, self.state, self._facts(), self._saved_optimizers)
+        collect = Collect(config, self.replay, self.state, self.worker, videos)
+        save = Save(self.folder, config, collect, self.state, self._agent_facts(), self._saved_optimizers)
         stop = Stop(config, self.state)
-        record = Record(self.folder / "metrics.csv", self.state, experience, self.console)
-        trainer = self._trainer([experience, self.curriculum, record, save, stop])
+        record = Record(self.folder / "metrics.csv", self.state, collect, self.console)
+        trainer = self._trainer([collect, self.curriculum, record, save, stop])
         batches = ReplayBatches(self.replay, config, self.curriculum, self.learner)
         if not self._saved_optimizers:
             save.save_run(trainer, self.learner)  # makes a run that ends before its first save resumable
@@ -202,7 +207,7 @@ class _Run:
             finally:
                 self.console.stop()
             if not self.state.interrupted:
-                experience.take()
+                collect.store_results()
                 record.write_evaluations(trainer)
                 save.keep_best(self.learner)
             save.save(trainer, self.learner)
@@ -260,7 +265,7 @@ class _Run:
     def _evaluate_best(self) -> float:
         """Mean return of the saved best agent's planner on the final starts; -inf if no best agent can be read.
 
-        The best of many short evaluations is also high by chance, so the final starts decide between best and last.
+        The highest mean of many short evaluations is partly chance, so the final starts decide between best and last.
         """
         folder = self.folder / "checkpoints" / "best"
         if not (folder / "info.json").exists():
@@ -273,11 +278,11 @@ class _Run:
         self.console.console.print(
             f"evaluating the best agent so far, of {info['env_frames']:,} frames, on the same starts"
         )
-        earned = float(np.mean(self._evaluate(model, actor=False)["planner"]))
-        self.console.console.print(f"its planner earned {earned:.1f}; checkpoints/best is the better of the two")
-        return earned
+        mean = float(np.mean(self._evaluate(model, actor=False)["planner"]))
+        self.console.console.print(f"its planner earned {mean:.1f}; checkpoints/best is the better of the two")
+        return mean
 
-    def _announce(self) -> None:
+    def _print_settings(self) -> None:
         config, description, run, env = self.config, self.description, self.config.run, self.config.env
         parameters = sum(parameter.numel() for parameter in self.learner.model.parameters())
         budget = [f"{run.frames:,} frames"] if run.frames else []
@@ -297,7 +302,7 @@ class _Run:
         for name, line in lines.items():
             self.console.console.print(f"{name:<12}{line}", soft_wrap=True)
 
-    def _facts(self) -> dict[str, Any]:
+    def _agent_facts(self) -> dict[str, Any]:
         from latentplan import __version__
 
         return {

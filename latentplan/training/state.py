@@ -28,13 +28,13 @@ class RunState:
         decisions: Decisions so far.
         rounds: Collection rounds so far.
         learned_rounds: Value of `rounds` when the last epoch ended; -1 before the first epoch.
-        earlier_minutes: Wall-clock minutes of the run before `started`.
+        earlier_minutes: Wall-clock minutes that the run had taken by `started`.
         next_evaluation: Value of `env_frames` at which the next evaluation is due.
         best_return: Best mean return of the planner in an evaluation so far.
         evaluations: One entry per evaluation: env_frames, decisions, updates, minutes, planner, actor.
         curriculum_over: Whether the value head was reset after the curriculum's task.
         interrupted: Whether the user asked to stop.
-        started: Time at which this process took over, in seconds of the monotonic clock.
+        started: Time from which `minutes` counts on, in seconds of the monotonic clock of this process.
     """
 
     env_frames: int = 0
@@ -75,11 +75,11 @@ def save_state(folder: Path, state: RunState, learner: dict[str, Any], optimizer
         replay: The replay; its new rows are appended to the saved ones.
     """
     replay.save(folder / "replay")
-    save_whole({"run": state.to_dict(), "learner": learner, "optimizers": optimizers}, folder / STATE_FILE)
+    save_atomically({"run": state.to_dict(), "learner": learner, "optimizers": optimizers}, folder / STATE_FILE)
 
 
-def save_whole(saved: dict[str, Any], path: Path) -> None:
-    """Writes a file with `torch.save` and replaces an earlier one in one step, so that no crash leaves half a file."""
+def save_atomically(saved: dict[str, Any], path: Path) -> None:
+    """Writes a file with `torch.save`; an earlier file stays whole until the new one replaces it in one step."""
     make_folder(path.parent)
     part = path.with_name(f"{path.name}.part")
     torch.save(saved, part)
@@ -101,14 +101,14 @@ def load_state(folder: Path, device: torch.device) -> tuple[RunState, dict[str, 
         raise UserError(f"{folder / STATE_FILE} is damaged: {error}") from None
 
 
-def restore(learner: Learner, saved: dict[str, Any], folder: Path) -> None:
+def restore_learner(learner: Learner, saved: dict[str, Any], folder: Path) -> None:
     """Loads a saved state into a learner.
 
     A run saved before averaged weights existed starts its average from the saved weights.
 
     Args:
         learner: The learner to load into.
-        saved: Its `weights` and number of `updates`.
+        saved: The saved `weights` and number of `updates`.
         folder: Folder of the run, for the error message.
 
     Raises:

@@ -8,7 +8,7 @@ import torch
 
 from latentplan.agents.checkpoint import read_info
 from latentplan.training import resume, train
-from latentplan.training.callbacks import Experience, Save, Stop
+from latentplan.training.callbacks import Collect, Save, Stop
 from latentplan.training.collection.collector import Collector
 from latentplan.training.state import RunState
 from tests.training.run_folder import saved_state
@@ -18,14 +18,14 @@ from tests.training.run_folder import saved_state
 def observed(tiny, dot, tmp_path_factory):
     """Weights that a run evaluated, saved as best and collected with; the next evaluation always follows at once."""
     evaluated, saved, collected = [], [], []
-    collect, start = Collector.collect, Experience.on_train_epoch_start
+    collect, start = Collector.collect, Collect.on_train_epoch_start
 
     def state_of(model):
         return {name: value.clone() for name, value in model.state_dict().items()}
 
     def evaluate(collector, episodes, film=None, weights=None, actor=True):
         if weights is not None:
-            collector._load(weights)
+            collector._load_weights(weights)
         evaluated.append(state_of(collector.model))
         return {"planner": [float(len(evaluated))], "actor": [0.0]}  # every evaluation is better than the last
 
@@ -37,9 +37,9 @@ def observed(tiny, dot, tmp_path_factory):
         collected.append((weights,))
         return collect(collector, weights, *arguments)
 
-    def keep_models(experience, trainer, learner):
+    def keep_models(callback, trainer, learner):
         before = len(collected)
-        start(experience, trainer, learner)
+        start(callback, trainer, learner)
         if len(collected) > before:
             collected[-1] += (state_of(learner.averaged), state_of(learner.model))
 
@@ -47,7 +47,7 @@ def observed(tiny, dot, tmp_path_factory):
         patch.setattr(Collector, "evaluate", evaluate)
         patch.setattr(Collector, "collect", keep_weights)
         patch.setattr(Save, "save_agent", save_agent)
-        patch.setattr(Experience, "on_train_epoch_start", keep_models)
+        patch.setattr(Collect, "on_train_epoch_start", keep_models)
         train(tiny(tmp_path_factory.mktemp("observed") / "run", evaluation={"every_frames": 15}), dot)
     return evaluated, saved, [entry for entry in collected if entry[0] is not None]
 
@@ -113,23 +113,23 @@ def test_best_agent_is_evaluated_with_the_planner_only(compared):
 
 
 def test_evaluation_that_runs_when_the_time_is_up_can_be_the_best(tiny, dot, tmp_path, monkeypatch):
-    monkeypatch.setattr(Stop, "_is_late", lambda stop: stop.state.decisions >= 45)
+    monkeypatch.setattr(Stop, "_is_time_spent", lambda stop: stop.state.decisions >= 45)
     monkeypatch.setattr(Collector, "evaluate", evaluating(iter([1.0, -1.0, 1.0]), []))
     run = train(tiny(tmp_path / "run"), dot)
     assert [entry["planner"] for entry in saved_state(run.run_dir)["run"]["evaluations"]] == [1.0]
     assert frames_of(run.run_dir)["best"] == 45
 
 
-def test_take_drops_requests_of_a_worker_that_ended_with_an_interrupted_run(tiny, tmp_path):
+def test_store_results_drops_requests_of_a_worker_that_ended_with_an_interrupted_run(tiny, tmp_path):
     class Gone:
         def result(self):
             raise RuntimeError("the collection process ended unexpectedly")
 
     state = RunState()
-    experience = Experience(tiny(tmp_path), None, state, Gone(), tmp_path)
-    experience._asked_round = True
+    collect = Collect(tiny(tmp_path), None, state, Gone(), tmp_path)
+    collect._is_round_pending = True
     with pytest.raises(RuntimeError, match="ended unexpectedly"):
-        experience.take()
+        collect.store_results()
     state.interrupted = True
-    experience.take()
-    assert not experience._asked_round
+    collect.store_results()
+    assert not collect._is_round_pending

@@ -54,8 +54,8 @@ def test_metrics_file_drops_chosen_rows_and_a_row_written_in_part(file):
 def test_record_writes_each_metric_of_the_learner_to_csv_and_tensorboard(tmp_path):
     """The header orders losses as the learner does, and gradient norms after them."""
     state = RunState(env_frames=30, decisions=15, earlier_minutes=2.0)
-    experience = SimpleNamespace(episode_returns=[4.0, 6.0])
-    record = Record(tmp_path / "metrics.csv", state, experience, SimpleNamespace(episode_return=None))
+    collect = SimpleNamespace(episode_returns=[4.0, 6.0])
+    record = Record(tmp_path / "metrics.csv", state, collect, SimpleNamespace(episode_return=None))
     names = ("reconstruction", "model_grad_norm", "surprise", "behaviour_grad_norm")
     learner = SimpleNamespace(updates=7, metrics={name: torch.tensor(float(place)) for place, name in enumerate(names)})
     logger = TensorBoardLogger(tmp_path, name="tensorboard", version="")

@@ -93,28 +93,28 @@ class Collector:
         self._eval_env = build(config.env, 0)
         action_dim = int(np.prod(self.envs.single_action_space.shape or ()))
         self._decisions: int | None = getattr(self._eval_env.unwrapped, "decisions_per_episode", None)
-        self.discount = discount = config.learning.discount or _discount_for(self._decisions)
+        self.discount = discount = config.learning.discount or _default_discount(self._decisions)
         self.labels: dict[str, float] = getattr(self._eval_env.unwrapped, "labels", {})
         self.model = accelerate(WorldModel(config.model, action_dim, self.labels).to(device))
         noise, correlation = config.collection.noise_std, config.collection.noise_correlation
-        planner, for_goals = (
+        planner, goal_planner = (
             PlanningAgent(self.model, config, discount, noise_std=noise, noise_correlation=correlation)
             for _ in range(2)
         )
         for goal in config.collection.goals:
-            for_goals.set_objective(goal)  # an expression that cannot be pursued is refused before the run starts
+            goal_planner.set_objective(goal)  # an expression that cannot be pursued is refused before the run starts
         actor = ActorAgent(self.model, config, explore=True, noise_correlation=correlation)
-        self._agents: dict[str, ModelAgent] = {"planner": planner, "actor": actor, "goal": for_goals}
-        self._evaluated: dict[str, Any] = {
+        self._agents: dict[str, ModelAgent] = {"planner": planner, "actor": actor, "goal": goal_planner}
+        self._evaluation_agents: dict[str, Any] = {
             mode: make_agent(mode, self.model, config, discount) for mode in ("planner", "actor")
         }
         self._random = RandomAgent(action_dim)
         self._frames: np.ndarray | None = None
         self._labels = np.zeros((config.env.num_envs, len(self.labels)), np.float32)
-        self._ended = np.ones(config.env.num_envs, dtype=bool)
+        self._has_ended = np.ones(config.env.num_envs, dtype=bool)
         self._returns = np.zeros(config.env.num_envs)
-        self._check = RewardCheck(config.env.num_envs, discount)
-        self._acting: object = None
+        self._check_rewards = RewardCheck(config.env.num_envs, discount)
+        self._current_agent: object = None
 
     def describe(self) -> Description:
         """Facts of the environment that the learner needs; renders a few frames to time them."""
@@ -141,7 +141,7 @@ class Collector:
             weights: State of the world model; None acts at random.
             behaviour: "planner" or "actor".
             decisions: Decisions over all environments, rounded up to a multiple of their number.
-            counter: Number of the round; its random streams derive from this number.
+            counter: Number of the round, from which its random streams derive.
             goal: Expression that the planner pursues instead of the reward; None pursues the reward.
 
         Raises:
@@ -149,19 +149,19 @@ class Collector:
         """
         agent = self._random if weights is None else self._agents[behaviour if goal is None else "goal"]
         if weights is not None:
-            self._load(weights)
+            self._load_weights(weights)
         if isinstance(agent, PlanningAgent) and goal is not None:
             agent.set_objective(goal)
-        if agent is not self._acting:
+        if agent is not self._current_agent:
             agent.reset()
-            self._acting = agent
+            self._current_agent = agent
         agent.seed(derive_seed(self.config.run.seed, "collect", counter))
-        steps = -(-decisions // len(self._ended))
-        log = _Log(len(self._ended), self.model.action_dim, self.config.model.deter_dim)
+        steps = -(-decisions // len(self._has_ended))
+        log = _Log(len(self._has_ended), self.model.action_dim, self.config.model.deter_dim)
         for _ in range(steps):
             self._restart_ended(agent, counter)
             self._step(agent, log)
-        return Collected(log.rows(), log.env_frames, steps * len(self._ended), log.returns)
+        return Collected(log.rows(), log.env_frames, steps * len(self._has_ended), log.returns)
 
     def evaluate(
         self,
@@ -170,22 +170,22 @@ class Collector:
         weights: dict[str, np.ndarray] | None = None,
         actor: bool = True,
     ) -> dict[str, list[float]]:
-        """Returns of planner and actor, without exploration, in episodes that start alike.
+        """Returns of planner and actor, without exploration, in episodes with the same starts.
 
         Args:
             episodes: Episodes of each agent.
-            film: Path for a film of the planner's first episode; a film that cannot be written gives a warning.
+            film: Path of a film of the planner's first episode, or None. A film that cannot be written gives a warning.
             weights: State of the world model; None keeps the weights of the last round.
-            actor: Whether the actor plays too.
+            actor: Whether the actor is evaluated too.
 
         Returns:
-            One return per episode, under "planner" and, if it played, "actor".
+            One return per episode, under "planner" and, with `actor`, under "actor".
         """
         if weights is not None:
-            self._load(weights)
+            self._load_weights(weights)
         stream = derive_seed(self.config.run.seed, "evaluation")
         seeds = [episode_seed(stream, index) for index in range(episodes)]
-        planner = self._evaluated["planner"]
+        planner = self._evaluation_agents["planner"]
         with contextlib.ExitStack() as stack:
             on_step = None
             if film is not None:
@@ -193,7 +193,7 @@ class Collector:
                 on_step = stack.enter_context(filming_if_possible(film, self._eval_env, planner, every=every))
             played = {"planner": run_episodes(self._eval_env, planner, seeds, on_step=on_step)}
         if actor:
-            played["actor"] = run_episodes(self._eval_env, self._evaluated["actor"], seeds)
+            played["actor"] = run_episodes(self._eval_env, self._evaluation_agents["actor"], seeds)
         return {mode: [episode.total_return for episode in rollouts] for mode, rollouts in played.items()}
 
     def close(self) -> None:
@@ -201,46 +201,46 @@ class Collector:
         self.envs.close(timeout=CLOSING_SECONDS)  # without a timeout, close waits forever for a step that failed
         self._eval_env.close()
 
-    def _load(self, weights: dict[str, np.ndarray]) -> None:
+    def _load_weights(self, weights: dict[str, np.ndarray]) -> None:
         self.model.load_state_dict({name: torch.from_numpy(value) for name, value in weights.items()})
 
     def _restart_ended(self, agent: ModelAgent | RandomAgent, counter: int) -> None:
-        if not self._ended.any():
+        if not self._has_ended.any():
             return
         if self._frames is None:
             self._frames, info = self.envs.reset(seed=derive_seed(self.config.run.seed, "episodes", counter))
         else:
-            self._frames, info = self.envs.reset(options={"reset_mask": self._ended})
-            agent.reset(self._ended)
+            self._frames, info = self.envs.reset(options={"reset_mask": self._has_ended})
+            agent.reset(self._has_ended)
         if self.labels:
-            self._labels[self._ended] = np.asarray(info["labels"])[self._ended]
-        self._returns[self._ended] = 0.0
+            self._labels[self._has_ended] = np.asarray(info["labels"])[self._has_ended]
+        self._returns[self._has_ended] = 0.0
 
     def _step(self, agent: ModelAgent | RandomAgent, log: _Log) -> None:
         assert self._frames is not None
-        frames, labels, first = self._frames.copy(), self._labels.copy(), self._ended.copy()
+        frames, labels, first = self._frames.copy(), self._labels.copy(), self._has_ended.copy()
         actions = agent.act(frames)
         state = agent.state if isinstance(agent, ModelAgent) else None
         deter = None if state is None else first_turn(state).deter.float().cpu().numpy()
         self._frames, rewards, terminated, truncated, info = self.envs.step(actions)
-        self._check(rewards, first)
-        self._ended = terminated | truncated
+        self._check_rewards(rewards, first)
+        self._has_ended = terminated | truncated
         self._returns += rewards
         if self.labels:
             self._labels = np.array(info["labels"], np.float32)
         log.append(frames, deter, actions, rewards, ~terminated, first, labels, np.asarray(info["env_frames"]))
-        for lane in np.flatnonzero(self._ended):
-            frame, row = self._frames[lane].copy(), self._labels[lane].copy()  # the restart overwrites both
-            log.finish(int(lane), frame, row, float(self._returns[lane]))
+        for lane in np.flatnonzero(self._has_ended):
+            last_frame, last_labels = self._frames[lane].copy(), self._labels[lane].copy()  # a restart overwrites both
+            log.finish(int(lane), last_frame, last_labels, float(self._returns[lane]))
 
 
-def _discount_for(decisions: int | None) -> float:
+def _default_discount(decisions: int | None) -> float:
     """Discount whose horizon is a fifth of an episode: 0.96 at 125 decisions, 0.99 at 500."""
     return 1.0 - 5.0 / min(max(decisions or 500, 50), 1000)
 
 
 class _Log:
-    """Rows of every lane, gathered step by step during one round."""
+    """Collects the rows of every lane during one round."""
 
     def __init__(self, lanes: int, action_dim: int, deter_dim: int) -> None:
         self._lanes: list[list[tuple[Any, ...]]] = [[] for _ in range(lanes)]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import multiprocessing
+import signal
 import sys
 import traceback
 from collections import deque
@@ -16,7 +17,7 @@ from gymnasium.vector.utils import CloudpickleWrapper
 from latentplan.config import Config, UserError
 from latentplan.envs import single_threaded_children
 from latentplan.training.collection.collector import CLOSING_SECONDS, Collector, EnvFactory
-from latentplan.training.resources import collector_threads
+from latentplan.training.resources import choose_collector_threads
 
 
 class LocalWorker:
@@ -90,7 +91,7 @@ class RemoteWorker:
         return value
 
     def close(self) -> None:
-        """Ends the process, also while a method runs."""
+        """Ends the process, even if a method is still running."""
         if self._process.is_alive():
             self._process.terminate()
         self._process.join(CLOSING_SECONDS)
@@ -112,15 +113,14 @@ Worker = LocalWorker | RemoteWorker
 def make_worker(config: Config, make_user_env: EnvFactory | None, device: torch.device) -> Worker:
     """The worker that `collection.overlap` selects; a local worker acts on the learner's device."""
     if config.collection.overlap:
-        return RemoteWorker(config, make_user_env, collector_threads(device))
+        return RemoteWorker(config, make_user_env, choose_collector_threads(device))
     return LocalWorker(config, make_user_env, str(device))
 
 
-def _serve(connection: Connection, factory: EnvFactory | None, config: Config, threads: int) -> None:
-    import signal
-
+def _serve(connection: Connection, make_user_env: EnvFactory | None, config: Config, threads: int) -> None:
+    """Runs methods of a `Collector` in this process as the learner requests them, until the connection closes."""
     signal.signal(signal.SIGTERM, lambda *_: sys.exit())  # an ordinary exit also ends the environments' processes
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches the whole group; only the learner reacts
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches the whole process group, but only the learner reacts
     torch.set_num_threads(threads)
     collector: Collector | None = None
     while True:
@@ -130,7 +130,7 @@ def _serve(connection: Connection, factory: EnvFactory | None, config: Config, t
             return
         try:
             if collector is None:
-                collector = Collector(config, factory, "cpu")
+                collector = Collector(config, make_user_env, "cpu")
             connection.send(("ok", getattr(collector, method)(*arguments)))
         except UserError as error:
             connection.send(("user_error", str(error)))

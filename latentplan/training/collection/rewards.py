@@ -11,7 +11,7 @@ from latentplan.models.heads import LARGEST_SCALAR
 
 
 class RewardCheck:
-    """Refuses rewards that are not finite, and warns once when discounted sums leave the range of the reward heads.
+    """Refuses rewards that are not finite, and warns once if discounted sums of rewards exceed the value head's range.
 
     Args:
         num_envs: Number of environments.

@@ -21,7 +21,7 @@ def plan_actions(
     rows_per_call: int,
     report: Callable[[int], None],
 ) -> Gaussian:
-    """Mean and std of the planner's first action at every belief, by searches without a warm start.
+    """Labels beliefs: plans at every belief without a warm start, and returns the first actions.
 
     Args:
         planner: The search.
@@ -61,7 +61,10 @@ def first_actions(plan: Plan, min_std: float) -> Gaussian:
 
 
 class Demonstrations:
-    """Beliefs, the planner's first action at each, and the round of that label; float32, in main memory."""
+    """A store of beliefs, each with the planner's first action as its label and the round in which it was labelled.
+
+    The store holds float32 in main memory.
+    """
 
     def __init__(self) -> None:
         self.columns: dict[str, Tensor] = {}
@@ -80,7 +83,7 @@ class Demonstrations:
             self.columns[name] = torch.cat([*held, value.detach().cpu()])
 
     def oldest(self, count: int) -> Tensor:
-        """Rows of the `count` beliefs with the oldest labels, (count,)."""
+        """Finds the rows of the `count` beliefs with the oldest labels, (count,)."""
         return self.columns["round"].argsort(stable=True)[:count]
 
     def states(self, rows: Tensor) -> State:

@@ -39,12 +39,12 @@ from latentplan.training.console import StatusLine
 from latentplan.training.distillation.labels import Demonstrations, first_actions, plan_actions
 from latentplan.training.distillation.student import Student
 from latentplan.training.folder import DISTILLATION_FILE, lock_folder, refuse_used
-from latentplan.training.state import INTERRUPTED, save_whole
 from latentplan.training.run import Result
+from latentplan.training.state import INTERRUPTED, save_atomically
 
 NUM_STAGES = 3  # per round: collect, train, select
-NO_ROUND = -1  # stands for the actor with which the distillation began
-# Names of random streams, from which the starts of episodes derive: another name gives other results.
+NO_ROUND = -1  # value of `best_round` while the actor before distillation is the best
+# Names of random streams, from which the starts of episodes derive; other names would change the results.
 COLLECTED, SELECTING, TEST = "drive", "choose", "judge"
 
 
@@ -196,7 +196,7 @@ class Comparison:
 
 
 class _Distillation:
-    """One distillation: its agents, environment, labels, student and state."""
+    """A distillation with its agents, environment, labels, student and state."""
 
     def __init__(
         self,
@@ -227,7 +227,7 @@ class _Distillation:
         self._earlier_minutes = 0.0
 
     def run(self) -> Result:
-        """Run the remaining rounds and save the better agent; when interrupted, print how to resume."""
+        """Run the remaining rounds and save the better agent; after an interruption, print how to resume."""
         state = self.state
         try:
             with lock_folder(self.folder), self.line:
@@ -321,27 +321,27 @@ class _Distillation:
     def _finish(self) -> dict[str, float]:
         """Evaluate the best actor on the test starts, and save the agent with it only if it is better there too."""
         state = self.state
-        found = Comparison(state.before, state.planner)
+        comparison = Comparison(state.before, state.planner)
         if state.best_round != NO_ROUND:
             self.model.actor.load_state_dict(self.best)
             after = self._play(self.acting, TEST, "evaluating the best actor")
-            found = replace(
-                found, after=after, planner_after=self._play(self.planning, TEST, "the planner with the best actor")
-            )
-        self.model.actor.load_state_dict(self.best if found.is_better else self.initial)
-        kept = found if found.is_better else Comparison(found.before, found.planner, found.before, found.planner)
+            planner_after = self._play(self.planning, TEST, "the planner with the best actor")
+            comparison = replace(comparison, after=after, planner_after=planner_after)
+        is_better = comparison.is_better
+        self.model.actor.load_state_dict(self.best if is_better else self.initial)
+        kept = comparison if is_better else replace(comparison, after=state.before, planner_after=state.planner)
         returns = asdict(kept)
         facts = {
             "rounds": state.stage // NUM_STAGES,
             "decisions": state.decisions,
-            "kept_round": state.best_round + 1 if found.is_better else None,
+            "kept_round": state.best_round + 1 if is_better else None,
             **{f"returns_{name}": values for name, values in returns.items()},
             "settings": to_dict(self.settings),
             "planner": to_dict(self.planner_config),
             "from_sha256": self.info["sha256"],
         }
         save_checkpoint(self.folder, self.model, self.config, self.info | {"distilled": facts})
-        for line in [*found.describe(state.best_round + 1), f"agent: {self.folder}"]:
+        for line in [*comparison.describe(state.best_round + 1), f"agent: {self.folder}"]:
             self.line.print(line)
         return {name: float(np.mean(values)) for name, values in returns.items()}
 
@@ -354,7 +354,16 @@ class _Distillation:
         num_episodes: int | None = None,
         on_step: OnStep | None = None,
     ) -> list[float]:
-        """Returns of episodes whose starts derive from a stream's name and a counter."""
+        """Plays episodes, and returns their returns.
+
+        Args:
+            agent: Acts in the episodes.
+            starts: Name of the random stream from which the starts derive.
+            activity: Text for the status line.
+            counter: Number that separates the streams of one name.
+            num_episodes: Number of episodes; None takes `evaluation_episodes`.
+            on_step: Called after every step.
+        """
         num_episodes = num_episodes or self.settings.evaluation_episodes
         stream = derive_seed(self.settings.seed, starts, counter)
         seeds = [episode_seed(stream, index) for index in range(num_episodes)]
@@ -387,13 +396,13 @@ class _Distillation:
             "student": self.student.state_dict(),
             "best": self.best,
         }
-        save_whole(saved, self.folder / DISTILLATION_FILE)
+        save_atomically(saved, self.folder / DISTILLATION_FILE)
 
     def _is_spent(self) -> bool:
         """Whether the budget allows no further round; a round that has begun is finished."""
         round_index, stage = divmod(self.state.stage, NUM_STAGES)
-        late = self.settings.minutes is not None and self._minutes() >= self.settings.minutes
-        return stage == 0 and (late or round_index >= self.settings.rounds)
+        is_late = self.settings.minutes is not None and self._minutes() >= self.settings.minutes
+        return stage == 0 and (is_late or round_index >= self.settings.rounds)
 
     def _minutes(self) -> float:
         return self._earlier_minutes + (time.monotonic() - self._started) / 60.0

@@ -2,7 +2,7 @@
 
 A box holds one interval per quantity. Only the goal heads change; the rest of the agent stays bit for bit as it is.
 Rollouts start from beliefs in the replay, and boxes lie around quantities observed in the replay. Every update draws
-from its own random stream, so an interrupted learning ends with the same agent as an uninterrupted one.
+from its own random stream, so goal learning that was interrupted and resumed ends with the same agent.
 """
 
 from __future__ import annotations
@@ -32,8 +32,8 @@ class Boxes(NamedTuple):
     """One box per row.
 
     Attributes:
-        low: Lower ends of the intervals, (rows, quantity), -inf where open.
-        high: Upper ends, inf where open.
+        low: Lower ends of the intervals, (rows, quantity); -inf for an interval without a lower end.
+        high: Upper ends of the intervals, (rows, quantity); inf for an interval without an upper end.
         rows: Row of the observed quantities around which each box lies, (rows,).
     """
 
@@ -45,11 +45,11 @@ class Boxes(NamedTuple):
 class BoxSource:
     """Draws boxes around observed quantities.
 
-    Each box has one chosen quantity. Three quarters of the boxes lie around a row whose chosen quantity is close to a
-    value drawn uniformly from its range, so that rare values become frequent goals. The other boxes lie around a row
-    drawn uniformly. In a quarter of all boxes the centre of the chosen quantity then moves to that uniform value. Each
-    interval is a point, open above, open below, closed with a width of up to one scale, or open on both sides; the
-    chosen quantity's interval is never open on both sides.
+    Each box has one chosen quantity and one wanted value, drawn uniformly from the range of the chosen quantity. Three
+    quarters of the boxes lie around a row whose chosen quantity is close to the wanted value, so that rare values become
+    frequent goals. The other boxes lie around a row drawn uniformly. In a quarter of all boxes the centre of the chosen
+    quantity then moves to the wanted value. Each interval is a point, open above, open below, closed with a width of up
+    to one scale, or open on both sides; the interval of the chosen quantity is never open on both sides.
 
     Args:
         observed: Observed quantities, (row, quantity).
@@ -64,7 +64,7 @@ class BoxSource:
         self._sorted, self._order = observed.t().contiguous().sort(dim=1)
 
     def draw(self, num: int, generator: torch.Generator) -> Boxes:
-        """`num` random boxes."""
+        """Draws `num` random boxes."""
         size, device = (num, self.observed.shape[1]), self.observed.device
 
         def uniform(*shape: int) -> Tensor:
@@ -85,7 +85,7 @@ class BoxSource:
         return Boxes(low, torch.where(has_high, centre + half, math.inf), rows)
 
     def _nearest(self, chosen: Tensor, wanted: Tensor) -> Tensor:
-        """For each box, a row whose chosen quantity is close to the wanted value.
+        """Finds for each box a row whose chosen quantity is close to the wanted value.
 
         Args:
             chosen: Index of the chosen quantity, (box, 1).
@@ -123,7 +123,7 @@ class GoalLearner:
         self.model, self.settings, self.learning = model, settings, learning
         self.discount, self.frames_per_step = discount, frames_per_step
         self.updates, self.return_range = 0, torch.zeros((), device=model.device)
-        self.dream = Snapshot(model).model
+        self.frozen_model = Snapshot(model).model
         self.target = copy.deepcopy(model.goal_heads).requires_grad_(False)
         parameters = [*model.goal_heads.requires_grad_(True).parameters()]
         self.optimizer = torch.optim.Adam(parameters, lr=settings.learning_rate, eps=1e-6, fused=True)
@@ -149,11 +149,11 @@ class GoalLearner:
         with self.model.trunk_precision():
             start = self._starts(rows, generator)
             features, entropies = self.imagine(start, code, generator)
-            worth = box_degree(low, high, self.model.goal_quantities(features[1:]), scales)
+            degrees = box_degree(low, high, self.model.goal_quantities(features[1:]), scales)  # (horizon, rows)
             values = self.target.value(features[1:], code)
-        discounts = torch.full_like(worth, self.discount)
+        discounts = torch.full_like(degrees, self.discount)
         returns = self.model.backend.call(
-            lambda_return, self.frames_per_step * worth, discounts, values, self.learning.lambda_
+            lambda_return, self.frames_per_step * degrees, discounts, values, self.learning.lambda_
         )
         reach = torch.cat([torch.ones_like(discounts[:1]), discounts[:-1]]).cumprod(0)
         gains = returns / return_scale(self.return_range, returns.detach()) + settings.entropy_scale * entropies
@@ -163,13 +163,23 @@ class GoalLearner:
         descend(self.optimizer, loss, self.learning.max_grad_norm, self.updates)
         self.model.backend.move_towards([*self.target.parameters()], [*heads.parameters()], self.learning.target_rate)
         self.updates += 1
-        return {"worth": float(worth.detach().mean()), "entropy": float(entropies.detach().mean())}
+        return {"worth": float(degrees.detach().mean()), "entropy": float(entropies.detach().mean())}
 
     def imagine(self, start: State, code: Tensor, generator: torch.Generator) -> tuple[Tensor, Tensor]:
-        """What the actor for the boxes of a code does from rows of states; see `Dynamics.imagine`."""
+        """Imagined rollouts of the goal actor.
+
+        Args:
+            start: States from which the rollouts start, (rows, ...).
+            code: Codes of the boxes, (rows, code), from `GoalHeads.encode`.
+            generator: Random stream of the actions and latents.
+
+        Returns:
+            Features of the states, the start first, (horizon + 1, rows, feature), and entropies of the actions in nats,
+            (horizon, rows).
+        """
         act = partial(self.model.goal_action, code=code)
-        noise = draw_noise(self.dream, self.settings.horizon, len(start.deter), generator)
-        features, std = self.dream.dynamics.imagine(act, start, *noise)
+        noise = draw_noise(self.frozen_model, self.settings.horizon, len(start.deter), generator)
+        features, std = self.frozen_model.dynamics.imagine(act, start, *noise)
         return features, entropy(std)
 
     def state_dict(self) -> dict[str, Any]:
@@ -193,9 +203,13 @@ class GoalLearner:
         return torch.Generator(self.model.device).manual_seed(derive_seed(self.settings.seed, name, counter))
 
     def _starts(self, rows: Tensor, generator: torch.Generator) -> State:
-        """Beliefs from which rollouts start: half at the rows around which the boxes lie, half at any row.
+        """Draws the beliefs from which rollouts start: half at the rows around which the boxes lie, half at any row.
 
         The actor learns from the first half to stay in a box, and from the second half to reach a box.
+
+        Args:
+            rows: Row of the replay around which each box lies, (rows,).
+            generator: Random stream of the draw.
         """
         size, device = (len(rows),), self.model.device
         anywhere = torch.randint(len(self.beliefs.deter), size, generator=generator, device=device)
@@ -206,7 +220,7 @@ class GoalLearner:
 
 @torch.no_grad()
 def _infer_beliefs(model: WorldModel, replay: Replay, rows: Tensor) -> State:
-    """The beliefs at rows of a replay, from stored GRU states and frames; computed once, since the model is fixed."""
+    """Computes the beliefs at rows (n,) of a replay from the stored deterministic states and frames, (n, ...) each."""
     beliefs = [
         model.see(replay.deter[part].float().to(model.device), replay.frames[part].to(model.device))
         for part in rows.split(FRAMES_PER_CALL)

@@ -1,4 +1,4 @@
-"""A replay for goal learning without the replay of a run: the agent plays for its task and for random goals."""
+"""A replay for goal learning of an agent without one: the agent plays for its task and for random goals."""
 
 from __future__ import annotations
 
@@ -19,9 +19,7 @@ ROUND_DECISIONS = 125
 
 
 def play(config: Config, model: WorldModel, decisions: int, seed: int, report: Callable[[int], None]) -> Replay:
-    """Plays with an agent: rounds of exploration for its task alternate with rounds for a random box.
-
-    The actor plays the first kind of round, the planner the second.
+    """Plays with an agent: the actor explores for the agent's task in one round, the planner pursues a box in the next.
 
     Args:
         config: Settings of the agent, with its exploration noise.
@@ -33,10 +31,10 @@ def play(config: Config, model: WorldModel, decisions: int, seed: int, report: C
     Returns:
         A replay with one row per decision, and one more per episode.
     """
-    alone = replace(config, env=replace(config.env, num_envs=1), run=replace(config.run, seed=seed))
+    single = replace(config, env=replace(config.env, num_envs=1), run=replace(config.run, seed=seed))
     size = 2 * (decisions + ROUND_DECISIONS)  # an episode has one row more than decisions
     replay = Replay(size, model.action_dim, model.config.deter_dim, 1, torch.device("cpu"), len(model.labels))
-    collector = Collector(alone, None, "cpu")
+    collector = Collector(single, None, "cpu")
     heads = [name for name in model.state_dict() if name.startswith("goal_heads.")]
     weights = {name: value.cpu().numpy() for name, value in model.state_dict().items() if name not in heads}
     generator = torch.Generator().manual_seed(derive_seed(seed, "play"))

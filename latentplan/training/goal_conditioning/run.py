@@ -1,4 +1,4 @@
-"""Goal conditioning of a trained agent: from its folder and its replay to an agent that also pursues goals."""
+"""Goal conditioning: makes an agent that also pursues goals, from the folder and the replay of a trained agent."""
 
 from __future__ import annotations
 
@@ -22,11 +22,11 @@ from latentplan.training.console import StatusLine
 from latentplan.training.folder import GOALS_FILE, lock_folder, refuse_used
 from latentplan.training.goal_conditioning.learner import GoalLearner
 from latentplan.training.goal_conditioning.play import play
-from latentplan.training.state import INTERRUPTED, save_whole
 from latentplan.training.run import Result
+from latentplan.training.state import INTERRUPTED, save_atomically
 
 SAVE_SECONDS = 300.0
-PLAYED_FILE = "played.json"  # beside a played replay: which agent played it, and with which settings
+PLAYED_FILE = "played.json"  # names the agent that played the replay in the same folder, and its settings
 
 
 def learn_goals(
@@ -35,14 +35,14 @@ def learn_goals(
     """Teaches a trained agent to pursue goals that are named after training.
 
     Args:
-        checkpoint: Folder of a run, whose replay gives the beliefs to start from, or of an agent without a replay,
-            which then plays first.
+        checkpoint: Folder of a run or of an agent. Rollouts start from beliefs in the replay of the run; an agent without
+            a replay plays first.
         folder: Folder for the new agent and the saved state.
         settings: Settings of the learning; None takes the defaults.
         device: "cpu" or "cuda".
 
     Returns:
-        The folder, and `worth`, a running mean over updates: see `GoalLearner.update`.
+        The folder, and a running mean of the updates' `worth`; see `GoalLearner.update`.
 
     Raises:
         UserError: The agent, its replay or the folder cannot be used.
@@ -95,7 +95,7 @@ def load_replay(path: Path, model: WorldModel) -> Replay:
 def _load_or_play(
     agent: Path, sha256: str, folder: Path, model: WorldModel, config: Config, settings: GoalsConfig, line: StatusLine
 ) -> Replay:
-    """The replay of the agent's run if there is one, else a replay that the agent plays and the folder keeps."""
+    """Loads the replay of the agent's run if there is one, else a replay that the agent plays and the folder keeps."""
     collected, played, note = agent / "resume" / "replay", folder / "replay", folder / "replay" / PLAYED_FILE
     if (collected / "rows.pt").exists():
         return load_replay(collected, model)
@@ -151,7 +151,7 @@ def _learn(run: Path, folder: Path, settings: GoalsConfig, device: str, saved: d
         save_checkpoint(folder, model, config, info | {"goals": facts | {"from_sha256": info["sha256"]}})
         about = {"run": str(run.resolve()), "source": str(source.resolve()), "sha256": info["sha256"]}
         state = {"settings": to_dict(settings), "minutes": minutes(), "learner": learner.state_dict()}
-        save_whole(about | state, folder / GOALS_FILE)
+        save_atomically(about | state, folder / GOALS_FILE)
 
     with line, _stop_on_signals() as should_stop:
         while learner.updates < settings.updates and not (should_stop() or minutes() >= (settings.minutes or math.inf)):

@@ -137,8 +137,8 @@ class GraphedLearner(Learner):
 def make_learner(model: WorldModel, config: Config, discount: float, replay: Replay, curriculum: Curriculum) -> Learner:
     """Makes the learner that the settings select.
 
-    A model whose updates can be recorded gets a `GraphedLearner` if `learning.cuda_graph` is set; every other model gets
-    a `Learner`.
+    With `learning.cuda_graph` a model whose updates can be recorded gets a `GraphedLearner`; any other model gets a
+    `Learner`.
 
     Args:
         model: The world model, on its device.

@@ -171,7 +171,7 @@ def test_collector_plans_for_the_goal_of_a_round(make_cart):
     planned_for = []
     for counter, goal in enumerate((None, "cart -> 0.8", "cart -> -0.8", None)):
         collector.collect(weights, "planner", 2, counter, goal)
-        planned_for.append(collector._acting.controller.objective)
+        planned_for.append(collector._current_agent.controller.objective)
     reward, right, left, again = planned_for
     assert reward is None and again is None
     assert right is not None and left is not None and right is not left

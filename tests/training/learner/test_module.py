@@ -9,7 +9,7 @@ from latentplan.models import WorldModel
 from latentplan.models.fast import accelerate
 from latentplan.replay.buffer import Replay
 from latentplan.training.learner.module import Learner
-from latentplan.training.state import restore
+from latentplan.training.state import restore_learner
 
 
 class Standalone(Learner):
@@ -117,14 +117,14 @@ def test_averaged_weights_are_the_latest_ones_when_the_rate_is_one(batch, tiny):
     assert all(torch.equal(averaged[name], value) for name, value in latest.items())
 
 
-def test_restore_starts_the_average_from_the_saved_weights_when_none_was_saved(batch, tiny):
+def test_restore_learner_starts_the_average_from_the_saved_weights_when_none_was_saved(batch, tiny):
     learner, resumed = standalone(tiny), standalone(tiny)
     averages_of(learner, batch, 12)
     saved = {name: value for name, value in learner.state_dict().items() if not name.startswith("averaged")}
-    restore(resumed, {"weights": saved, "updates": 12}, Path("run"))
+    restore_learner(resumed, {"weights": saved, "updates": 12}, Path("run"))
     assert resumed.averaged_updates.tolist() == [0.0, 0.0]
     latest = learner.model.state_dict()
     assert all(torch.equal(value, latest[name]) for name, value in resumed.averaged.state_dict().items())
-    restore(resumed, {"weights": learner.state_dict(), "updates": 12}, Path("run"))
+    restore_learner(resumed, {"weights": learner.state_dict(), "updates": 12}, Path("run"))
     kept = learner.averaged.state_dict()
     assert all(torch.equal(value, kept[name]) for name, value in resumed.averaged.state_dict().items())
