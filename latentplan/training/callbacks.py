@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
 SAVE_MINUTES = 5.0
 CLOCKS = ("env_frames", "decisions", "updates", "minutes")
-COLUMNS = (*CLOCKS, "episode_return", "planner_return", "actor_return", "planner_minus_actor")  # losses follow these
+COLUMNS = (*CLOCKS, "episode_return", "planner_return", "actor_return", "planner_minus_actor")  # the losses follow
 
 
 class Collect(lightning.Callback):

@@ -32,7 +32,7 @@ def refuse_used(folder: Path, own_file: str, flag: str) -> None:
     for name, content in CONTENTS.items():
         if (folder / name).exists():
             can_resume = (folder / own_file).exists()
-            advice = f"go on with --resume {folder} (or resume from Python), or " if can_resume else ""
+            advice = f"resume it with --resume {folder} (or from Python), or " if can_resume else ""
             raise UserError(f"{folder} already holds {content}: {advice}choose another {flag}")
 
 

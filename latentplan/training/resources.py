@@ -57,14 +57,14 @@ def choose_replay_capacity(config: Config, saved: Path) -> int:
     if config.replay.capacity is not None:
         return config.replay.capacity
     lanes = [path.stat().st_size // FRAME_BYTES for path in saved.glob("frames_*.u8")]
-    held = len(lanes) * max(lanes, default=0)
+    num_saved = len(lanes) * max(lanes, default=0)
     if config.run.frames is None:
-        return max(UNKNOWN_LENGTH_CAPACITY, held)
+        return max(UNKNOWN_LENGTH_CAPACITY, num_saved)
     # Up to two rounds exceed the budget, and every episode ends with one frame without an action.
     decisions = config.run.frames / config.env.action_repeat
     per_episode = min(config.collection.episode_decisions or 20, 20)
     collected = 2 * config.collection.round_decisions + config.collection.prefill_decisions
-    return max(int((1.0 + 1.0 / per_episode) * decisions) + collected, held)
+    return max(int((1.0 + 1.0 / per_episode) * decisions) + collected, num_saved)
 
 
 def _count_cores() -> int:

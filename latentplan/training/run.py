@@ -215,7 +215,7 @@ class _Run:
             command = f"python scripts/train.py --resume {self.folder}"
             if config.env.domain == USER_DOMAIN:
                 command = f'latentplan.training.resume("{self.folder}", make_env=...)'
-            self.console.console.print(f"stopped; to go on: {command}", soft_wrap=True)
+            self.console.console.print(f"stopped; to resume: {command}", soft_wrap=True)
             return Result(self.folder, INTERRUPTED, {})
         return Result(self.folder, 0, self._finish(trainer, save, videos / "final.webm"))
 

@@ -1,4 +1,4 @@
-"""Replay, filled with frames that hold the time: rows stay aligned, complete and in order."""
+"""The replay keeps rows aligned, complete and in order; frames encode their lane, episode and time."""
 
 from pathlib import Path
 
@@ -9,7 +9,7 @@ import torch
 from latentplan.config import UserError
 from latentplan.replay import memory
 from latentplan.replay.buffer import Replay, replay_bytes
-from tests.replay.replay_clock import CPU, Clock, filled, frame_values, make_replay, sample
+from tests.replay.numbered_rows import CPU, NumberedRows, frame_values, make_filled_replay, make_replay, sample
 
 
 def assert_aligned(batch):
@@ -33,7 +33,7 @@ RINGS = [
 @pytest.mark.parametrize("ring", RINGS)
 @pytest.mark.parametrize("length", [1, 3, 6])
 def test_sample_is_aligned_and_never_crosses_episodes(ring, length):
-    batch = sample(filled(**ring), length=length)
+    batch = sample(make_filled_replay(**ring), length=length)
     assert batch.frames.shape == (64, length + 1, 64, 64, 3) and batch.frames.dtype == torch.uint8
     assert batch.deter.shape == (64, 2) and batch.deter.dtype == torch.float32
     assert_aligned(batch)
@@ -41,7 +41,7 @@ def test_sample_is_aligned_and_never_crosses_episodes(ring, length):
 
 @pytest.mark.parametrize("ring", RINGS)
 def test_draw_reaches_every_sequence_that_is_held(ring):
-    replay, length = filled(**ring), 3
+    replay, length = make_filled_replay(**ring), 3
     drawn = {tuple(start) for start in torch.stack(frame_values(sample(replay, 1000, length)), -1)[:, 0].tolist()}
     rows = replay.frames[:, 0, 0].float()
     held = {tuple(row) for row in rows.tolist()} if len(replay) == len(rows) else None
@@ -55,15 +55,15 @@ def test_draw_reaches_every_sequence_that_is_held(ring):
 
 
 def test_draw_ends_an_interrupted_episode_where_the_next_begins():
-    replay, clock = make_replay(), Clock(0, (9,))
-    replay.add(0, clock.rows(0, 4))  # the run stopped here, and a resumed run begins a new episode
-    replay.add(0, clock.rows(0, 6))
+    replay, numbered = make_replay(), NumberedRows(0, (9,))
+    replay.add(0, numbered.rows(0, 4))  # the run stopped here, and a resumed run begins a new episode
+    replay.add(0, numbered.rows(0, 6))
     for seed in range(5):
         assert_aligned(sample(replay, seed=seed))
 
 
 def test_add_stores_each_frame_once():
-    replay = filled(lengths=(7, 4, 9))
+    replay = make_filled_replay(lengths=(7, 4, 9))
     assert len(replay) == 8 + 5 + 10
     stored = {tuple(frame) for frame in replay.frames[: len(replay), 0, 0].tolist()}
     assert len(stored) == len(replay)
@@ -71,21 +71,21 @@ def test_add_stores_each_frame_once():
 
 
 def test_add_keeps_the_newest_rows_when_the_ring_is_full():
-    replay = filled(capacity=12, lengths=(7, 4, 9))
-    newest = [entry[2::-1] for entry in Clock(0, (7, 4, 9)).entries[-12:]]
+    replay = make_filled_replay(capacity=12, lengths=(7, 4, 9))
+    newest = [entry[2::-1] for entry in NumberedRows(0, (7, 4, 9)).entries[-12:]]
     assert sorted(map(tuple, replay.frames[:, 0, 0].tolist())) == sorted(newest)
     assert len(replay) == 12
 
 
 def test_draw_repeats_with_its_random_stream():
-    replay = filled()
+    replay = make_filled_replay()
     first, again, other = (sample(replay, seed=seed) for seed in (0, 0, 1))
     assert all(torch.equal(left, right) for left, right in zip(first, again, strict=True))
     assert not torch.equal(first.rows, other.rows)
 
 
 def test_refresh_writes_beliefs_to_the_rows_of_the_batch():
-    replay = filled(capacity=40, lanes=2, lengths=(7, 4, 9, 6))
+    replay = make_filled_replay(capacity=40, lanes=2, lengths=(7, 4, 9, 6))
     batch = sample(replay)
     time, episode, lane = frame_values(batch)
     replay.refresh(
@@ -101,7 +101,7 @@ def test_refresh_writes_beliefs_to_the_rows_of_the_batch():
 
 
 def test_refresh_keeps_the_last_belief_of_a_row_that_occurs_twice():
-    replay = filled()
+    replay = make_filled_replay()
     deter = torch.arange(12.0).reshape(2, 3, 2)
     replay.refresh(torch.tensor([[4, 5, 4], [6, 4, 5]]), deter, torch.ones(2, 3, dtype=torch.bool))
     assert replay.deter[4:7].tolist() == [[8.0, 9.0], [10.0, 11.0], [6.0, 7.0]]
@@ -109,7 +109,7 @@ def test_refresh_keeps_the_last_belief_of_a_row_that_occurs_twice():
 
 @pytest.mark.parametrize("chosen", [((1, 1, 1), (0, 0, 0)), ((0, 0, 0), (1, 1, 1)), ((0, 1, 0), (0, 0, 1))])
 def test_refresh_ignores_beliefs_that_are_not_chosen(chosen):
-    replay = filled()
+    replay = make_filled_replay()
     before = replay.deter.clone()
     rows, deter = torch.tensor([[4, 5, 6], [5, 6, 7]]), torch.arange(12.0).reshape(2, 3, 2)
     replay.refresh(rows, deter, torch.tensor(chosen) == 1)
@@ -127,7 +127,7 @@ def assert_same(left, right):
 
 @pytest.mark.parametrize("ring", RINGS)
 def test_load_restores_a_saved_replay(ring, tmp_path):
-    replay = filled(**ring)
+    replay = make_filled_replay(**ring)
     replay.save(tmp_path)
     loaded = make_replay(ring.get("capacity", 60), ring.get("lanes", 1))
     loaded.load(tmp_path)
@@ -136,9 +136,9 @@ def test_load_restores_a_saved_replay(ring, tmp_path):
 
 @pytest.mark.parametrize("capacity", [60, 12])
 def test_save_gives_the_same_files_in_parts_as_at_once(capacity, tmp_path):
-    replay, clock = make_replay(capacity), Clock(0, (7, 4, 9))
-    for start in range(0, len(clock.entries), 4):
-        replay.add(0, clock.rows(start, start + 4))
+    replay, numbered = make_replay(capacity), NumberedRows(0, (7, 4, 9))
+    for start in range(0, len(numbered.entries), 4):
+        replay.add(0, numbered.rows(start, start + 4))
         replay.save(tmp_path)
         if start == 8:  # go on from disk halfway
             replay = make_replay(capacity)
@@ -146,15 +146,15 @@ def test_save_gives_the_same_files_in_parts_as_at_once(capacity, tmp_path):
     loaded = make_replay(capacity)
     loaded.load(tmp_path)
     assert_same(replay, loaded)
-    assert_same(filled(capacity=capacity), loaded)
+    assert_same(make_filled_replay(capacity=capacity), loaded)
 
 
 def test_save_writes_new_frames_only(tmp_path):
-    replay, clock = make_replay(), Clock(0, (7, 4, 9))
-    replay.add(0, clock.rows(0, 8))
+    replay, numbered = make_replay(), NumberedRows(0, (7, 4, 9))
+    replay.add(0, numbered.rows(0, 8))
     replay.save(tmp_path)
     (tmp_path / "frames_0.u8").write_bytes(bytes(8 * 64 * 64 * 3))
-    replay.add(0, clock.rows(8, 13))
+    replay.add(0, numbered.rows(8, 13))
     replay.save(tmp_path)
     stored = np.fromfile(tmp_path / "frames_0.u8", np.uint8).reshape(-1, 64, 64, 3)
     assert len(stored) == 13
@@ -163,16 +163,16 @@ def test_save_writes_new_frames_only(tmp_path):
 
 @pytest.mark.parametrize(("before", "after"), [(60, 100), (12, 60), (60, 14), (12, 8)])
 def test_load_keeps_the_newest_rows_in_another_capacity(before, after, tmp_path):
-    replay = filled(capacity=before)
+    replay = make_filled_replay(capacity=before)
     replay.save(tmp_path)
     loaded = make_replay(after)
     loaded.load(tmp_path)
     assert len(loaded) == min(len(replay), after)
     assert_aligned(sample(loaded))
-    newest = [entry[2::-1] for entry in Clock(0, (7, 4, 9)).entries[-len(loaded) :]]
+    newest = [entry[2::-1] for entry in NumberedRows(0, (7, 4, 9)).entries[-len(loaded) :]]
     held = loaded.frames[torch.from_numpy(loaded.episode[0] >= 0)]
     assert sorted(map(tuple, held[:, 0, 0].tolist())) == sorted(newest)
-    loaded.add(0, Clock(0, (5,)).rows())
+    loaded.add(0, NumberedRows(0, (5,)).rows())
     loaded.save(tmp_path)
     again = make_replay(after)
     again.load(tmp_path)
@@ -182,7 +182,7 @@ def test_load_keeps_the_newest_rows_in_another_capacity(before, after, tmp_path)
 def test_load_refuses_replays_of_other_sizes(tmp_path):
     with pytest.raises(UserError, match="no replay found"):
         make_replay().load(tmp_path)
-    filled().save(tmp_path)
+    make_filled_replay().save(tmp_path)
     for other in (
         make_replay(lanes=2),
         Replay(60, 2, 2, 1, CPU, 2),
@@ -194,7 +194,7 @@ def test_load_refuses_replays_of_other_sizes(tmp_path):
 
 
 def test_load_refuses_a_file_with_missing_frames(tmp_path):
-    filled().save(tmp_path)
+    make_filled_replay().save(tmp_path)
     with (tmp_path / "frames_0.u8").open("r+b") as file:
         file.truncate(10 * 64 * 64 * 3)
     with pytest.raises(UserError, match="must hold 23 frames"):
@@ -203,14 +203,14 @@ def test_load_refuses_a_file_with_missing_frames(tmp_path):
 
 @pytest.mark.parametrize("lengths", [(), (2,), (4, 4, 4)])
 def test_draw_names_the_sequence_length_when_episodes_are_too_short(lengths):
-    replay = filled(lengths=lengths)
+    replay = make_filled_replay(lengths=lengths)
     with pytest.raises(UserError, match=r"sequence_length \(5\)"):
         sample(replay, length=5)
 
 
 def test_draw_advises_more_capacity_when_a_lane_is_too_small():
     with pytest.raises(UserError, match="raise --replay.capacity"):
-        sample(filled(lengths=(9,), capacity=4), length=5)
+        sample(make_filled_replay(lengths=(9,), capacity=4), length=5)
 
 
 @pytest.mark.parametrize(
@@ -218,11 +218,11 @@ def test_draw_advises_more_capacity_when_a_lane_is_too_small():
 )
 def test_draw_advises_by_the_reason_that_no_sequence_fits(lengths, advice):
     with pytest.raises(UserError, match=advice):
-        sample(filled(lengths=lengths), length=5)
+        sample(make_filled_replay(lengths=lengths), length=5)
 
 
 def test_draw_takes_an_episode_of_exactly_the_sequence_length():
-    assert_aligned(sample(filled(lengths=(2, 5, 3)), length=5))
+    assert_aligned(sample(make_filled_replay(lengths=(2, 5, 3)), length=5))
 
 
 def test_replay_refuses_more_than_nine_tenths_of_the_free_memory(monkeypatch):

@@ -5,15 +5,15 @@ import csv
 import torch
 
 
-def rows_of(folder):
+def read_rows(folder):
     with (folder / "metrics.csv").open(newline="") as file:
         return list(csv.DictReader(file))
 
 
-def epochs_of(folder):
+def read_epochs(folder):
     """The rows of epochs, without the rows of evaluations."""
-    return [row for row in rows_of(folder) if row["reconstruction"]]
+    return [row for row in read_rows(folder) if row["reconstruction"]]
 
 
-def saved_state(folder):
+def read_state(folder):
     return torch.load(folder / "resume" / "state.pt", weights_only=True)

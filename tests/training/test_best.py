@@ -11,7 +11,7 @@ from latentplan.training import resume, train
 from latentplan.training.callbacks import Collect, Save, Stop
 from latentplan.training.collection.collector import Collector
 from latentplan.training.state import RunState
-from tests.training.run_folder import saved_state
+from tests.training.run_folder import read_state
 
 
 @pytest.fixture(scope="module")
@@ -20,18 +20,18 @@ def observed(tiny, dot, tmp_path_factory):
     evaluated, saved, collected = [], [], []
     collect, start = Collector.collect, Collect.on_train_epoch_start
 
-    def state_of(model):
+    def copy_state(model):
         return {name: value.clone() for name, value in model.state_dict().items()}
 
     def evaluate(collector, episodes, film=None, weights=None, actor=True):
         if weights is not None:
             collector._load_weights(weights)
-        evaluated.append(state_of(collector.model))
+        evaluated.append(copy_state(collector.model))
         return {"planner": [float(len(evaluated))], "actor": [0.0]}  # every evaluation is better than the last
 
     def save_agent(save, name, model, info):
         if name == "best":
-            saved.append(state_of(model))
+            saved.append(copy_state(model))
 
     def keep_weights(collector, weights, *arguments):
         collected.append((weights,))
@@ -41,7 +41,7 @@ def observed(tiny, dot, tmp_path_factory):
         before = len(collected)
         start(callback, trainer, learner)
         if len(collected) > before:
-            collected[-1] += (state_of(learner.averaged), state_of(learner.model))
+            collected[-1] += (copy_state(learner.averaged), copy_state(learner.model))
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(Collector, "evaluate", evaluate)
@@ -69,7 +69,7 @@ def test_collection_acts_with_the_averaged_weights(observed):
     assert not all(is_latest)
 
 
-def evaluating(returns, calls):
+def make_evaluate(returns, calls):
     """A stand-in for `Collector.evaluate` with given returns of the planner; records whether the actor plays."""
 
     def evaluate(collector, episodes, film=None, weights=None, actor=True):
@@ -84,27 +84,27 @@ def compared(tiny, dot, tmp_path_factory):
     """A run whose evaluation at 45 frames gave 10; at the end the last agent earns 5 and the best agent 7."""
     calls = []
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(Collector, "evaluate", evaluating(iter([10.0, 5.0, 7.0]), calls))
+        patch.setattr(Collector, "evaluate", make_evaluate(iter([10.0, 5.0, 7.0]), calls))
         folder = tmp_path_factory.mktemp("compared") / "run"
         return train(tiny(folder, evaluation={"every_frames": 45}), dot), calls
 
 
-def frames_of(folder):
+def read_frames(folder):
     return {name: read_info(folder / "checkpoints" / name)["env_frames"] for name in ("best", "last")}
 
 
 def test_best_agent_stays_when_it_beats_the_last_agent_on_the_final_starts(compared):
     run, _ = compared
     assert run.summary["planner"] == 5.0
-    assert frames_of(run.run_dir) == {"best": 45, "last": 90}
+    assert read_frames(run.run_dir) == {"best": 45, "last": 90}
 
 
 def test_best_agent_is_replaced_when_the_last_agent_beats_it_on_the_final_starts(compared, dot, tmp_path, monkeypatch):
     """The best mean of many short evaluations is also high by chance, so the final evaluation repeats it."""
     folder = shutil.copytree(compared[0].run_dir, tmp_path / "run")
-    monkeypatch.setattr(Collector, "evaluate", evaluating(iter([5.0, 3.0]), []))
+    monkeypatch.setattr(Collector, "evaluate", make_evaluate(iter([5.0, 3.0]), []))
     assert resume(folder, make_env=dot).summary["planner"] == 5.0
-    assert frames_of(folder) == {"best": 90, "last": 90}
+    assert read_frames(folder) == {"best": 90, "last": 90}
 
 
 def test_best_agent_is_evaluated_with_the_planner_only(compared):
@@ -114,19 +114,19 @@ def test_best_agent_is_evaluated_with_the_planner_only(compared):
 
 def test_evaluation_that_runs_when_the_time_is_up_can_be_the_best(tiny, dot, tmp_path, monkeypatch):
     monkeypatch.setattr(Stop, "_is_time_spent", lambda stop: stop.state.decisions >= 45)
-    monkeypatch.setattr(Collector, "evaluate", evaluating(iter([1.0, -1.0, 1.0]), []))
+    monkeypatch.setattr(Collector, "evaluate", make_evaluate(iter([1.0, -1.0, 1.0]), []))
     run = train(tiny(tmp_path / "run"), dot)
-    assert [entry["planner"] for entry in saved_state(run.run_dir)["run"]["evaluations"]] == [1.0]
-    assert frames_of(run.run_dir)["best"] == 45
+    assert [entry["planner"] for entry in read_state(run.run_dir)["run"]["evaluations"]] == [1.0]
+    assert read_frames(run.run_dir)["best"] == 45
 
 
 def test_store_results_drops_requests_of_a_worker_that_ended_with_an_interrupted_run(tiny, tmp_path):
-    class Gone:
+    class EndedWorker:
         def result(self):
             raise RuntimeError("the collection process ended unexpectedly")
 
     state = RunState()
-    collect = Collect(tiny(tmp_path), None, state, Gone(), tmp_path)
+    collect = Collect(tiny(tmp_path), None, state, EndedWorker(), tmp_path)
     collect._is_round_pending = True
     with pytest.raises(RuntimeError, match="ended unexpectedly"):
         collect.store_results()

@@ -12,7 +12,7 @@ from latentplan.training.callbacks import COLUMNS, MetricsFile, Record
 from latentplan.training.state import RunState
 
 
-def read(path):
+def read_table(path):
     with path.open(newline="") as file:
         reader = csv.DictReader(file)
         return list(reader), tuple(reader.fieldnames)
@@ -26,7 +26,7 @@ def file(tmp_path):
 def test_metrics_file_begins_with_its_columns_and_adds_new_names_at_the_end(file):
     file.append({"updates": 1, "minutes": 0.5})
     file.append({"minutes": 1.0, "reward": 0.25, "updates": 2, "value": 3.0})
-    rows, header = read(file.path)
+    rows, header = read_table(file.path)
     assert header == ("updates", "minutes", "reward", "value")
     assert rows[0] == {"updates": "1", "minutes": "0.5", "reward": "", "value": ""}
     assert rows[1] == {"updates": "2", "minutes": "1.0", "reward": "0.25", "value": "3.0"}
@@ -36,7 +36,7 @@ def test_metrics_file_keeps_figures_of_earlier_columns_when_losses_come_and_go(f
     file.append({"updates": 1, "removed": 0.1234567890123})
     resumed = MetricsFile(file.path, file.columns)
     resumed.append({"updates": 2, "added": 7.0})
-    rows, header = read(file.path)
+    rows, header = read_table(file.path)
     assert header == ("updates", "minutes", "removed", "added")
     assert [(row["removed"], row["added"]) for row in rows] == [("0.1234567890123", ""), ("", "7.0")]
 
@@ -47,7 +47,7 @@ def test_metrics_file_drops_chosen_rows_and_a_row_written_in_part(file):
     with file.path.open("a", newline="") as text:
         text.write("4,0.0")
     file.drop_rows(lambda row: int(row["updates"]) == 2)
-    rows, header = read(file.path)
+    rows, header = read_table(file.path)
     assert [row["updates"] for row in rows] == ["1", "3"] and header == ("updates", "minutes", "reward")
 
 
@@ -61,7 +61,7 @@ def test_record_writes_each_metric_of_the_learner_to_csv_and_tensorboard(tmp_pat
     logger = TensorBoardLogger(tmp_path, name="tensorboard", version="")
     record.on_train_epoch_end(SimpleNamespace(logger=logger), learner)
     logger.finalize("success")
-    ((row,), header) = read(tmp_path / "metrics.csv")
+    ((row,), header) = read_table(tmp_path / "metrics.csv")
     assert header == (*COLUMNS, "reconstruction", "surprise", "model_grad_norm", "behaviour_grad_norm")
     assert (row["env_frames"], row["updates"], row["episode_return"]) == ("30", "7", "5.0")
     assert [float(row[name]) for name in names] == [0.0, 1.0, 2.0, 3.0]

@@ -14,7 +14,7 @@ from latentplan.training import callbacks, resume, train
 from latentplan.training.collection.process import LocalWorker
 from latentplan.training.learner.registry import WORLD_MODEL_LOSSES, register
 from latentplan.training.run import INTERRUPTED, _Run
-from tests.training.run_folder import epochs_of, rows_of, saved_state
+from tests.training.run_folder import read_epochs, read_rows, read_state
 
 
 def assert_continues(before, after):
@@ -35,25 +35,25 @@ def test_resume_continues_an_interrupted_run(tiny, dot, tmp_path, interrupting, 
     assert (stopped.exit_code, dict(stopped.summary)) == (INTERRUPTED, {})
     assert "make_env=..." in capsys.readouterr().out  # the command line cannot make this environment
     assert [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)] == handlers
-    before = saved_state(stopped.run_dir)
+    before = read_state(stopped.run_dir)
     assert before["run"]["env_frames"] < 90
     resumed = resume(stopped.run_dir, make_env=dot)
     assert (resumed.run_dir, resumed.exit_code) == (stopped.run_dir, 0)
-    after = saved_state(stopped.run_dir)
+    after = read_state(stopped.run_dir)
     assert_continues(before, after)
     assert after["run"]["env_frames"] == 90
-    updates = [int(row["updates"]) for row in epochs_of(stopped.run_dir)]
+    updates = [int(row["updates"]) for row in read_epochs(stopped.run_dir)]
     assert updates == sorted(set(updates))
 
 
 def test_resume_extends_a_finished_run(short, extended):
-    after = saved_state(extended.run_dir)
-    assert_continues(saved_state(short.run_dir), after)
+    after = read_state(extended.run_dir)
+    assert_continues(read_state(short.run_dir), after)
     assert after["run"]["env_frames"] == 90
 
 
 def test_resume_makes_as_many_updates_as_one_long_run(finished, extended):
-    updates = [saved_state(run.run_dir)["learner"]["updates"] for run in (extended, finished)]
+    updates = [read_state(run.run_dir)["learner"]["updates"] for run in (extended, finished)]
     assert updates[0] == updates[1]
 
 
@@ -66,9 +66,9 @@ def test_resume_keeps_the_column_of_a_removed_loss_and_adds_the_column_of_a_new_
     (folder / "metrics.csv").write_text("".join(f"{line}\r\n" for line in (header, *lines)))
     register(WORLD_MODEL_LOSSES, "largest_reward")(lambda predicted: predicted.batch.rewards.abs().max())
     resume(folder, frames=105, make_env=dot)
-    *rows, last = epochs_of(folder)
+    *rows, last = read_epochs(folder)
     assert list(last) == [*header.split(","), "overshooting", "largest_reward"]
-    assert [row["imitation"] for row in rows] == [row["overshooting"] for row in epochs_of(extended.run_dir)]
+    assert [row["imitation"] for row in rows] == [row["overshooting"] for row in read_epochs(extended.run_dir)]
     assert {row["overshooting"] for row in rows} == {row["largest_reward"] for row in rows} == {""}
     assert last["imitation"] == "" and float(last["overshooting"]) > 0.0 and 0.0 < float(last["largest_reward"]) <= 1.0
 
@@ -84,12 +84,12 @@ def test_final_evaluation_is_not_counted_in_the_minutes(short, dot, tmp_path, mo
     monkeypatch.setattr("latentplan.training.state.time", clock)
     monkeypatch.setattr(_Run, "_evaluate", slow)
     run = resume(shutil.copytree(short.run_dir, tmp_path / "run"), make_env=dot)
-    assert ahead[0] > 0.0 and saved_state(run.run_dir)["run"]["earlier_minutes"] < 30.0
+    assert ahead[0] > 0.0 and read_state(run.run_dir)["run"]["earlier_minutes"] < 30.0
 
 
 def test_resume_survives_the_loss_of_the_best_agent(finished, dot, tmp_path, capsys):
     folder = shutil.copytree(finished.run_dir, tmp_path / "run")
-    state = saved_state(folder)
+    state = read_state(folder)
     state["run"]["best_return"] = 1e6
     torch.save(state, folder / "resume" / "state.pt")
     (folder / "checkpoints" / "best" / "weights.safetensors").unlink()
@@ -99,32 +99,32 @@ def test_resume_survives_the_loss_of_the_best_agent(finished, dot, tmp_path, cap
 
 
 def test_resume_continues_a_run_interrupted_before_it_learned(tiny, dot, tmp_path, monkeypatch):
-    class Gone(LocalWorker):
-        """A worker that ends together with the run, as when a signal reaches the whole process group."""
+    class InterruptedWorker(LocalWorker):
+        """A worker whose process the same signal ends as the run, as when a signal reaches the whole process group."""
 
         def submit(self, command, *arguments):
-            self.is_gone = command == "collect"
+            self.has_ended = command == "collect"
             super().submit(command, *arguments)
 
         def result(self):
-            if not self.is_gone:
+            if not self.has_ended:
                 return super().result()
             os.kill(os.getpid(), signal.SIGTERM)
             raise RuntimeError("the collection process ended unexpectedly")
 
     with monkeypatch.context() as patch:
-        patch.setattr("latentplan.training.collection.process.LocalWorker", Gone)
+        patch.setattr("latentplan.training.collection.process.LocalWorker", InterruptedWorker)
         assert train(tiny(tmp_path / "run"), dot).exit_code == INTERRUPTED
-    assert saved_state(tmp_path / "run")["run"]["decisions"] == 0
+    assert read_state(tmp_path / "run")["run"]["decisions"] == 0
     assert resume(tmp_path / "run", make_env=dot).exit_code == 0
 
 
 def test_resume_keeps_the_new_budget_of_an_interrupted_extension(short, dot, tmp_path, interrupting):
     folder = shutil.copytree(short.run_dir, tmp_path / "run")
     stopped = resume(folder, frames=90, make_env=interrupting(dot, at_step=10).make)
-    assert stopped.exit_code == INTERRUPTED and saved_state(folder)["run"]["env_frames"] < 90
+    assert stopped.exit_code == INTERRUPTED and read_state(folder)["run"]["env_frames"] < 90
     resume(folder, make_env=dot)
-    assert saved_state(folder)["run"]["env_frames"] == 90
+    assert read_state(folder)["run"]["env_frames"] == 90
 
 
 def test_resume_repeats_a_run_that_crashed_before_its_first_save(finished, tiny, dot, tmp_path):
@@ -133,10 +133,10 @@ def test_resume_repeats_a_run_that_crashed_before_its_first_save(finished, tiny,
     step = {"step": lambda self, action: dot.step(self, action) if next(steps) < 100 else 1 / 0}
     with pytest.raises(ZeroDivisionError):
         train(tiny(tmp_path / "run", evaluation={"every_frames": 10**6}), type("Crashing", (dot,), step))
-    assert len(rows_of(tmp_path / "run")) > 0 and saved_state(tmp_path / "run")["learner"]["updates"] == 0
+    assert len(read_rows(tmp_path / "run")) > 0 and read_state(tmp_path / "run")["learner"]["updates"] == 0
     resume(tmp_path / "run", make_env=dot)
-    assert saved_state(tmp_path / "run")["learner"]["updates"] == saved_state(finished.run_dir)["learner"]["updates"]
-    updates = [int(row["updates"]) for row in rows_of(tmp_path / "run")]
+    assert read_state(tmp_path / "run")["learner"]["updates"] == read_state(finished.run_dir)["learner"]["updates"]
+    updates = [int(row["updates"]) for row in read_rows(tmp_path / "run")]
     assert len(updates) == len(set(updates))
 
 
@@ -147,11 +147,11 @@ def test_resume_evaluates_the_same_agent_of_a_finished_run(finished, dot):
 
 def test_resume_of_a_finished_run_saves_its_optimizers_again(finished, dot, tmp_path):
     folder = shutil.copytree(finished.run_dir, tmp_path / "run")
-    before = saved_state(folder)
+    before = read_state(folder)
     before["run"]["best_return"] = float("-inf")  # so that this evaluation is the best, and saved
     torch.save(before, folder / "resume" / "state.pt")
     resume(folder, make_env=dot)
-    after = saved_state(folder)
+    after = read_state(folder)
     assert after["run"]["best_return"] > float("-inf")
     states = [[optimizer["state"].keys() for optimizer in saved["optimizers"]] for saved in (before, after)]
     assert states[0] == states[1] and all(states[0])
@@ -161,8 +161,8 @@ def test_resume_repeats_an_evaluation_that_an_interruption_cut_off(finished, tin
     # Step 50 lies in the first round, when the evaluation of the prefill has been asked for but not taken.
     stopped = train(tiny(tmp_path / "run"), interrupting(dot, at_step=50).make)
     resume(stopped.run_dir, make_env=dot)
-    evaluated = [entry["env_frames"] for entry in saved_state(stopped.run_dir)["run"]["evaluations"]]
-    assert evaluated == [entry["env_frames"] for entry in saved_state(finished.run_dir)["run"]["evaluations"]]
+    evaluated = [entry["env_frames"] for entry in read_state(stopped.run_dir)["run"]["evaluations"]]
+    assert evaluated == [entry["env_frames"] for entry in read_state(finished.run_dir)["run"]["evaluations"]]
 
 
 def test_train_exits_at_once_on_a_second_interruption(tiny, dot, tmp_path, interrupting):
@@ -181,7 +181,7 @@ def test_resume_drops_metrics_written_after_the_last_save(short, dot, tmp_path):
     assert lost != lines[-1]
     (folder / "metrics.csv").write_text("".join([*lines, lost]))  # as a run that was killed leaves the file
     resume(folder, frames=75, make_env=dot)
-    assert [int(row["updates"]) for row in epochs_of(folder)] == [6, 12, 18]
+    assert [int(row["updates"]) for row in read_epochs(folder)] == [6, 12, 18]
     assert lost not in (folder / "metrics.csv").read_text()
 
 
@@ -192,6 +192,6 @@ def test_resume_continues_from_the_last_timed_save_after_a_crash(tiny, dot, tmp_
     config = tiny(tmp_path / "run", evaluation={"every_frames": 10**6}, run={"frames": 105})
     with pytest.raises(ZeroDivisionError):
         train(config, type("Crashing", (dot,), step))
-    assert (before := saved_state(tmp_path / "run"))["run"]["env_frames"] == 75
+    assert (before := read_state(tmp_path / "run"))["run"]["env_frames"] == 75
     resume(tmp_path / "run", make_env=dot)
-    assert_continues(before, saved_state(tmp_path / "run"))
+    assert_continues(before, read_state(tmp_path / "run"))

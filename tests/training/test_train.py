@@ -11,7 +11,7 @@ from latentplan.config import UserError
 from latentplan.training import resume, train
 from latentplan.training.callbacks import COLUMNS
 from latentplan.training.folder import lock_folder
-from tests.training.run_folder import epochs_of, rows_of, saved_state
+from tests.training.run_folder import read_epochs, read_rows, read_state
 
 LOSSES = (
     *(
@@ -29,26 +29,26 @@ LOSSES = (
 
 
 def without_minutes(folder):
-    return [{name: value for name, value in row.items() if name != "minutes"} for row in rows_of(folder)]
+    return [{name: value for name, value in row.items() if name != "minutes"} for row in read_rows(folder)]
 
 
 def test_train_ends_with_its_budget_and_returns_a_summary(finished):
     assert finished.exit_code == 0
     assert finished.summary.keys() >= {"planner", "actor"}
     assert all(0.0 <= finished.summary[mode] <= 20.0 for mode in ("planner", "actor"))
-    state = saved_state(finished.run_dir)
+    state = read_state(finished.run_dir)
     assert state["run"]["env_frames"] == state["run"]["decisions"] == 90
 
 
 def test_train_makes_every_update_of_its_rounds(finished):
     # 45 decisions before learning, then three rounds of 15; 6 updates per round, and 6 after the last round.
-    updates = saved_state(finished.run_dir)["learner"]["updates"]
+    updates = read_state(finished.run_dir)["learner"]["updates"]
     assert updates == 6 * 4
-    assert [int(row["updates"]) for row in epochs_of(finished.run_dir)] == [6, 12, 18, 24]
+    assert [int(row["updates"]) for row in read_epochs(finished.run_dir)] == [6, 12, 18, 24]
 
 
 def test_train_writes_metrics_in_the_documented_order(finished):
-    rows, epochs = rows_of(finished.run_dir), epochs_of(finished.run_dir)
+    rows, epochs = read_rows(finished.run_dir), read_epochs(finished.run_dir)
     assert tuple(rows[0]) == (*COLUMNS, *LOSSES)
     clocks = [[float(row[name]) for row in epochs] for name in ("env_frames", "decisions", "updates", "minutes")]
     assert all(np.all(np.diff(clock) >= 0) for clock in clocks)
@@ -57,8 +57,8 @@ def test_train_writes_metrics_in_the_documented_order(finished):
 
 
 def test_train_writes_evaluations_with_the_clocks_of_the_evaluated_weights(finished):
-    evaluated = [row for row in rows_of(finished.run_dir) if row["planner_return"]]
-    evaluations = saved_state(finished.run_dir)["run"]["evaluations"]
+    evaluated = [row for row in read_rows(finished.run_dir) if row["planner_return"]]
+    evaluations = read_state(finished.run_dir)["run"]["evaluations"]
     assert len(evaluated) == len(evaluations) > 0
     for row, entry in zip(evaluated, evaluations, strict=True):
         assert (int(row["env_frames"]), int(row["updates"])) == (entry["env_frames"], entry["updates"])
@@ -82,7 +82,7 @@ def test_train_repeats_with_its_seed_also_when_another_process_collects(finished
 
 def test_train_differs_with_another_seed(finished, tiny, dot, tmp_path):
     other = train(tiny(tmp_path / "other", run={"seed": 1, "frames": 45}), dot)
-    (first, *_), (theirs, *_) = epochs_of(finished.run_dir), epochs_of(other.run_dir)
+    (first, *_), (theirs, *_) = read_epochs(finished.run_dir), read_epochs(other.run_dir)
     assert first["reconstruction"] != theirs["reconstruction"]
 
 
@@ -173,4 +173,4 @@ def test_train_explains_that_episodes_are_too_short(tiny, dot, tmp_path):
 
 def test_train_shortens_the_prefill_to_a_small_budget(tiny, dot, tmp_path):
     run = train(tiny(tmp_path / "run", run={"frames": 25}), dot)
-    assert saved_state(run.run_dir)["run"]["env_frames"] == 25
+    assert read_state(run.run_dir)["run"]["env_frames"] == 25

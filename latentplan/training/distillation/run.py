@@ -243,7 +243,7 @@ class _Distillation:
             command = f"python scripts/distill.py --resume {self.folder}"
             if self.config.env.domain == USER_DOMAIN:
                 command = f'latentplan.training.resume_distillation("{self.folder}", make_env=...)'
-            self.line.print(f"stopped; to go on: {command}")
+            self.line.print(f"stopped; to resume: {command}")
             return Result(self.folder, INTERRUPTED, {})
         finally:
             self.env.close()

@@ -45,8 +45,8 @@ class Boxes(NamedTuple):
 class BoxSource:
     """Draws boxes around observed quantities.
 
-    Each box has one chosen quantity and one wanted value, drawn uniformly from the range of the chosen quantity. Three
-    quarters of the boxes lie around a row whose chosen quantity is close to the wanted value, so that rare values become
+    Each box has one chosen quantity and one wanted value, drawn uniformly from the range of that quantity. Three
+    quarters of the boxes lie around a row whose chosen quantity is close to the wanted value, so that rare values are
     frequent goals. The other boxes lie around a row drawn uniformly. In a quarter of all boxes the centre of the chosen
     quantity then moves to the wanted value. Each interval is a point, open above, open below, closed with a width of up
     to one scale, or open on both sides; the interval of the chosen quantity is never open on both sides.

@@ -35,8 +35,8 @@ def learn_goals(
     """Teaches a trained agent to pursue goals that are named after training.
 
     Args:
-        checkpoint: Folder of a run or of an agent. Rollouts start from beliefs in the replay of the run; an agent without
-            a replay plays first.
+        checkpoint: Folder of a run or of an agent. Rollouts start from beliefs in the replay of the run; an agent that
+            has no replay plays first.
         folder: Folder for the new agent and the saved state.
         settings: Settings of the learning; None takes the defaults.
         device: "cpu" or "cuda".
@@ -166,7 +166,7 @@ def _learn(run: Path, folder: Path, settings: GoalsConfig, device: str, saved: d
                 last_save = time.monotonic()
         save()
         if should_stop():
-            line.print(f"stopped; to go on: python scripts/goals.py --resume {folder}")
+            line.print(f"stopped; to resume: python scripts/goals.py --resume {folder}")
             return Result(folder, INTERRUPTED, {})
         line.print(f"agent: {folder}")
     return Result(folder, 0, {"worth": worth})

@@ -52,7 +52,7 @@ class Prediction(NamedTuple):
         reward_logits: Predicted rewards, (batch, time, bin).
         continue_logits: Predicted continuation, (batch, time).
         open_loop: Features predicted from actions alone, (batch, reached, feature); see `_predict_open_loop`.
-        open_loop_reward_logits: Rewards predicted from these features, (batch, reached, bin).
+        open_loop_reward_logits: Rewards predicted from `open_loop`, (batch, reached, bin).
         open_loop_divergence: Mean KL of the open-loop priors to the posteriors, in nats, a scalar.
         is_seen: 1 for frames up to the end of the episode, 0 beyond, (batch, time + 1).
     """
@@ -76,9 +76,9 @@ class Replayed(NamedTuple):
     """Replayed states with the returns that followed them.
 
     Attributes:
-        features: Features of states, (rows, batch, feature).
-        returns: Lambda-returns from these states on, (rows, batch).
-        weights: Weights of these states, with mean 1; 0 beyond the end of an episode, (rows, batch).
+        features: Features of the states, (rows, batch, feature).
+        returns: Lambda-returns from each state on, (rows, batch).
+        weights: Weights of the states, with mean 1; 0 beyond the end of an episode, (rows, batch).
     """
 
     features: Tensor
@@ -94,7 +94,7 @@ class Behaviour(NamedTuple):
         config: Settings of learning.
         imagined: Imagined rollouts.
         returns: Lambda-returns of the imagined states but the last, (horizon, rows).
-        reach: Probability that a rollout has not ended before each of these states, (horizon, rows).
+        reach: Probability that a rollout has not ended before each state but the last, (horizon, rows).
         return_scale: Spread of the returns, by which the actor's loss divides them, a scalar.
         replayed: Replayed states with their returns.
     """

@@ -212,7 +212,7 @@ class Learner(lightning.LightningModule):
 
 
 def is_refreshed(batch: Batch, chosen: Tensor) -> Tensor:
-    """Frames whose stored beliefs are replaced: those of chosen sequences, up to the end of the episode.
+    """Chooses the frames whose stored beliefs are replaced: frames of chosen sequences, up to the end of the episode.
 
     Args:
         batch: Sequences.

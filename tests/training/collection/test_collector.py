@@ -14,7 +14,7 @@ from latentplan.training.callbacks import choose_behaviour
 from latentplan.training.collection.collector import Collector
 
 
-def weights_of(config, seed=0):
+def make_weights(config, seed=0):
     torch.manual_seed(seed)
     model = WorldModel(config.model, action_dim=1)
     return {name: value.numpy() for name, value in model.state_dict().items()}
@@ -33,7 +33,7 @@ def make_collector(tiny, dot):
         collector.close()
 
 
-def place_of(frames):
+def read_places(frames):
     """Position of the dot in [-1, 1], from frames (n, 64, 64, 3) of a picture with 16 columns."""
     columns = frames[:, 0, :, 0].astype(float)
     return ((columns * np.arange(64)).sum(1) / columns.sum(1) / 4.0 - 0.375 - 7.5) / 7.0
@@ -45,7 +45,7 @@ def test_collector_returns_rows_that_obey_the_dynamics_of_the_environment(make_c
     assert len(rows.frames) == 47  # each frame once; the last frames of two episodes have no action
     assert (collected.decisions, collected.env_frames, len(collected.episode_returns)) == (45, 45, 2)
     assert np.flatnonzero(rows.is_first).tolist() == [0, 21, 42]
-    place = place_of(rows.frames)
+    place = read_places(rows.frames)
     goes_on = ~rows.is_first[1:]
     expected = np.clip(place[:-1] + 0.2 * rows.actions[:-1, 0], -1.0, 1.0)
     half_a_column = 1.0 / 7.0
@@ -61,7 +61,7 @@ def test_collector_continues_episodes_between_rounds(make_collector):
     first, second = (parts.collect(None, "random", 15, counter).rows[0] for counter in (0, 1))
     joined = np.concatenate([first.is_first, second.is_first])
     assert np.array_equal(joined, expected.is_first)
-    place = place_of(np.concatenate([first.frames[-1:], second.frames[:1]]))
+    place = read_places(np.concatenate([first.frames[-1:], second.frames[:1]]))
     assert place[1] == pytest.approx(np.clip(place[0] + 0.2 * first.actions[-1, 0], -1, 1), abs=1.0 / 7.0)
 
 
@@ -94,14 +94,14 @@ def test_evaluate_warns_when_the_film_cannot_be_written(make_collector, tmp_path
 
 
 def test_evaluate_plays_whole_episodes_when_collection_shortens_them(make_collector, tiny):
-    weights = weights_of(tiny(""))
+    weights = make_weights(tiny(""))
     cut, whole = make_collector(collection={"episode_decisions": 8}), make_collector()
     assert cut.evaluate(2, weights=weights) == whole.evaluate(2, weights=weights)
 
 
 def test_collector_stores_the_belief_of_each_frame(make_collector, tiny):
     collector = make_collector()
-    (rows,) = collector.collect(weights_of(tiny("")), "actor", 25, 0).rows
+    (rows,) = collector.collect(make_weights(tiny("")), "actor", 25, 0).rows
     assert rows.deter.shape == (26, 16)
     assert (rows.deter[[0, 21]] == 0.0).all()
     assert (np.abs(rows.deter[1:20]).sum(1) > 0.0).all()
@@ -111,7 +111,7 @@ def test_collector_stores_the_belief_of_each_frame(make_collector, tiny):
 def test_collector_stores_the_belief_of_the_unturned_frame_when_the_agent_turns_frames(make_collector, tiny, behaviour):
     turns = {"model": {"turns": 4}, "learning": {"turned_share": 0.5}}
     config, collector = tiny("", **turns), make_collector(**turns)
-    (rows,) = collector.collect(weights_of(config), behaviour, 10, 0).rows
+    (rows,) = collector.collect(make_weights(config), behaviour, 10, 0).rows
     frames, actions = torch.from_numpy(rows.frames), torch.from_numpy(rows.actions)
     state = collector.model.see(torch.zeros(1, 16), frames[:1])
     for time in range(1, 10):
@@ -121,7 +121,7 @@ def test_collector_stores_the_belief_of_the_unturned_frame_when_the_agent_turns_
 
 @pytest.mark.parametrize("behaviour", ["planner", "actor"])
 def test_collector_repeats_a_round_with_the_same_seed_round_and_weights(make_collector, tiny, behaviour):
-    weights = weights_of(tiny(""))
+    weights = make_weights(tiny(""))
     one, same, other = (make_collector().collect(weights, behaviour, 12, counter).rows[0] for counter in (3, 3, 4))
     assert np.array_equal(one.actions, same.actions) and np.array_equal(one.frames, same.frames)
     assert not np.array_equal(one.actions, other.actions)
@@ -184,7 +184,7 @@ def test_collector_refuses_goals_that_cannot_be_pursued(make_cart, goal, said):
 
 
 def test_evaluate_neither_explores_nor_disturbs_collection(make_collector, tiny):
-    weights = weights_of(tiny(""))
+    weights = make_weights(tiny(""))
     evaluated, plain = make_collector(), make_collector()
     for collector in (evaluated, plain):
         collector.collect(weights, "planner", 7, 0)

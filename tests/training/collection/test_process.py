@@ -1,10 +1,15 @@
-"""Workers: results in order, from this process and from another one that leaves nothing behind."""
+"""Workers return results in the order of requests, from this process and from another process."""
 
 import numpy as np
 import pytest
 
 from latentplan.config import UserError
 from latentplan.training.collection.process import LocalWorker, RemoteWorker
+
+
+def test_collection_process_imports_no_lightning(run_python):
+    script = "import sys, latentplan.training.collection.process; print('lightning' in sys.modules)"
+    assert run_python("-c", script).stdout.strip() == "False"
 
 
 def test_local_worker_returns_results_in_the_order_of_requests(tiny, dot):

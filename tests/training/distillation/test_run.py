@@ -63,11 +63,11 @@ def finished(checkpoint, push, tmp_path_factory):
     return distill(checkpoint, tmp_path_factory.mktemp("runs") / "out", SETTINGS, make_env=push)
 
 
-def weights_of(folder):
+def read_weights(folder):
     return load_model(folder)[0].state_dict()
 
 
-def states_of(model, rows=40, seed=0):
+def draw_states(model, rows=40, seed=0):
     generator = torch.Generator().manual_seed(seed)
     return State(
         0.5 * torch.randn(rows, model.config.deter_dim, generator=generator),
@@ -82,7 +82,7 @@ def test_distill_recovers_most_of_the_planners_return(finished):
 
 
 def test_distill_changes_only_the_actor(finished, checkpoint):
-    before, after = weights_of(checkpoint), weights_of(finished.run_dir)
+    before, after = read_weights(checkpoint), read_weights(finished.run_dir)
     changed = {name.split(".")[0] for name in before if not torch.equal(before[name], after[name])}
     assert changed == {"actor"}
 
@@ -119,7 +119,7 @@ def test_distill_keeps_an_actor_that_earns_more_than_its_planner(checkpoint, pus
 
     result = distill(checkpoint, tmp_path / "out", SHORT, make_env=Pull)
     assert result.summary["planner"] < result.summary["before"] == result.summary["after"]
-    before, after = weights_of(checkpoint), weights_of(tmp_path / "out")
+    before, after = read_weights(checkpoint), read_weights(tmp_path / "out")
     assert all(torch.equal(before[name], after[name]) for name in before)
     assert read_info(tmp_path / "out")["distilled"]["kept_round"] is None
     out = " ".join(capsys.readouterr().out.split())
@@ -137,7 +137,7 @@ def test_resume_distillation_ends_with_the_agent_of_an_uninterrupted_one(
     assert f"--resume {out}" in " ".join(capsys.readouterr().out.split())
     gone_on = resume_distillation(out, make_env=push)
     assert gone_on.exit_code == 0 and gone_on.summary == finished.summary
-    expected, after = weights_of(finished.run_dir), weights_of(out)
+    expected, after = read_weights(finished.run_dir), read_weights(out)
     assert all(torch.equal(expected[name], after[name]) for name in expected)
     saved, reference = (torch.load(folder / DISTILLATION_FILE, weights_only=True) for folder in (out, finished.run_dir))
     assert saved["state"]["stage"] == reference["state"]["stage"] == 9
@@ -218,7 +218,7 @@ def test_plan_gives_the_distribution_of_the_first_action(model, tiny):
 
 
 def test_plan_actions_returns_the_same_labels_for_any_batch_size(model, tiny):
-    planner, states = PlanningAgent(model, tiny(""), 0.9, planner=PLANNER).controller.planner, states_of(model)
+    planner, states = PlanningAgent(model, tiny(""), 0.9, planner=PLANNER).controller.planner, draw_states(model)
     done = []
     whole, parts = (
         plan_actions(planner, model, states, torch.Generator().manual_seed(0), rows, done.append) for rows in (40, 7)
@@ -230,14 +230,14 @@ def test_plan_actions_returns_the_same_labels_for_any_batch_size(model, tiny):
 
 
 def test_plan_actions_raises_when_a_search_finds_no_finite_return(model, tiny):
-    planner, states = PlanningAgent(model, tiny(""), 0.9, planner=PLANNER).controller.planner, states_of(model)
+    planner, states = PlanningAgent(model, tiny(""), 0.9, planner=PLANNER).controller.planner, draw_states(model)
     states.deter[3] = float("nan")
     with pytest.raises(FloatingPointError, match="at 1 of 40 states"):
         plan_actions(planner, model, states, torch.Generator(), 40, lambda done: None)
 
 
 def test_student_learns_the_labels(model):
-    states = states_of(model, 300)
+    states = draw_states(model, 300)
     wanted = Gaussian(torch.tanh(states.deter[:, :1]), torch.full((300, 1), 0.3))
     demonstrations, losses = Demonstrations(), []
     demonstrations.add(states, wanted, 0)
@@ -249,7 +249,7 @@ def test_student_learns_the_labels(model):
 
 
 def test_student_learns_one_label_for_all_turns_of_a_belief(model):
-    demonstrations, rows = Demonstrations(), states_of(model, 160)
+    demonstrations, rows = Demonstrations(), draw_states(model, 160)
     sides = State(*(part.unflatten(0, (40, 4)) for part in rows))
     planned = Gaussian(torch.linspace(-0.8, 0.8, 40)[:, None], torch.full((40, 1), 0.1))
     demonstrations.add(sides, planned, 0)
@@ -262,7 +262,7 @@ def test_student_learns_one_label_for_all_turns_of_a_belief(model):
 
 def test_student_raises_when_labels_are_not_finite(model):
     demonstrations = Demonstrations()
-    demonstrations.add(states_of(model), Gaussian(torch.full((40, 1), float("nan")), torch.ones(40, 1)), 0)
+    demonstrations.add(draw_states(model), Gaussian(torch.full((40, 1), float("nan")), torch.ones(40, 1)), 0)
     with pytest.raises(FloatingPointError, match="not finite"):
         Student(model.actor, DistillConfig()).learn(demonstrations, 0, lambda done, loss: None)
 

@@ -14,13 +14,13 @@ from latentplan.training.state import RunState
 LABELS = {"height": 0.2, "task.stand": 1.0, "task.walk": 1.0}
 
 
-def first(name, action_repeat=1, frames=100, **env):
-    """Settings of a run with a curriculum of 100 frames for a task or expression."""
+def make_config(name, action_repeat=1, frames=100, **env):
+    """Makes the settings of a run with a curriculum of 100 frames for a task or expression."""
     learning = LearningConfig(curriculum_task=name, curriculum_frames=frames)
     return Config(env=EnvConfig(action_repeat=action_repeat, **env), learning=learning)
 
 
-def at(env_frames):
+def state_at(env_frames):
     return RunState(env_frames=env_frames)
 
 
@@ -31,8 +31,8 @@ def labelled(batch):
 
 
 def test_curriculum_gives_the_rewards_of_its_task_until_its_frames_are_over(labelled):
-    state = at(0)
-    curriculum = Curriculum(first("stand"), LABELS, state)
+    state = state_at(0)
+    curriculum = Curriculum(make_config("stand"), LABELS, state)
     for state.env_frames in (0, 99):
         assert torch.equal(curriculum(labelled).rewards, labelled.labels[:, 1:, 1])
     state.env_frames = 100
@@ -40,21 +40,21 @@ def test_curriculum_gives_the_rewards_of_its_task_until_its_frames_are_over(labe
 
 
 def test_curriculum_changes_only_the_rewards(labelled):
-    changed = Curriculum(first("walk", action_repeat=2), LABELS, at(0))(labelled)
+    changed = Curriculum(make_config("walk", action_repeat=2), LABELS, state_at(0))(labelled)
     for name in set(labelled._fields) - {"rewards"}:
         assert getattr(changed, name) is getattr(labelled, name)
 
 
 def test_curriculum_returns_the_same_batch_without_another_task(labelled):
-    assert Curriculum(first(None), LABELS, at(0))(labelled) is labelled
-    assert Curriculum(first("walk", task="walk"), LABELS, at(0))(labelled) is labelled
-    assert Curriculum(first("walk", task="walk"), {}, at(0))(labelled) is labelled
+    assert Curriculum(make_config(None), LABELS, state_at(0))(labelled) is labelled
+    assert Curriculum(make_config("walk", task="walk"), LABELS, state_at(0))(labelled) is labelled
+    assert Curriculum(make_config("walk", task="walk"), {}, state_at(0))(labelled) is labelled
 
 
 @pytest.mark.parametrize("task", ["walk", "stand"])
 def test_curriculum_may_precede_an_objective(labelled, task):
-    state = at(99)
-    curriculum = Curriculum(first("walk", task=task, objective="speed -> 2.0"), LABELS, state)
+    state = state_at(99)
+    curriculum = Curriculum(make_config("walk", task=task, objective="speed -> 2.0"), LABELS, state)
     assert torch.equal(curriculum(labelled).rewards, labelled.labels[:, 1:, 2])
     state.env_frames = 100
     assert curriculum(labelled) is labelled
@@ -63,20 +63,20 @@ def test_curriculum_may_precede_an_objective(labelled, task):
 @pytest.mark.parametrize(("labels", "told"), [(LABELS, "stand, walk"), ({}, "none")])
 def test_curriculum_refuses_an_unknown_task(labels, told):
     with pytest.raises(UserError, match=f"curriculum_task 'fly' is unknown; .*: {told}; as an expression: .*fly"):
-        Curriculum(first("fly"), labels, at(0))
+        Curriculum(make_config("fly"), labels, state_at(0))
 
 
 @pytest.mark.parametrize("text", ["return", "height + goal:nowhere.png"])
 def test_curriculum_refuses_an_expression_over_unlabelled_values(text):
     with pytest.raises(UserError, match="curriculum_task"):
-        Curriculum(first(text), LABELS, at(0))
+        Curriculum(make_config(text), LABELS, state_at(0))
 
 
 def test_curriculum_computes_an_expression_over_labels(labelled):
     height, stand, _ = labelled.labels[:, 1:].unbind(-1)
-    changed = Curriculum(first("2 * height - task(stand)"), LABELS, at(0))(labelled)
+    changed = Curriculum(make_config("2 * height - task(stand)"), LABELS, state_at(0))(labelled)
     assert torch.allclose(changed.rewards, 2 * height - stand)
-    clause = Curriculum(first("height > 0.6"), LABELS, at(0))(labelled)
+    clause = Curriculum(make_config("height > 0.6"), LABELS, state_at(0))(labelled)
     missing = (0.6 - height).clamp_min(0.0) / 0.2
     assert torch.allclose(clause.rewards, 0.1 ** missing.square())
 
@@ -86,8 +86,8 @@ def test_curriculum_gives_the_reward_of_the_same_objective(labelled):
     labels = torch.randn(4, 6, len(scales), generator=torch.Generator().manual_seed(0))
     paid = ObjectiveReward(text, "pendulum")
     expected = [[paid(row) for row in rows[1:].double().numpy()] for rows in labels]
-    config = first(text, domain="pendulum", task="swingup")
-    changed = Curriculum(config, scales, at(0))(labelled._replace(labels=labels))
+    config = make_config(text, domain="pendulum", task="swingup")
+    changed = Curriculum(config, scales, state_at(0))(labelled._replace(labels=labels))
     assert torch.allclose(changed.rewards.double(), torch.tensor(expected, dtype=torch.float64), atol=1e-5)
 
 
@@ -128,21 +128,21 @@ class Learner:
 
 @pytest.mark.parametrize(("task", "frames", "times"), [("stand", 100, 1), ("stand", 0, 0), (None, 100, 0)])
 def test_curriculum_resets_the_value_head_once_also_when_resumed(task, frames, times):
-    learner, state = Learner(), at(99)
-    curriculum = Curriculum(first(task, frames=frames), LABELS, state)
+    learner, state = Learner(), state_at(99)
+    curriculum = Curriculum(make_config(task, frames=frames), LABELS, state)
     curriculum.on_train_epoch_start(None, learner)
     assert learner.num_resets == 0
     state.env_frames = 101
     curriculum.on_train_epoch_start(None, learner)
-    resumed = Curriculum(first(task, frames=frames), LABELS, RunState(**state.to_dict()))
+    resumed = Curriculum(make_config(task, frames=frames), LABELS, RunState(**state.to_dict()))
     for each in (curriculum, resumed):
         each.on_train_epoch_start(None, learner)
     assert learner.num_resets == times
 
 
 def test_curriculum_is_skipped_when_its_task_is_the_objective(labelled):
-    learner, state = Learner(), at(0)
-    curriculum = Curriculum(first("height", objective="height"), LABELS, state)
+    learner, state = Learner(), state_at(0)
+    curriculum = Curriculum(make_config("height", objective="height"), LABELS, state)
     assert curriculum(labelled) is labelled and curriculum.note == ""
     state.env_frames = 101
     curriculum.on_train_epoch_start(None, learner)
@@ -150,5 +150,7 @@ def test_curriculum_is_skipped_when_its_task_is_the_objective(labelled):
 
 
 def test_note_describes_the_curriculum():
-    assert Curriculum(first("stand", frames=40_000), LABELS, at(0)).note == "; first stand, for 40,000 frames"
-    assert Curriculum(first("stand", frames=0), LABELS, at(0)).note == ""
+    assert (
+        Curriculum(make_config("stand", frames=40_000), LABELS, state_at(0)).note == "; first stand, for 40,000 frames"
+    )
+    assert Curriculum(make_config("stand", frames=0), LABELS, state_at(0)).note == ""

@@ -34,12 +34,12 @@ class Graphed(OwnOptimizers, GraphedLearner):
     """The graphed learner, which takes rows."""
 
 
-def prepared(batch):
-    """The batch with other rewards than the stored ones."""
+def raise_rewards(batch):
+    """Returns the batch with other rewards than the stored rewards."""
     return batch._replace(rewards=batch.rewards + 1.0)
 
 
-def filled(device):
+def make_replay(device):
     replay = Replay(40, 1, 16, 1, torch.device(device), num_labels=2)
     rng = np.random.default_rng(0)
     rows = Rows(
@@ -55,18 +55,18 @@ def filled(device):
     return replay
 
 
-def learner_of(kind, tiny, device="cpu", **more):
+def make_learner(kind, tiny, device="cpu", **more):
     torch.manual_seed(0)
     config = tiny("", learning=SETTINGS)
     model = WorldModel(config.model, 1, LABELS)
-    return kind(model.to(device), config.learning, 0.9, filled(device), seed=0, **more).to(device)
+    return kind(model.to(device), config.learning, 0.9, make_replay(device), seed=0, **more).to(device)
 
 
-def graphed(tiny, device="cpu"):
-    return learner_of(Graphed, tiny, device, prepare=prepared)
+def make_graphed(tiny, device="cpu"):
+    return make_learner(Graphed, tiny, device, prepare=raise_rewards)
 
 
-def draws(replay, count):
+def draw_rows(replay, count):
     rng = np.random.default_rng(1)
     return [replay.draw(4, 5, rng) for _ in range(count)]
 
@@ -78,44 +78,44 @@ def assert_same(left, right):
 
 
 def test_graphed_learner_learns_as_the_plain_learner_in_turn(tiny):
-    plain, whole = learner_of(Plain, tiny), graphed(tiny)
-    for rows in draws(plain.replay, 5):
-        plain.training_step(prepared(plain.replay.gather(rows)), 0)
+    plain, graphed = make_learner(Plain, tiny), make_graphed(tiny)
+    for rows in draw_rows(plain.replay, 5):
+        plain.training_step(raise_rewards(plain.replay.gather(rows)), 0)
         plain.catch_up()
-        whole.training_step(rows, 0)
-        whole.catch_up()
-    assert_same(plain, whole)
-    assert plain.updates == whole.updates == 5
-    assert all(torch.equal(whole.metrics[name], value) for name, value in plain.metrics.items())
+        graphed.training_step(rows, 0)
+        graphed.catch_up()
+    assert_same(plain, graphed)
+    assert plain.updates == graphed.updates == 5
+    assert all(torch.equal(graphed.metrics[name], value) for name, value in plain.metrics.items())
 
 
 def test_graphed_learner_skips_and_reports_gradients_that_are_not_finite(tiny):
-    whole = graphed(tiny)
-    good, bad = draws(whole.replay, 2)
-    whole.training_step(good, 0)
-    before, rewards = copy.deepcopy(whole.state_dict()), whole.replay.rewards.clone()
-    beliefs = whole.replay.deter.clone()
-    whole.replay.rewards[bad[0, 2]] = float("nan")
-    whole.training_step(bad, 0)
-    weights = {name: value for name, value in whole.state_dict().items() if name.startswith("model.")}
+    graphed = make_graphed(tiny)
+    good, bad = draw_rows(graphed.replay, 2)
+    graphed.training_step(good, 0)
+    before, rewards = copy.deepcopy(graphed.state_dict()), graphed.replay.rewards.clone()
+    beliefs = graphed.replay.deter.clone()
+    graphed.replay.rewards[bad[0, 2]] = float("nan")
+    graphed.training_step(bad, 0)
+    weights = {name: value for name, value in graphed.state_dict().items() if name.startswith("model.")}
     assert weights and all(torch.equal(before[name], value) for name, value in weights.items())
-    assert all(value.isfinite().all() for value in whole.state_dict().values())
-    assert torch.equal(whole.replay.deter, beliefs)
+    assert all(value.isfinite().all() for value in graphed.state_dict().values())
+    assert torch.equal(graphed.replay.deter, beliefs)
     with pytest.warns(
         RuntimeWarning, match="not finite in 1 of the last 2 updates, up to update 2: these updates were skipped"
     ):
-        whole.catch_up()
-    whole.replay.rewards.copy_(rewards)
-    whole.training_step(good, 0)
-    whole.catch_up()
-    assert not torch.equal(before["model.actor.mlp.output.bias"], whole.model.actor.mlp.output.bias)
-    whole.replay.rewards.fill_(float("nan"))
-    whole.training_step(bad, 0)
+        graphed.catch_up()
+    graphed.replay.rewards.copy_(rewards)
+    graphed.training_step(good, 0)
+    graphed.catch_up()
+    assert not torch.equal(before["model.actor.mlp.output.bias"], graphed.model.actor.mlp.output.bias)
+    graphed.replay.rewards.fill_(float("nan"))
+    graphed.training_step(bad, 0)
     with pytest.raises(FloatingPointError, match="1 of the last 1 updates, up to update 4"):
-        whole.catch_up()
+        graphed.catch_up()
 
 
-class NothingRead(TorchDispatchMode):
+class RefuseReads(TorchDispatchMode):
     """Refuses operations that a graph cannot record: reads by the host, and results whose size depends on values.
 
     The check inside `torch.quantile` is allowed: torch 2.11 reads its argument on a CPU, but not on a GPU.
@@ -126,7 +126,7 @@ class NothingRead(TorchDispatchMode):
     def __torch_dispatch__(self, func, types, args=(), kwargs=None):
         if func is torch.ops.aten.index.Tensor:
             refused = any(index is not None and index.dtype == torch.bool for index in args[1])
-        elif func is torch.ops.aten.equal.default and NothingRead.in_quantile:
+        elif func is torch.ops.aten.equal.default and RefuseReads.in_quantile:
             refused = False
         else:
             refused = {torch.Tag.data_dependent_output, torch.Tag.dynamic_output_shape} & set(func.tags)
@@ -141,25 +141,25 @@ def watched(tiny, monkeypatch):
     quantile = torch.quantile
 
     def marked(*arguments):
-        NothingRead.in_quantile = True
+        RefuseReads.in_quantile = True
         try:
             return quantile(*arguments)
         finally:
-            NothingRead.in_quantile = False
+            RefuseReads.in_quantile = False
 
     monkeypatch.setattr(torch, "quantile", marked)
-    learner = graphed(tiny)
-    learner.training_step(*draws(learner.replay, 1), 0)
+    learner = make_graphed(tiny)
+    learner.training_step(*draw_rows(learner.replay, 1), 0)
     return learner
 
 
 def test_graphed_update_reads_no_value_back(watched):
-    with NothingRead():
+    with RefuseReads():
         outputs = watched.update(torch.Generator())
     assert {"reconstruction", "probe", "actor", "value", "model_grad_norm", "behaviour_grad_norm"} <= set(outputs)
 
 
-@pytest.mark.parametrize("part", ["descent", "number", "choice"])
+@pytest.mark.parametrize("part", ["descent", "number", "selection"])
 def test_graphed_update_test_detects_a_read(watched, monkeypatch, part):
     if part == "descent":
         monkeypatch.setattr(Graphed, "_descend", Learner._descend)
@@ -171,7 +171,7 @@ def test_graphed_update_test_detects_a_read(watched, monkeypatch, part):
         monkeypatch.setattr(
             watched, "prepare", lambda batch: batch._replace(deter=batch.deter[batch.deter[:, 0] > -9.0])
         )
-    with NothingRead(), pytest.raises(AssertionError, match="reads a value"):
+    with RefuseReads(), pytest.raises(AssertionError, match="reads a value"):
         watched.update(torch.Generator())
 
 
@@ -183,21 +183,21 @@ def test_config_refuses_a_cuda_graph_without_replay_on_the_device():
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
 def test_replayed_graph_learns_as_the_plain_learner_on_a_gpu(tiny):
-    """The value head is reset half-way, so that the graph is recorded twice."""
-    plain, whole = learner_of(Plain, tiny, "cuda"), graphed(tiny, "cuda")
-    for number, rows in enumerate(draws(plain.replay, 4 * WARM_UP_UPDATES)):
+    """The value head is reset after half the updates, so that the graph is recorded twice."""
+    plain, graphed = make_learner(Plain, tiny, "cuda"), make_graphed(tiny, "cuda")
+    for number, rows in enumerate(draw_rows(plain.replay, 4 * WARM_UP_UPDATES)):
         if number == 2 * WARM_UP_UPDATES:
             plain.reset_value_head()
-            whole.reset_value_head()
-        plain.training_step(prepared(plain.replay.gather(rows)), 0)
+            graphed.reset_value_head()
+        plain.training_step(raise_rewards(plain.replay.gather(rows)), 0)
         plain.catch_up()
-        whole.training_step(rows, 0)
-    whole.catch_up()
-    for (name, one), (_, two) in zip(plain.state_dict().items(), whole.state_dict().items(), strict=True):
+        graphed.training_step(rows, 0)
+    graphed.catch_up()
+    for (name, one), (_, two) in zip(plain.state_dict().items(), graphed.state_dict().items(), strict=True):
         torch.testing.assert_close(one, two, rtol=1e-3, atol=1e-4, msg=name)
 
 
-def test_load_optimizer_state_keeps_the_capturable_flag_of_the_device():
+def test_load_optimizer_state_keeps_the_capturable_flag_of_the_optimizer():
     weight = torch.nn.Parameter(torch.ones(2))
     saved, resumed = (torch.optim.Adam([weight], lr=1e-3, fused=True) for _ in range(2))
     weight.grad = torch.ones(2)

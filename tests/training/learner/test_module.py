@@ -1,4 +1,4 @@
-"""The learner: model and behaviour update side by side with the results of updates in turn."""
+"""The learner: model and behaviour learn at the same time, with the results of learning one after the other."""
 
 from pathlib import Path
 
@@ -20,7 +20,7 @@ class Standalone(Learner):
         return self.own
 
 
-def standalone(tiny, **learning):
+def make_standalone(tiny, **learning):
     torch.manual_seed(0)
     config = tiny("", learning=learning)
     model = accelerate(WorldModel(config.model, action_dim=1))
@@ -28,7 +28,7 @@ def standalone(tiny, **learning):
 
 
 def test_learner_gives_the_same_results_side_by_side_as_in_turn(batch, tiny):
-    overlapped, in_turn = standalone(tiny), standalone(tiny)
+    overlapped, in_turn = make_standalone(tiny), make_standalone(tiny)
     for _ in range(4):
         overlapped.training_step(batch, 0)
         in_turn.training_step(batch, 0)
@@ -40,7 +40,7 @@ def test_learner_gives_the_same_results_side_by_side_as_in_turn(batch, tiny):
 
 
 def test_update_changes_model_then_behaviour_and_refreshes_the_snapshot(batch, tiny):
-    learner = standalone(tiny)
+    learner = make_standalone(tiny)
     before = {name: value.clone() for name, value in learner.model.state_dict().items()}
     learner.training_step(batch, 0)
     moved = {name for name, value in learner.model.state_dict().items() if not torch.equal(value, before[name])}
@@ -55,7 +55,7 @@ def test_update_changes_model_then_behaviour_and_refreshes_the_snapshot(batch, t
 
 
 def test_catch_up_raises_the_error_of_the_behaviour_thread(batch, tiny):
-    learner = standalone(tiny)
+    learner = make_standalone(tiny)
     learner.training_step(batch, 0)
     with torch.no_grad():
         learner.model.value_head.mlp.output.bias.fill_(float("nan"))
@@ -65,13 +65,13 @@ def test_catch_up_raises_the_error_of_the_behaviour_thread(batch, tiny):
 
 @pytest.mark.parametrize("share", [0.0, 1.0])
 def test_update_does_not_store_beliefs_of_turned_sequences(batch, tiny, share):
-    learner = standalone(tiny, turned_share=share)
+    learner = make_standalone(tiny, turned_share=share)
     learner.training_step(batch, 0)
     assert (learner.replay.deter[batch.rows] == 0.0).all() == (share == 1.0)
 
 
 def test_reset_value_head_changes_only_the_value_head_and_its_optimizer_state(batch, tiny):
-    learner = standalone(tiny)
+    learner = make_standalone(tiny)
     for _ in range(3):
         learner.training_step(batch, 0)
         learner.catch_up()
@@ -91,8 +91,8 @@ def test_reset_value_head_changes_only_the_value_head_and_its_optimizer_state(ba
     assert set(learner.optimizers()[1].state) > held
 
 
-def averages_of(learner, batch, updates):
-    """Learned and averaged weights after each update, oldest first."""
+def collect_averages(learner, batch, updates):
+    """Makes updates; returns learned and averaged weights after each update, oldest first."""
     seen = []
     for _ in range(updates):
         learner.training_step(batch, 0)
@@ -104,7 +104,7 @@ def averages_of(learner, batch, updates):
 
 
 def test_averaged_weights_follow_the_documented_average(batch, tiny):
-    seen = averages_of(standalone(tiny, average_rate=0.4), batch, 30)
+    seen = collect_averages(make_standalone(tiny, average_rate=0.4), batch, 30)
     for name in ("dynamics.gates.weight", "actor.mlp.output.weight", "value_head.mlp.output.bias"):
         weights, averages = ([pair[which][name] for pair in seen] for which in (0, 1))
         assert torch.equal(averages[9], weights[9])  # the last tenth of 10 updates is one update
@@ -113,13 +113,13 @@ def test_averaged_weights_follow_the_documented_average(batch, tiny):
 
 
 def test_averaged_weights_are_the_latest_ones_when_the_rate_is_one(batch, tiny):
-    latest, averaged = averages_of(standalone(tiny, average_rate=1.0), batch, 12)[-1]
+    latest, averaged = collect_averages(make_standalone(tiny, average_rate=1.0), batch, 12)[-1]
     assert all(torch.equal(averaged[name], value) for name, value in latest.items())
 
 
 def test_restore_learner_starts_the_average_from_the_saved_weights_when_none_was_saved(batch, tiny):
-    learner, resumed = standalone(tiny), standalone(tiny)
-    averages_of(learner, batch, 12)
+    learner, resumed = make_standalone(tiny), make_standalone(tiny)
+    collect_averages(learner, batch, 12)
     saved = {name: value for name, value in learner.state_dict().items() if not name.startswith("averaged")}
     restore_learner(resumed, {"weights": saved, "updates": 12}, Path("run"))
     assert resumed.averaged_updates.tolist() == [0.0, 0.0]

@@ -13,7 +13,7 @@ from latentplan.models.backend import Backend
 from latentplan.models.dynamics import gaussian
 from latentplan.models.fast import accelerate
 from latentplan.planning import check_model
-from tests.training.learner.test_graphed import draws, filled
+from tests.training.learner.test_graphed import draw_rows, make_replay
 from tests.training.learner.test_module import Standalone
 
 
@@ -51,9 +51,9 @@ def test_accelerate_keeps_the_reference_for_unknown_dynamics(model):
 
 
 def test_unknown_dynamics_learn_from_an_update(model, tiny):
-    replay, before = filled("cpu"), model.dynamics.recurrence.weight.clone()
+    replay, before = make_replay("cpu"), model.dynamics.recurrence.weight.clone()
     learner = Standalone(model, tiny("").learning, 0.9, replay, seed=0)
-    learner.training_step(replay.gather(draws(replay, 1)[0]), 0)
+    learner.training_step(replay.gather(draw_rows(replay, 1)[0]), 0)
     learner.catch_up()
     assert not torch.equal(model.dynamics.recurrence.weight, before)
     assert all(bool(torch.isfinite(value)) for value in learner.metrics.values())

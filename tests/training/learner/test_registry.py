@@ -10,7 +10,7 @@ from latentplan.training.learner.losses import world_model_loss
 from latentplan.training.learner.registry import BEHAVIOUR_LOSSES, WORLD_MODEL_LOSSES, register
 
 
-def stream():
+def make_generator():
     return torch.Generator().manual_seed(0)
 
 
@@ -30,15 +30,15 @@ def test_register_refuses_a_name_that_is_taken_and_a_scale_without_setting():
 
 def test_registered_losses_enter_both_sums(learner, batch, restored_losses):
     """The added losses are 1 for the world model, and 2 with the scale 3 for behaviour."""
-    before = world_model_loss(learner.model, batch, learner.config, stream())
-    behaviour_before, _ = learner._behaviour_loss(before, batch, stream())
+    before = world_model_loss(learner.model, batch, learner.config, make_generator())
+    behaviour_before, _ = learner._behaviour_loss(before, batch, make_generator())
     learner.return_range.zero_()
     learner.config = dataclasses.replace(learner.config, reward_scale=3.0)
     register(WORLD_MODEL_LOSSES, "one")(lambda predicted: predicted.batch.rewards.new_ones(()))
     register(BEHAVIOUR_LOSSES, "two", "reward_scale")(lambda behaviour: behaviour.returns.new_full((), 2.0))
     rewards = before.parts["reward"] + before.parts["open_loop_reward"]
-    after = world_model_loss(learner.model, batch, learner.config, stream())
+    after = world_model_loss(learner.model, batch, learner.config, make_generator())
     assert after.loss.item() == pytest.approx((before.loss + 1.0 + 2.0 * rewards).item(), rel=1e-5)
-    behaviour_after, parts = learner._behaviour_loss(before, batch, stream())
+    behaviour_after, parts = learner._behaviour_loss(before, batch, make_generator())
     assert behaviour_after.item() == pytest.approx(behaviour_before.item() + 6.0, rel=1e-5)
     assert (after.parts["one"], parts["two"]) == (1.0, 2.0)

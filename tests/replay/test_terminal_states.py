@@ -1,22 +1,22 @@
-"""Sequences at the end of an episode: drawn beyond terminal states, but not beyond time limits."""
+"""Terminal states: drawn sequences reach beyond them, but not beyond time limits."""
 
 import numpy as np
 import pytest
 import torch
 
 from latentplan.replay.buffer import Batch
-from tests.replay.replay_clock import Clock, filled, make_replay, sample
+from tests.replay.numbered_rows import NumberedRows, make_filled_replay, make_replay, sample
 
 
-def batch_of(continues):
-    """A batch of which only `continues` is given."""
+def make_batch(continues):
+    """Makes a batch in which all fields but `continues` are empty."""
     return Batch(**{**dict.fromkeys(Batch._fields, torch.empty(0)), "continues": continues})
 
 
 def test_draw_reaches_terminal_states_at_their_true_rate():
     replay, rng = make_replay(capacity=4000), np.random.default_rng(0)
     lengths = rng.geometric(0.1, 200)
-    rows = Clock(0, lengths).rows()
+    rows = NumberedRows(0, lengths).rows()
     transitions = np.flatnonzero(rows.actions[:, 0] > 0.0)
     last = transitions[~np.isin(transitions + 1, transitions)]
     rows.continues[last] = 0.0
@@ -24,7 +24,7 @@ def test_draw_reaches_terminal_states_at_their_true_rate():
     drawn = replay.draw(4000, 16, rng)
     time = replay.frames[:, 0, 0, 0].float()[drawn]
     continues = replay.continues[drawn[:, :-1]]
-    weights = batch_of(continues).within
+    weights = make_batch(continues).within
     assert (time.diff(dim=1)[weights == 1.0] == 1.0).all()
     share = ((1.0 - continues) * weights).sum() / weights.sum()
     assert share == pytest.approx(0.1, abs=0.02)  # the lengths are geometric: each step ends with probability 0.1
@@ -32,13 +32,13 @@ def test_draw_reaches_terminal_states_at_their_true_rate():
 
 def test_within_is_0_after_a_terminal_state():
     continues = torch.tensor([[1.0, 0.0, 1.0, 0.0], [1.0, 1.0, 1.0, 1.0], [0.0, 1.0, 1.0, 1.0]])
-    assert batch_of(continues).within.tolist() == [[1, 1, 0, 0], [1, 1, 1, 1], [1, 0, 0, 0]]
+    assert make_batch(continues).within.tolist() == [[1, 1, 0, 0], [1, 1, 1, 1], [1, 0, 0, 0]]
 
 
 def test_draw_reaches_beyond_terminal_states_but_not_beyond_time_limits(tmp_path):
-    replay = filled(lengths=(7, 4, 9))
+    replay = make_filled_replay(lengths=(7, 4, 9))
     assert not replay.is_end.any() and (sample(replay, length=5).within == 1.0).all()
-    rows = Clock(0, (7, 4, 9)).rows()
+    rows = NumberedRows(0, (7, 4, 9)).rows()
     rows.continues[11] = 0.0  # the second episode ends in a terminal state
     ended = make_replay()
     ended.add(0, rows)

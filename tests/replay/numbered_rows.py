@@ -1,4 +1,4 @@
-"""Rows whose values follow from their time, for tests of the replay."""
+"""Rows whose values encode their lane, episode and time, for tests of the replay."""
 
 import numpy as np
 import torch
@@ -8,11 +8,11 @@ from latentplan.replay.buffer import Replay, Rows
 CPU = torch.device("cpu")
 
 
-class Clock:
-    """Rows of one lane with episodes of given lengths; every value of a row follows from its lane, episode and time.
+class NumberedRows:
+    """Rows of one lane with episodes of given lengths.
 
-    The frame is filled with time, episode and lane; action[t] leads from t to t + 1, so it holds t + 0.5 (scaled to
-    stay within [-1, 1]), and the reward that arrives with frame t + 1 is t + 1.
+    Each frame is filled with its time, episode and lane. action[t] leads from t to t + 1, so it is (t + 0.5) / 256, in
+    [-1, 1]. The reward that arrives with frame t + 1 is t + 1.
     """
 
     def __init__(self, lane, lengths):
@@ -44,12 +44,12 @@ def make_replay(capacity=60, lanes=1):
     return Replay(capacity, action_dim=1, deter_dim=2, num_lanes=lanes, device=CPU, num_labels=2)
 
 
-def filled(capacity=60, lanes=1, lengths=(7, 4, 9), chunk=5):
+def make_filled_replay(capacity=60, lanes=1, lengths=(7, 4, 9), chunk=5):
     replay = make_replay(capacity, lanes)
     for lane in range(lanes):
-        clock = Clock(lane, lengths)
-        for start in range(0, len(clock.entries), chunk):
-            replay.add(lane, clock.rows(start, start + chunk))
+        numbered = NumberedRows(lane, lengths)
+        for start in range(0, len(numbered.entries), chunk):
+            replay.add(lane, numbered.rows(start, start + chunk))
     return replay
 
 

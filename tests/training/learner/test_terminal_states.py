@@ -1,9 +1,8 @@
-"""Nothing is learned from rows beyond a terminal state."""
+"""Terminal states: the losses ignore rows beyond them."""
 
 import pytest
 import torch
 
-from latentplan.models import WorldModel
 from latentplan.training.learner.losses import world_model_loss
 from latentplan.training.learner.module import is_refreshed
 
@@ -27,13 +26,13 @@ def disturbed(ended):
     return ended._replace(frames=frames, actions=actions, rewards=rewards)
 
 
-def stream():
+def make_generator():
     return torch.Generator().manual_seed(0)
 
 
 def test_world_model_loss_ignores_rows_beyond_an_end(model, ended, disturbed, tiny):
     config = tiny("", learning={"overshooting_scale": 1.0, "overshooting_horizon": 2, "free_nats": 0.0}).learning
-    one, other = (world_model_loss(model, batch, config, stream()).parts for batch in (ended, disturbed))
+    one, other = (world_model_loss(model, batch, config, make_generator()).parts for batch in (ended, disturbed))
     for name, part in one.items():
         assert part.item() == pytest.approx(other[name].item(), rel=1e-5), name
 
@@ -41,9 +40,9 @@ def test_world_model_loss_ignores_rows_beyond_an_end(model, ended, disturbed, ti
 def test_behaviour_loss_ignores_rows_beyond_an_end(learner, ended, disturbed):
     losses = []
     for batch in (ended, disturbed):
-        learned = world_model_loss(learner.model, batch, learner.config, stream())
+        learned = world_model_loss(learner.model, batch, learner.config, make_generator())
         learner.return_range.zero_()
-        losses.append(learner._behaviour_loss(learned, batch, stream())[0].item())
+        losses.append(learner._behaviour_loss(learned, batch, make_generator())[0].item())
     assert losses[0] == pytest.approx(losses[1], rel=1e-5)
 
 
@@ -55,7 +54,6 @@ def test_is_refreshed_excludes_rows_beyond_an_end(ended):
 
 def test_behaviour_loss_is_finite_when_every_row_ends_an_episode(learner, batch):
     ends = batch._replace(continues=torch.zeros_like(batch.continues))
-    learned = world_model_loss(learner.model, ends, learner.config, stream())
-    loss, parts = learner._behaviour_loss(learned, ends, stream())
+    learned = world_model_loss(learner.model, ends, learner.config, make_generator())
+    loss, parts = learner._behaviour_loss(learned, ends, make_generator())
     assert torch.isfinite(loss) and torch.isfinite(parts["imagined_return"])
-    assert isinstance(learner.model, WorldModel)
