@@ -68,7 +68,7 @@ class Collect(lightning.Callback):
             if state.interrupted:
                 trainer.should_stop = True
                 return
-        weights = weights_of(learner.averaged)
+        weights = copy_weights(learner.averaged)
         has_new_rows = state.rounds != state.learned_rounds  # false when a run was resumed after a finished epoch
         if not (self._is_round_pending or has_new_rows):
             self._request_round(weights)
@@ -144,7 +144,7 @@ class Collect(lightning.Callback):
         self.episode_returns.extend(collected.episode_returns)
 
 
-def weights_of(model: WorldModel) -> dict[str, np.ndarray]:
+def copy_weights(model: WorldModel) -> dict[str, np.ndarray]:
     """A copy of a model's state as NumPy arrays, which workers in other processes accept."""
     return {name: value.detach().cpu().numpy().copy() for name, value in model.state_dict().items()}
 

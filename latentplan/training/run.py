@@ -22,7 +22,7 @@ from latentplan.envs import default_task
 from latentplan.models import WorldModel
 from latentplan.models.fast import accelerate
 from latentplan.replay.buffer import Replay
-from latentplan.training.callbacks import Collect, Record, Restore, Save, Stop, weights_of
+from latentplan.training.callbacks import Collect, Record, Restore, Save, Stop, copy_weights
 from latentplan.training.collection.collector import Description, EnvFactory
 from latentplan.training.collection.process import Worker, make_worker
 from latentplan.training.console import Progress
@@ -259,7 +259,7 @@ class _Run:
         return summary
 
     def _evaluate(self, model: WorldModel, film: Path | None = None, actor: bool = True) -> dict[str, list[float]]:
-        self.worker.submit("evaluate", self.config.evaluation.final_episodes, film, weights_of(model), actor)
+        self.worker.submit("evaluate", self.config.evaluation.final_episodes, film, copy_weights(model), actor)
         return self.worker.result()  # type: ignore[no-any-return]
 
     def _evaluate_best(self) -> float:

@@ -120,6 +120,15 @@ def _load_or_play(
 
 
 def _learn(run: Path, folder: Path, settings: GoalsConfig, device: str, saved: dict[str, Any] | None) -> Result:
+    """Loads the agent and its replay, and learns until the budget is spent or a signal arrives.
+
+    Args:
+        run: Folder of the run or agent.
+        folder: Folder for the new agent and the saved state.
+        settings: Settings of the learning.
+        device: "cpu" or "cuda".
+        saved: State from which the learning is resumed; None starts from the first update.
+    """
     source = resolve_checkpoint(run)
     model, config, info = load_model(source, device)
     if not model.goal_names:

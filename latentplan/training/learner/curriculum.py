@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 
 class Curriculum(lightning.Callback):
-    """Replaces replayed rewards by the rewards of `curriculum_task` during the first `curriculum_frames` frames of a run.
+    """Replaces replayed rewards by the rewards of `curriculum_task` in the first `curriculum_frames` frames of a run.
 
     The value head is then reset. Otherwise the old values of states that the agent no longer visits would stay high and
     attract the agent.
