@@ -46,4 +46,4 @@ class ActorAgent(ModelAgent):
         mean, std = (mean_over_turns(part, state) for part in raw)
         if not self.explore:
             return mean
-        return sample_action(mean, std, self.noise.draw(mean, self.generator, self._forget))
+        return sample_action(mean, std, self.noise.draw(mean, self.generator, self._is_reset))

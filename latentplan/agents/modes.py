@@ -75,7 +75,7 @@ def make_agent(
         model: The world model.
         config: Settings the model was trained with.
         discount: Discount per decision, as learned; read by modes that plan.
-        planner: Settings of the search; None takes those of `config`. Read by modes that plan.
+        planner: Settings of the search, read by modes that plan; None takes the settings in `config`.
         **options: The mode's own options, see `AgentMode.options`.
 
     Raises:

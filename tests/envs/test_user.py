@@ -82,7 +82,7 @@ def test_decisions_per_episode_follows_from_a_wrapper_without_a_spec():
 
 
 def test_step_truncates_after_the_longest_episode_without_a_time_limit(monkeypatch):
-    monkeypatch.setattr(user, "LONGEST", 5)
+    monkeypatch.setattr(user, "MAX_DECISIONS", 5)
     env = wrap_user_env(Clock())
     for _ in range(2):
         env.reset()

@@ -132,7 +132,7 @@ def test_scored_env_scores_each_episode_on_its_own(env):
 def test_scored_env_reports_each_change_of_the_objective(env):
     told = []
     goals = read_goals("cart > 0; 250: cart < 0; 260: upright", None, "cartpole")
-    scored = ScoredEnv(env, goals, lambda objective: told.append((len(scored.worth), objective.text)))
+    scored = ScoredEnv(env, goals, lambda objective: told.append((len(scored.objective_scores), objective.text)))
     run_episodes(scored, RandomAgent(1), [5, 5])
     # A decision holds for 100 control steps: at 300 the objective of 260 is in force, and that of 250 was never due.
     assert told == [(0, "cart > 0"), (300, "upright")] * 2
@@ -146,11 +146,11 @@ def test_scored_env_scores_goal_images_by_the_cameras_frame(env, tmp_path):
     scored = ScoredEnv(env, read_goals(f"goal:{tmp_path}/goal0.png", None, "cartpole"))
     scored.reset(seed=3)
     scored.step(np.zeros(1))
-    assert 0.0 < min(scored.worth) and max(scored.worth) <= 1.0
+    assert 0.0 < min(scored.objective_scores) and max(scored.objective_scores) <= 1.0
     other = ScoredEnv(env, read_goals(f"goal:{tmp_path}/goal40.png", None, "cartpole"))
     other.reset(seed=3)
     other.step(np.zeros(1))
-    assert max(other.worth) < min(scored.worth)
+    assert max(other.objective_scores) < min(scored.objective_scores)
 
 
 @pytest.mark.parametrize("mode", ["planner", "gated", "background", "actor", "random"])
