@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -14,7 +13,7 @@ from latentplan.config.planner import override_planner
 
 REFERENCE = "full"
 NAMES = (REFERENCE, "no_actor", "no_value", "cold", "horizon1", "actor", "random")
-DIFFERENT_ACTION = 0.1
+DIFFERENT_ACTION = 0.1  # difference from which two actions in [-1, 1] count as different
 
 
 class Arm(NamedTuple):
@@ -76,19 +75,18 @@ def parse_arms(text: str, base: PlannerConfig) -> list[Arm]:
 def without_actor(base: PlannerConfig) -> dict[str, Any]:
     """Settings of a search that does not use the actor."""
     tail = {"tail": "zero"} if base.tail == "policy" else {}
-    trust = {} if base.surprise_limit is None else {"surprise_limit": None}
-    return {"num_policy_samples": 0, **tail, **trust}
+    surprise = {} if base.surprise_limit is None else {"surprise_limit": None}
+    return {"num_policy_samples": 0, **tail, **surprise}
 
 
-def play_arm(checkpoint: str, arm: Arm, seeds: Sequence[int], device: str, threads: int) -> Outcome:
+def play_arm(arm: Arm, checkpoint: str, seeds: Sequence[int], device: str) -> Outcome:
     """Plays one episode per seed, with the render quality of the checkpoint.
 
     Args:
+        arm: The arm that plays, with one CPU thread.
         checkpoint: Folder of a checkpoint or of a run.
-        arm: The arm that plays.
         seeds: Seeds of the starts.
         device: `cpu` or `cuda`.
-        threads: Number of CPU threads.
     """
     import numpy as np
     import torch
@@ -98,7 +96,7 @@ def play_arm(checkpoint: str, arm: Arm, seeds: Sequence[int], device: str, threa
     from latentplan.evaluation.episodes import Step, run_episodes
     from latentplan.evaluation.statistics import latency_percentiles
 
-    torch.set_num_threads(threads)
+    torch.set_num_threads(1)
     _, config, _ = load_model(checkpoint)
     agent: Any = load_agent(checkpoint, mode=arm.mode, device=device, **arm.planner)
     differs: list[bool] = []
@@ -123,14 +121,8 @@ def play_arm(checkpoint: str, arm: Arm, seeds: Sequence[int], device: str, threa
     )
 
 
-def single_thread() -> None:
-    """Limits a new process to one thread, before torch and the renderer are imported."""
-    for name in ("OMP_NUM_THREADS", "MKL_NUM_THREADS"):
-        os.environ[name] = "1"
-
-
 def check_checkpoint(path: Path) -> tuple[dict[str, Any], PlannerConfig]:
-    """Information about a checkpoint, and its settings of the search.
+    """The description of a checkpoint, and its settings of the search.
 
     Raises:
         UserError: The checkpoint is missing or damaged.

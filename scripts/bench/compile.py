@@ -1,7 +1,7 @@
-"""`benchmark.py compile`: searches in small models, stepped by Python and with `compile_rollout`.
+"""`benchmark.py compile`: searches in small models, stepped in Python or compiled by `compile_rollout`.
 
-The table shows median milliseconds per search of both, their ratio, the seconds of compilation, and the largest
-difference of the planned actions.
+The table shows median milliseconds per search of both versions, the ratio of the two medians, the seconds of
+compilation, and the largest difference between the planned actions.
 """
 
 from __future__ import annotations
@@ -21,15 +21,15 @@ if TYPE_CHECKING:
 
     from latentplan.planning import CEMPlanner, Model
 
-WARM_UP_PLANS = 3  # torch compiles for the first size, then once more for sizes that vary
+WARM_UP_PLANS = 3  # torch.compile compiles at the first size, and again, for any size, at the second
 
 
 @dataclass(frozen=True, kw_only=True)
 class Request(SearchRequest):
-    """What is timed.
+    """Flags of `benchmark.py compile`.
 
     Attributes:
-        plans: Timed searches of each model, taken in turns.
+        plans: Timed searches of each version of each model.
         json: Result as JSON.
     """
 
@@ -42,7 +42,7 @@ class Request(SearchRequest):
 
 
 def run(request: Request) -> int:
-    """Time searches in both versions of each model, in turns, and print how they compare."""
+    """Times searches in both versions of each model, in turns, and prints the comparison."""
     plans, sizes = request.plans, request.sizes
     device_name = request.use_device()
     import torch
@@ -107,7 +107,7 @@ def measure_model(model: Model, state: torch.Tensor, planner: CEMPlanner, plans:
 
     Returns:
         `stepped_ms`, `compiled_ms`, their `ratio`, `compilation_s` (extra seconds of the first compiled searches) and
-        `largest_difference` between the planned action sequences of both.
+        `largest_difference` between the planned action sequences of both versions.
     """
     import torch
 

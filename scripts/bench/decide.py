@@ -33,11 +33,11 @@ UNTRAINED_DISCOUNT = 0.99
 
 @dataclass(frozen=True, kw_only=True)
 class Request(ComposeRequest):
-    """What is timed.
+    """Flags of `benchmark.py decide`.
 
     Attributes:
         checkpoint: Folder of a trained agent, or of a run; None times an untrained agent.
-        batch: Environments decided for at once.
+        batch: Environments of each decision.
         decisions: Decisions that are timed.
         json: Result as JSON.
         planner: Settings of the search.
@@ -58,7 +58,7 @@ class Request(ComposeRequest):
 
 
 def run(request: Request) -> int:
-    """Time decisions on random frames and print their percentiles."""
+    """Times decisions on random frames and prints the percentiles."""
     batch, decisions = request.batch, request.decisions
     composed = None if request.checkpoint is not None else request.compose({"planner": request.planner})
     device_name = request.use_device()
@@ -67,7 +67,7 @@ def run(request: Request) -> int:
     from bench.machine import describe_machine
 
     device = torch.device(device_name)
-    model, config, discount = _load(request, composed, device)
+    model, config, discount = _load_model(request, composed, device)
     arms = {
         name: measure_decisions(agent, batch, decisions) for name, agent in _agents(model, config, discount).items()
     }
@@ -87,7 +87,7 @@ def measure_decisions(agent: Agent, batch: int, decisions: int) -> dict[str, Any
     """Milliseconds from frames in memory to actions, and model steps per decision and environment.
 
     Args:
-        agent: The agent; a planner is warm-started.
+        agent: The agent; the plans of a planning agent are warm-started.
         batch: Frames per decision; a single frame has no batch axis.
         decisions: Number of timed decisions.
 
@@ -134,8 +134,8 @@ def counted_model_steps(model: WorldModel) -> Iterator[dict[str, int]]:
             delattr(model, name)
 
 
-def _load(request: Request, composed: Config | None, device: torch.device) -> tuple[WorldModel, Config, float]:
-    """Model, settings and discount: of the checkpoint, or of an untrained agent."""
+def _load_model(request: Request, composed: Config | None, device: torch.device) -> tuple[WorldModel, Config, float]:
+    """The model, settings and discount of the checkpoint, or of an untrained agent with composed settings."""
     if composed is not None:
         import torch
 

@@ -17,8 +17,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
-from bench.anchors import FRAMES, published
 from bench.learn_plot import Curve, Point, plot_runs
+from bench.published_returns import FRAMES, published_returns_of
 from bench.report import format_table, interval, number, write_csv, write_json
 from latentplan.commands import train
 from latentplan.commands.flags import overrides, read_request
@@ -27,7 +27,7 @@ from latentplan.config.checks import above_zero
 from latentplan.config.files import Preset, read_config
 from latentplan.config.parsing import option
 
-OWN_FLAGS = {  # settings that these runs differ in, or are told by
+OWN_FLAGS = {  # settings that flags of this benchmark set for each run
     "env.domain": "--tasks",
     "env.task": "--tasks",
     "run.seed": "--seeds",
@@ -36,22 +36,22 @@ OWN_FLAGS = {  # settings that these runs differ in, or are told by
     "run.run_dir": "--out",
 }
 FINISHED = "finished.json"
-NEAR = 0.03  # of a number of frames: how far from it an evaluation may be that stands for it
+FRAMES_TOLERANCE = 0.03  # largest distance of an evaluation from a number of frames, as a share of that number
 OWN = "latentplan"
 
 
 @dataclass(frozen=True, kw_only=True)
 class Request:
-    """What is trained.
+    """Flags of `benchmark.py learn`.
 
     Attributes:
         tasks: Tasks, each as domain-task.
         seeds: Seeds of each task.
-        frames: Simulator frames of each run; without frames and minutes, the budget of the preset holds.
-        minutes: Minutes of each run; given with frames, a run ends with whichever is reached first.
+        frames: Simulator frames of each run; without frames and minutes, a run has the budget of the preset.
+        minutes: Minutes of each run; with frames given too, a run ends at the first of the two limits.
         thresholds: Evaluation returns for which the frames and minutes to reach them are reported.
-        mode: Agent that the reported evaluation returns are of.
-        out: Folder of the runs and results; finished runs in it are not repeated.
+        mode: Agent whose evaluation returns are reported.
+        out: Folder of the runs and results; finished runs in this folder are not repeated.
         preset: Machine class, as for training; None takes `gpu` where CUDA is usable, else `cpu`.
         device: Device, as for training; None takes CUDA where it is usable.
         config: YAML file of settings, as for training.
@@ -98,11 +98,11 @@ class Request:
 
 
 def run(request: Request) -> int:
-    """Train what is missing, then collect, tabulate and plot the curves."""
+    """Trains the unfinished runs, then collects, tabulates and plots the curves of all runs."""
     tasks, thresholds, mode, out = request.tasks, request.thresholds, request.mode, request.out
     budget, extra = request.budget, request.forwarded
     folders = {(task, seed): out / f"{task}-seed{seed}" for task in tasks for seed in request.seeds}
-    for (task, seed), folder in folders.items():  # a mistake in any run stops before the first
+    for (task, seed), folder in folders.items():  # refuses a mistake in any run before the first run begins
         asked = read_request(train.Request, _new_run(task, seed, folder, budget, extra))
         check_same(train.resolve(asked), folder)
     make_folder(out)
@@ -113,18 +113,18 @@ def run(request: Request) -> int:
     print(run_table(curves, thresholds))
     finals = final_estimates(curves)
     print(format_table(["task", "runs", "interquartile mean", "95 %"], [_final_row(*item) for item in finals.items()]))
-    anchors = {task: compare(task, curves, thresholds) for task in dict.fromkeys(tasks)}
-    for task, rows in anchors.items():
-        print(anchor_table(task, rows, thresholds))
+    comparisons = {task: compare(task, curves, thresholds) for task in dict.fromkeys(tasks)}
+    for task, rows in comparisons.items():
+        print(comparison_table(task, rows, thresholds))
     runs = run_facts(curves, thresholds)
-    write_json(out / "summary.json", {"mode": mode, "runs": runs, "final": finals, "anchors": anchors})
+    write_json(out / "summary.json", {"mode": mode, "runs": runs, "final": finals, "anchors": comparisons})
     plot_runs(curves, mode, out / "curves.png")
     print(f"curves.csv, summary.json and curves.png are in {out}")
     return 0
 
 
 def read_run(task: str, seed: int, folder: Path, mode: str) -> Curve:
-    """The evaluations of a run, with the final one.
+    """The evaluations of a run, including the final evaluation.
 
     Raises:
         UserError: The run has no evaluation, or its files are damaged.
@@ -148,10 +148,10 @@ def read_run(task: str, seed: int, folder: Path, mode: str) -> Curve:
 
 
 def check_same(config: Config, folder: Path) -> None:
-    """Checks that the run in a folder, if there is one, has these settings, apart from its budget.
+    """Checks that the run in a folder, if there is one, has these settings, except for the budget.
 
     Raises:
-        UserError: A setting differs; the message names the first one.
+        UserError: A setting differs; the message names the first such setting.
     """
     if not (folder / "config.yaml").exists():
         return
@@ -175,7 +175,7 @@ def first_reaching(curve: Curve, threshold: float) -> Point | None:
 
 
 def run_facts(curves: Sequence[Curve], thresholds: Sequence[int]) -> list[dict[str, Any]]:
-    """Per run: env frames, minutes, final return, and frames and minutes to each threshold (None if not reached)."""
+    """Env frames, minutes and final return of each run, and frames and minutes to each threshold (None if missed)."""
     facts = []
     for curve in curves:
         reached = {str(threshold): first_reaching(curve, threshold) for threshold in thresholds}
@@ -209,7 +209,7 @@ def run_table(curves: Sequence[Curve], thresholds: Sequence[int]) -> str:
 
 def final_estimates(curves: Sequence[Curve]) -> dict[str, dict[str, Any]]:
     """Interquartile mean of the final returns with its interval, by task and, for several tasks, over all."""
-    from bench.statistics import interquartile_estimate
+    from bench.estimates import interquartile_estimate
 
     groups: dict[str, list[float]] = {}
     for curve in curves:
@@ -224,25 +224,25 @@ def final_estimates(curves: Sequence[Curve]) -> dict[str, dict[str, Any]]:
 
 
 def compare(task: str, curves: Sequence[Curve], thresholds: Sequence[int]) -> dict[str, dict[str, Any]]:
-    """Our runs of a task and published results, by method; our runs come first.
+    """Results of this project's runs of a task, followed by published results, by method.
 
     Returns:
-        Per method `returns` by env frames (for our runs the interquartile mean over the evaluations near that number of
-        frames, with `intervals`), and `frames_to` each threshold. For published methods `frames_to` is the first number
-        of frames with a known return above the threshold; for our runs the median, None if half of them do not reach
-        the threshold.
+        For each method `returns` by env frames (for own runs the interquartile mean over the evaluations near that
+        number of frames, with `intervals`), and `frames_to` each threshold. For published methods `frames_to` is the
+        first number of frames with a known return of at least the threshold; for own runs the median over runs, None
+        if half of the runs do not reach the threshold.
     """
-    from bench.statistics import interquartile_estimate
+    from bench.estimates import interquartile_estimate
 
     own = [curve for curve in curves if curve.task == task]
     returns, intervals = {}, {}
     for frames in FRAMES:
-        near = [point.total_return for curve in own if (point := _nearest(curve, frames)) is not None]
+        near = [point.total_return for curve in own if (point := _nearest_point(curve, frames)) is not None]
         if near:
             returns[frames], *intervals[frames] = interquartile_estimate([near])
     rows: dict[str, dict[str, Any]] = {OWN: {"returns": returns, "intervals": intervals}}
     rows[OWN]["frames_to"] = {str(threshold): _median_frames(own, threshold) for threshold in thresholds}
-    for method, known in published(task).items():
+    for method, known in published_returns_of(task).items():
         reached = {
             str(threshold): next((frames for frames in sorted(known) if known[frames] >= threshold), None)
             for threshold in thresholds
@@ -251,7 +251,7 @@ def compare(task: str, curves: Sequence[Curve], thresholds: Sequence[int]) -> di
     return rows
 
 
-def anchor_table(task: str, rows: Mapping[str, Mapping[str, Any]], thresholds: Sequence[int]) -> str:
+def comparison_table(task: str, rows: Mapping[str, Mapping[str, Any]], thresholds: Sequence[int]) -> str:
     """The result of `compare` as a text table."""
     table = []
     for method, facts in rows.items():
@@ -262,10 +262,10 @@ def anchor_table(task: str, rows: Mapping[str, Mapping[str, Any]], thresholds: S
     return format_table([task, *columns], table)
 
 
-def _nearest(curve: Curve, frames: int) -> Point | None:
-    """The evaluation nearest to a number of env frames; None if none is near enough (see `NEAR`)."""
+def _nearest_point(curve: Curve, frames: int) -> Point | None:
+    """The evaluation nearest to a number of env frames; None if its distance exceeds `FRAMES_TOLERANCE`."""
     point = min(curve.points, key=lambda point: abs(point.env_frames - frames))
-    return point if abs(point.env_frames - frames) <= NEAR * frames else None
+    return point if abs(point.env_frames - frames) <= FRAMES_TOLERANCE * frames else None
 
 
 def _median_frames(curves: Sequence[Curve], threshold: int) -> float | None:
@@ -275,9 +275,9 @@ def _median_frames(curves: Sequence[Curve], threshold: int) -> float | None:
 
 
 def _train(task: str, seed: int, folder: Path, budget: list[str], extra: list[str]) -> None:
-    """Runs `train.py` in a process of its own, unless the folder holds the finished run already."""
+    """Runs `train.py` in a new process, unless the folder holds the finished run with this budget."""
     marker = folder / FINISHED
-    if _finished_with(marker) == budget:
+    if _read_budget(marker) == budget:
         print(f"{folder} is finished and not repeated", flush=True)
         return
     is_begun = (folder / "config.yaml").exists()
@@ -285,7 +285,7 @@ def _train(task: str, seed: int, folder: Path, budget: list[str], extra: list[st
     script = Path(__file__).resolve().parent.parent / "train.py"
     print(f"training {task}, seed {seed}", flush=True)
     training = subprocess.Popen([sys.executable, str(script), *arguments])
-    previous = signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches the run too, which then saves its state
+    previous = signal.signal(signal.SIGINT, signal.SIG_IGN)  # the run gets Ctrl-C too, and saves its state
     try:
         code = training.wait()
     finally:
@@ -297,7 +297,7 @@ def _train(task: str, seed: int, folder: Path, budget: list[str], extra: list[st
     write_json(marker, {"budget": budget})
 
 
-def _finished_with(marker: Path) -> list[str] | None:
+def _read_budget(marker: Path) -> list[str] | None:
     """The budget of a finished run; None if the run is not finished or its marker cannot be read."""
     try:
         budget: list[str] = json.loads(marker.read_text())["budget"]

@@ -1,4 +1,4 @@
-"""Milliseconds of our planner by the size of the search, for `benchmark.py plan --scaling`."""
+"""Milliseconds of the project's planner by the size of the search, for `benchmark.py plan --scaling`."""
 
 from __future__ import annotations
 

@@ -25,14 +25,14 @@ PARTS = ("iterations", "rates", "error", "replan")
 
 @dataclass(frozen=True, kw_only=True)
 class Request(ComputeRequest):
-    """What is measured.
+    """Flags of `benchmark.py realtime`.
 
     Attributes:
         checkpoint: Folder of a trained agent, or of a run (its best checkpoint).
         episodes: Episodes of each point, from the same starts.
         seed: Seed of the starts: episode i starts from a state that depends only on the seed and i.
         parts: Parts of the measurement.
-        rates: Decisions per second of the worlds that do not wait.
+        rates: Decisions per second of environments that do not wait.
         json: Result as JSON, written anew after every point.
         plot: Result as a picture.
     """
@@ -56,7 +56,7 @@ class Request(ComputeRequest):
 
 
 def run(request: Request) -> int:
-    """Measure the parts that were asked for, one point after the other."""
+    """Measures the parts of the request, one point after the other."""
     episodes, seed, checkpoint = request.episodes, request.seed, str(request.checkpoint)
     device = request.use_device()
     import torch

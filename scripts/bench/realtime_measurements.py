@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from latentplan.envs.suite import SuiteEnv
     from latentplan.evaluation.statistics import Episode
 
-ITERATIONS = {  # the first search of a warm planner is cold and has 5 iterations, as in the cold planner
+ITERATIONS = {  # the first search of a warm planner is cold, with 5 iterations as in the cold planner
     "5 cold": {"num_iterations": 5, "warm_start": False},
     **{f"{count} warm": {"num_iterations": 5, "warm_start_iterations": count} for count in (5, 3, 2, 1)},
 }
@@ -102,7 +102,7 @@ def measure_error(trial: Trial) -> Iterator[Row]:
     from latentplan.agents.checkpoint import load_agent
 
     agent: Any = load_agent(trial.checkpoint, mode="actor", device=trial.device)
-    parts = [_prediction_errors(agent.model, *_record(agent, trial.env, seed)) for seed in trial.seeds]
+    parts = [_prediction_errors(agent.model, *_record_episode(agent, trial.env, seed)) for seed in trial.seeds]
     parts = [part for part in parts if part.shape[1]]
     if not parts:
         return
@@ -112,7 +112,7 @@ def measure_error(trial: Trial) -> Iterator[Row]:
         yield {"step": step, **dict(zip(names, values, strict=True))}
 
 
-def _record(agent: Any, env: SuiteEnv, seed: int) -> tuple[list[Any], list[np.ndarray], list[float]]:
+def _record_episode(agent: Any, env: SuiteEnv, seed: int) -> tuple[list[Any], list[np.ndarray], list[float]]:
     """Beliefs of an episode, the action at each belief, and the reward that followed the action."""
     from latentplan.models.symmetry import first_turn
 

@@ -20,12 +20,12 @@ from latentplan.config.parsing import option, raise_unknown
 if TYPE_CHECKING:
     import numpy as np
 
-REPEATS = 3
+REPEATS = 3  # timed renderings of each state
 
 
 @dataclass(frozen=True)
 class Request:
-    """What is rendered.
+    """Flags of `benchmark.py render`.
 
     Attributes:
         domains: Domains of `dm_control.suite`.
@@ -45,7 +45,7 @@ class Request:
 
 
 def run(request: Request) -> int:
-    """Render the same states in every quality and compare time and pictures."""
+    """Renders the same states in every quality and compares times and pictures."""
     from latentplan.envs import render_info
 
     info = render_info()

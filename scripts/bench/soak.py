@@ -1,6 +1,6 @@
 """`benchmark.py soak --checkpoint DIR`: deadlines that agents miss on the wall clock.
 
-Agents take turns on recorded frames with an agent that does nothing, whose misses are those of the machine. The table
+Agents take turns on recorded frames with an idle agent, which misses deadlines only because of the machine. The table
 shows missed deadlines per 10,000 decisions; decision times and wake-up delays are in milliseconds.
 """
 
@@ -28,7 +28,7 @@ MODES = ("actor", "gated", "background", "planner")
 IDLE = "no-op"
 NUM_FRAMES = 250
 WARM_UP_DECISIONS = 5
-DEADLINE_SHARE = 0.3  # share of a period for a search; encoding and gating take as much, the machine takes the rest
+DEADLINE_SHARE = 0.3  # share of a period for a search; encoding and gating take about as much
 PAUSE_SECONDS = 0.2  # between blocks, so that a search in the background does not disturb the next agent
 
 
@@ -50,7 +50,7 @@ class Tally:
 
 
 class IdleAgent:
-    """Does nothing, so that its missed deadlines are those of the machine."""
+    """Does nothing; misses deadlines only because of the machine."""
 
     def act(self, frame: np.ndarray) -> None:
         """Does nothing."""
@@ -61,11 +61,11 @@ class IdleAgent:
 
 @dataclass(frozen=True, kw_only=True)
 class Request(ComputeRequest):
-    """What is counted.
+    """Flags of `benchmark.py soak`.
 
     Attributes:
         checkpoint: Folder of a trained agent, or of a run (its best checkpoint).
-        mode: Modes of the agent, some of actor, gated, background and planner; an idle agent joins them.
+        mode: Modes of the agent, among actor, gated, background and planner; an idle agent takes part too.
         control_hz: Decisions per second.
         decisions: Decisions that are due, of each agent.
         block: Decisions of one agent before the next agent takes over.
@@ -89,7 +89,7 @@ class Request(ComputeRequest):
 
 
 def run(request: Request) -> int:
-    """Let the agents take turns in real time, and count what each misses."""
+    """Lets the agents take turns in real time, and counts the deadlines that each agent misses."""
     modes, control_hz, checkpoint = request.mode, request.control_hz, str(request.checkpoint)
     decisions, block = request.decisions, request.block
     device = request.use_device()
@@ -213,7 +213,7 @@ def soak_table(rows: Mapping[str, dict[str, Any]]) -> str:
 
 
 def _record_frames(checkpoint: Path, device: str) -> list[np.ndarray]:
-    """Observations of an episode of the actor."""
+    """Frames of an episode of the actor, uint8 (64, 64, 3) each."""
     from latentplan.agents.checkpoint import load_agent, load_model
     from latentplan.envs import make_env
 

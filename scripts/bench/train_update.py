@@ -52,7 +52,7 @@ class StandaloneLearner(OwnOptimizers, Learner):
 
 
 class StandaloneGraph(OwnOptimizers, GraphedLearner):
-    """A learner that updates without a Trainer, with the whole update in one CUDA graph."""
+    """A learner that updates without a Trainer, with each update in one CUDA graph."""
 
 
 class PhaseMeter:
@@ -96,8 +96,8 @@ def measure_update(config: Config, action_dim: int, device: torch.device, update
 
     `update_ms` is the time in a training run, where the two halves of an update overlap; `in_turn_ms` is the time of
     the halves one after the other. `sample`, `behaviour`, `optimizer` and `other` are timed within `in_turn_ms`;
-    `encode`, `recurrence` and `decode` are run forward and backward by themselves on the same batch, and `heads` is the
-    rest of the world model's loss, with its gradient clipping.
+    `encode`, `recurrence` and `decode` are run alone, forward and backward, on the same batch, and `heads` is the rest
+    of the world model's loss, including the gradient clipping.
 
     Returns:
         Plain values: `parts` (ms and counted operations of each), `update_ms`, `graph_ms` (the same update as one CUDA
@@ -166,7 +166,7 @@ def synthetic_replay(config: Config, action_dim: int, device: torch.device) -> R
 
 
 def _timed_laps(learner: StandaloneLearner, alone: Parts, device: torch.device, updates: int) -> list[Lap]:
-    """Seconds of each part; parts run alone follow every update, so that a busy machine slows both alike."""
+    """Seconds of each part; updates and parts run alone take turns, so that a busy machine slows down both."""
     meter = PhaseMeter(learner, lambda: now(device))
     rng = np.random.default_rng(1)
     laps = []
@@ -195,7 +195,7 @@ def _lap(learner: StandaloneLearner, alone: Parts, meter: PhaseMeter, rng: np.ra
     for name, forward in alone.items():
         learner.model.zero_grad(set_to_none=True)
         meter.skip()
-        _descend(forward())
+        _run_backward(forward())
         meter.mark(name)
     heads = meter.lap["model"] - sum(meter.lap[name] for name in alone)
     return {**meter.lap, "heads": heads, "in_turn": in_turn}
@@ -240,6 +240,6 @@ def _parts_alone(model: WorldModel, batch: Batch) -> Parts:
     return {"encode": encode, "recurrence": recur, "decode": decode}
 
 
-def _descend(outputs: Any) -> None:
+def _run_backward(outputs: Any) -> None:
     leaves = [leaf for leaf in tree_leaves(outputs) if leaf.requires_grad]
     torch.autograd.backward(leaves, [torch.ones_like(leaf) for leaf in leaves])

@@ -75,10 +75,8 @@ def test_background_agent_acts_by_the_actor_until_the_first_plan_is_due(model, f
         action = agent.act(frames[0])
         assert action.shape == (2,) and action.dtype == np.float32 and np.abs(action).max() <= 1.0
         history.append((agent.last_source, agent.plan_age))
-        if len(history) <= 2:
-            assert np.allclose(
-                action, actor.act(frames[0]), atol=0.02
-            )  # the background agent's actor computes in bfloat16
+        if len(history) <= 2:  # the background agent's actor computes in bfloat16
+            assert np.allclose(action, actor.act(frames[0]), atol=0.02)
     assert history[:3] == [("actor", None), ("actor", None), ("plan", 1)]
     assert set(history[6:]) == {("plan", 0), ("plan", 1)}
 
@@ -158,12 +156,9 @@ def test_set_objective_changes_the_plans_and_not_the_actor(film):
     model = WorldModel(CONFIG.model, action_dim=2, labels={"cart": 1.0})
     agents = [make(model), make(model)]
     agents[1].set_objective("cart > 100", constraints="cart > 50")
-    told = agents[1].scheduler.executor.goals
-    assert len(told["constraints"]) == 1
-    assert set(pickle.loads(pickle.dumps(told["objective"])).needs) == {
-        "probe",
-        "value",
-    }  # the term can be sent to a process
+    goals = agents[1].scheduler.executor.goals
+    sent = pickle.loads(pickle.dumps(goals["objective"]))  # as for a worker process
+    assert len(goals["constraints"]) == 1 and set(sent.needs) == {"probe", "value"}
     first, later = [[agent.act(frames[0]) for agent in agents] for frames in film[:3]][::2]
     assert np.array_equal(*first) and not np.array_equal(*later)
     with pytest.raises(UserError, match="height"):
@@ -182,7 +177,7 @@ def test_background_agent_gets_plans_from_a_real_worker(model, film, worker):
             sources.add(agent.last_source)
             if "plan" in sources:
                 break
-            time.sleep(0.02)  # without a period every plan of a few steps comes too late
+            time.sleep(0.02)  # without a pause, more decisions pass during a search than a plan has steps
         assert "plan" in sources
         process = agent.scheduler.executor.process
     assert process is None or not process.is_alive()

@@ -1,4 +1,4 @@
-"""What all agents have in common: shapes and bounds of actions, random streams, resets, exploration."""
+"""Properties of all agents: shapes and bounds of actions, random streams, resets, exploration."""
 
 import numpy as np
 import pytest

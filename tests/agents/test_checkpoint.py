@@ -1,4 +1,4 @@
-"""Checkpoints: loading restores the saved agent, or fails with one line that says why."""
+"""Checkpoints: loading restores the saved agent, or fails with the reason in one line."""
 
 import copy
 import hashlib
@@ -30,7 +30,7 @@ def model():
     model = accelerate(WorldModel(CONFIG.model, action_dim=2))
     with torch.no_grad():
         model.reward_head.mlp.output.weight.normal_(std=0.3)
-        # A checkpoint holds float16: weights that are float16 already come back exactly.
+        # A checkpoint holds float16, so that only float16 weights are restored exactly.
         for parameter in model.parameters():
             parameter.copy_(parameter.half().float())
     return model

@@ -1,6 +1,7 @@
-"""The gated agent: plans at doubtful decisions, within its budget, warm-started from the aged plan."""
+"""The gated agent: plans doubtful decisions within its budget, warm-started from the aged plan."""
 
 import copy
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -42,7 +43,7 @@ def make(model, **options):
 
 
 class Script(GatedAgent):
-    """A gated agent whose doubts are given, one for each decision."""
+    """A gated agent with a given doubt at each decision."""
 
     def __init__(self, model, doubts):
         super().__init__(model, CONFIG, 0.9)
@@ -69,8 +70,8 @@ def test_gated_agent_exceeds_the_budget_only_by_decisions_that_must_be_planned(m
     agent.set_objective(goal)
     for index in range(60):
         agent.act(film[index % 37, 0])
-        run_out = 0 if goal is None else index // 3
-        assert agent._num_planned <= max(1 + run_out, 0.4 * (index + 1)) + 1e-6
+        num_ended_plans = 0 if goal is None else index // 3
+        assert agent._num_planned <= max(1 + num_ended_plans, 0.4 * (index + 1)) + 1e-6
     assert agent.planned_fraction > 0.15
 
 
@@ -85,7 +86,7 @@ def test_gated_agent_plans_the_most_doubtful_environments_when_the_budget_does_n
     assert agent.last_source == ["plan", "actor", "actor"]
 
 
-def test_signal_is_the_mismatch_since_the_last_plan_when_the_objective_is_not_the_actors(model, film):
+def test_signal_is_the_mismatch_since_the_last_plan_under_an_untrained_goal(model, film):
     agent = make(model, planning_budget=0.3, signal="value")
     agent.set_objective(lambda rollout: rollout.actions[:, 0, 0])
     expected, seen = 0.0, []
@@ -236,6 +237,14 @@ def test_gated_agent_acts_by_the_actor_when_no_candidate_has_a_finite_return(mod
             assert gated.last_source == ["actor"] * 3
 
 
+def test_gated_agent_reports_the_actor_when_the_deadline_leaves_no_time_for_a_search(model, film):
+    agent = make(model, planning_budget=1.0, planner=replace(CONFIG.planner, deadline_ms=1e-6))
+    for frames in film[:3]:
+        agent.act(frames)
+        assert agent.last_source == ["actor"] * 3
+    assert agent.planned_fraction == 1.0  # share of decisions with a requested search
+
+
 def test_signals_choose_different_decisions(model, film):
     moments = {}
     for signal in SIGNALS:
@@ -275,7 +284,7 @@ def test_gated_agent_refuses_budgets_and_signals_that_do_not_exist(model, option
         make(model, **options)
 
 
-def test_gated_agent_executes_the_rest_of_the_plan_when_the_objective_is_not_the_actors(model, film):
+def test_gated_agent_executes_the_rest_of_the_plan_under_an_untrained_goal(model, film):
     agent, sources = make(model, planning_budget=0.3, signal="random"), []
     agent.set_objective(lambda rollout: -rollout.actions[:, 0, 0])
     for frames in film:
@@ -296,7 +305,7 @@ def test_gated_agent_plans_at_once_when_an_objective_is_set(model, film):
         agent.set_objective(goal)
         agent.act(film[1, 0])
         assert agent.last_source == "plan"
-    for nothing_else in (None, "return"):
-        agent.set_objective(nothing_else)
+    for learned in (None, "return"):
+        agent.set_objective(learned)
         agent.act(film[2, 0])
         assert agent.last_source == "actor"

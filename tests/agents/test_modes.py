@@ -1,4 +1,4 @@
-"""The table of agent modes: every row can be used, a new row is enough for a new mode."""
+"""The table of agent modes: every mode is usable, and a new row in the table is enough for a new mode."""
 
 import numpy as np
 import pytest

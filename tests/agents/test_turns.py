@@ -1,4 +1,4 @@
-"""Agents that see four quarter turns of every frame: the turn of the frame does not change the action."""
+"""Agents with four quarter turns of every frame: turning the frame does not change the action."""
 
 import copy
 import dataclasses
@@ -68,7 +68,7 @@ def test_act_returns_one_action_per_frame(make, model, film):
 
 
 def without_turns(model):
-    """An actor with the same weights that sees frames as they are."""
+    """An actor with the same weights and without turns."""
     alone = copy.deepcopy(model)
     alone.config = dataclasses.replace(SIZES, turns=1)
     return ActorAgent(alone, CONFIG)
@@ -92,9 +92,8 @@ def test_action_is_the_mean_of_the_actions_of_all_turns(model, film):
     assert np.allclose(ActorAgent(model, CONFIG).act(film[0]), np.mean(sides, axis=0), atol=1e-5)
 
 
-@pytest.mark.parametrize(
-    "make", ["planner", "actor"], indirect=True
-)  # gated and background agents share searches or a threshold
+# Gated and background agents are left out, because the environments of a batch share a threshold or a search.
+@pytest.mark.parametrize("make", ["planner", "actor"], indirect=True)
 def test_act_gives_each_environment_of_a_batch_its_own_action(make, model, film):
     together, alone = make(model), make(model)
     for frames in film:
@@ -144,7 +143,7 @@ def test_exported_program_turns_its_frames_itself(model, film, tmp_path):
         assert np.allclose(action.detach().numpy(), agent.act(frames), atol=1e-4)
 
 
-def test_config_refuses_turns_when_no_turned_frames_are_learned_from():
+def test_config_refuses_turns_without_turned_frames_in_training():
     with pytest.raises(UserError, match="turned_share"):
         Config(model=SIZES)
     with pytest.raises(ValueError, match="turns must be 1 or 4"):

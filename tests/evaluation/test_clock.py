@@ -1,4 +1,4 @@
-"""The virtual clock and its executor, alone and with every kind of agent."""
+"""The virtual clock and the executor, alone and with every kind of agent."""
 
 import time
 
@@ -25,7 +25,7 @@ PLANNER = PlannerConfig(horizon=4, num_samples=8, num_elites=2, num_policy_sampl
 
 
 class Searcher:
-    """A planner whose plans are numbers that count its calls."""
+    """A planner that returns the number of its calls as the plan."""
 
     def __init__(self):
         self.count = 0

@@ -40,7 +40,7 @@ class TapeEnv:
 
 
 class CountingAgent:
-    """Acts 1, 2, 3 and so on, and keeps the periods that it saw."""
+    """Returns the actions 1, 2, 3 and so on, and keeps the periods of the frames."""
 
     def seed(self, seed):
         pass
@@ -58,7 +58,7 @@ def constant(milliseconds):
 
 
 def play(milliseconds, control_hz=20.0, length=4, on_step=None, env=None):
-    """One episode in which every decision takes as many milliseconds; a period is 50 by default."""
+    """One episode with decisions of the given duration; a period lasts 50 ms by default."""
     env, agent = env or TapeEnv(length), CountingAgent()
     clock = VirtualClock(control_hz, constant(milliseconds))
     (episode,) = iterate_timed_episodes(env, agent, [0], clock, on_step=on_step)

@@ -1,4 +1,4 @@
-"""The planner maximises expressions over predicted quantities and keeps constraints with a distance."""
+"""The planner maximises expressions over predicted quantities, and keeps a distance from constraints."""
 
 from typing import NamedTuple
 
@@ -225,7 +225,7 @@ def test_read_goal_image_names_the_file_when_it_cannot_be_read(tmp_path, name, r
         read_goal_image(str(tmp_path / name))
 
 
-def test_read_goal_image_tells_the_reason_of_opencv_when_image_is_too_large(tmp_path, monkeypatch):
+def test_read_goal_image_gives_opencvs_reason_when_the_image_is_too_large(tmp_path, monkeypatch):
     (tmp_path / "large.png").touch()
 
     def refuse(path, flags):

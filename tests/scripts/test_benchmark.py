@@ -12,10 +12,10 @@ import torch
 from bench.ablate import compare_arms
 from bench.ablation_arms import NAMES, Arm, Outcome, parse_arms
 from bench.decide import measure_decisions
+from bench.estimates import interquartile_estimate, interquartile_mean, paired_difference
 from bench.machine import product_limits
 from bench.render import measure_qualities
 from bench.report import format_table, interval, number
-from bench.statistics import interquartile_estimate, interquartile_mean, paired_difference
 from bench.train_update import PARTS, measure_graph, measure_update
 
 from latentplan.agents.actor import ActorAgent

@@ -1,4 +1,4 @@
-"""`benchmark.py plan`: our planner beside those of other libraries."""
+"""`benchmark.py plan`: the project's planner beside planners of other libraries."""
 
 import json
 import sys

@@ -1,4 +1,4 @@
-"""The peer's side: a process that runs one search for each line of input and answers with its time."""
+"""Server of a peer: a process that runs one search for each line of input and answers with its duration."""
 
 from __future__ import annotations
 

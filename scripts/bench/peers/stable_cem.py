@@ -1,4 +1,4 @@
-"""stable-worldmodel's CEMSolver, whose model returns the cost of whole action sequences."""
+"""CEMSolver of stable-worldmodel, with a model that returns the cost of action sequences."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from latentplan.models import State, WorldModel
 
 
 class RewardCost:
-    """The model with the interface of that library: `get_cost` of candidates (1, sample, horizon, action)."""
+    """The model with the interface of stable-worldmodel: `get_cost` of candidates (1, sample, horizon, action)."""
 
     def __init__(self, model: WorldModel, start: State) -> None:
         self.model, self.start = model, start
