@@ -66,15 +66,15 @@ class VirtualClock:
 
     def charge_plan(self, compute: Callable[[], Result]) -> tuple[Result, float]:
         """The result of a computation beside the present decision, and the time in ms at which the result is ready."""
-        asked_ms = self.now_ms
+        requested_ms = self.now_ms
         if not self.latency.is_replayed:  # the decision took time before its request for the plan
-            asked_ms += _elapsed_ms(self._decision_began) - self._plan_ms
+            requested_ms += _elapsed_ms(self._decision_began) - self._plan_ms
         started = time.perf_counter()
         result = compute()
         elapsed_ms = _elapsed_ms(started)
         self._plan_ms += elapsed_ms
         waits = self.control_hz is None
-        return result, self.now_ms if waits else asked_ms + self._charge_plan(elapsed_ms)
+        return result, self.now_ms if waits else requested_ms + self._charge_plan(elapsed_ms)
 
 
 class VirtualExecutor:
@@ -89,12 +89,12 @@ class VirtualExecutor:
         clock: The clock that charges the plans.
 
     Attributes:
-        asked_ms: Time in ms at which each plan of this episode was requested, by the tick of its first action.
+        requested_ms: Time in ms at which each plan of this episode was requested, by the tick of its first action.
     """
 
     def __init__(self, planner: Any, model: Any, clock: VirtualClock) -> None:
         self.planner, self.model, self.clock = planner, model, clock
-        self.asked_ms: dict[int, float] = {}
+        self.requested_ms: dict[int, float] = {}
         self._objective: Term | None = None
         self._constraints: Sequence[Constraint] = ()
         self._episode = clock.episode
@@ -126,7 +126,7 @@ class VirtualExecutor:
         plan, ready_ms = self.clock.charge_plan(
             lambda: self.planner.plan(self.model, state, previous, generator=generator, **goals)
         )
-        self.asked_ms[tick] = self.clock.now_ms
+        self.requested_ms[tick] = self.clock.now_ms
         self._pending = (tick, plan, ready_ms)
         return True
 
@@ -141,7 +141,7 @@ class VirtualExecutor:
     def _drop_earlier_episode(self) -> None:
         if self._episode != self.clock.episode:
             self._episode, self._pending = self.clock.episode, None
-            self.asked_ms.clear()
+            self.requested_ms.clear()
 
 
 def _elapsed_ms(started: float) -> float:

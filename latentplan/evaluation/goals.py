@@ -166,16 +166,16 @@ class ScoredEnv(gymnasium.Wrapper[Any, Any, Any, Any]):
         """
         scores = self.scores[:episodes]
         means = {name: float(np.mean([score.quantities[name] for score in scores])) for name in self._names}
-        found: dict[str, Any] = {"quantities": means}
+        summary: dict[str, Any] = {"quantities": means}
         if self.goals.phases:
             returns = [score.objective_return for score in scores]
-            found |= {"objective": self.goals.objective_text, "objective_return": float(np.mean(returns))}
-            found["objective_returns"] = returns
+            summary |= {"objective": self.goals.objective_text, "objective_return": float(np.mean(returns))}
+            summary["objective_returns"] = returns
         if self.goals.constraints:
             rates = [score.violation_rate for score in scores]
-            found |= {"constraint": self.goals.constraint_text, "violation_rate": float(np.mean(rates))}
-            found["violation_rates"] = rates
-        return found
+            summary |= {"constraint": self.goals.constraint_text, "violation_rate": float(np.mean(rates))}
+            summary["violation_rates"] = rates
+        return summary
 
     def _score_control_step(self, values: dict[str, np.float64], reward: float, picture: NDArray[np.uint8]) -> None:
         phase = self._current_phase()

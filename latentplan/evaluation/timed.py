@@ -193,7 +193,7 @@ class RunningWorld:
             return
         executor = agent.scheduler.executor if hasattr(agent, "scheduler") else None
         if isinstance(executor, VirtualExecutor):
-            self._plan_began_ms = executor.asked_ms[agent.scheduler.tick - 1 - agent.plan_age]
+            self._plan_began_ms = executor.requested_ms[agent.scheduler.tick - 1 - agent.plan_age]
         elif source == "plan":
             self._plan_began_ms = self.clock.now_ms
         self.record.plan_age_ms.append(self.clock.now_ms + decision_ms - self._plan_began_ms)

@@ -20,7 +20,7 @@ from torch import Tensor
 
 from latentplan.config import EnvConfig, UserError
 from latentplan.config.quantities import scales
-from latentplan.objectives.box import BoxView, Interval, box_of, planning_degree
+from latentplan.objectives.box import BoxView, box_of, planning_degree
 from latentplan.objectives.expression import (
     Clause,
     Expression,
@@ -89,11 +89,6 @@ def build_goals(
         require_labels(clauses, model.label_names)
         constraints = [build_constraint(clauses)]
     return objective, constraints
-
-
-def learned_box(expression: Expression, model: Any) -> dict[str, Interval] | None:
-    """The box of an expression; None if the expression is not a box or the model has no goal heads."""
-    return box_of(expression, model.goal_names) if getattr(model, "goal_dim", 0) else None
 
 
 def build_objective(
@@ -200,7 +195,8 @@ def _build_expression(
     """The planner's objective for an expression; None if the expression is the learned return."""
     require_labels([node for _, node in expression.terms], model.label_names)
     has_value = supports(model, "value") if planner.terminal_value is None else planner.terminal_value
-    box = learned_box(expression, model) if has_value else None
+    has_goal_heads = bool(getattr(model, "goal_dim", 0))
+    box = box_of(expression, model.goal_names) if has_value and has_goal_heads else None
     if box is not None:
         return conditioned(BoxView(box, env.action_repeat))
     if expression.is_return:

@@ -102,7 +102,7 @@ def parse_constraints(text: str, scales: Mapping[str, float]) -> tuple[Clause, .
     Raises:
         UserError: The text is no constraint; the message names the position and the nearest name.
     """
-    return tuple(clause for part in text.split(";") for clause in _Parser(part, scales).inequalities())
+    return tuple(clause for part in text.split(";") for clause in _Parser(part, scales).read_inequalities())
 
 
 def split_outside_quotes(text: str, separator: str) -> list[str]:
@@ -159,7 +159,7 @@ class _Parser:
             self._forbid_whole_terms(node)
         return [(weight, node)]
 
-    def inequalities(self) -> list[Clause]:
+    def read_inequalities(self) -> list[Clause]:
         """The clauses of a constraint."""
         found: list[Clause] = []
         pending = [self.parse()]

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from bench.ablation_arms import NAMES, REFERENCE, Outcome, check_checkpoint, parse_arms, play_arm
-from bench.report import format_table, interval, number, write_csv, write_json
+from bench.report import format_interval, format_number, format_table, write_csv, write_json
 from bench.workers import run_in_order
 from latentplan.commands.shell import ComputeRequest
 from latentplan.config import to_dict
@@ -111,11 +111,11 @@ def summary_table(compared: dict[str, dict[str, Any]]) -> str:
         rows.append(
             [
                 name,
-                number(facts["mean_return"]),
-                interval(facts["ci95"]),
-                number(facts["minus_full"], sign=True),
-                interval(facts["minus_full_ci95"], sign=True),
-                number(facts["decision_ms"]["p50"], 2),
+                format_number(facts["mean_return"]),
+                format_interval(facts["ci95"]),
+                format_number(facts["minus_full"], sign=True),
+                format_interval(facts["minus_full_ci95"], sign=True),
+                format_number(facts["decision_ms"]["p50"], 2),
                 "-" if share is None else f"{100.0 * share:.0f} %",
             ]
         )

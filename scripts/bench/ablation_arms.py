@@ -67,9 +67,9 @@ def parse_arms(text: str, base: PlannerConfig) -> list[Arm]:
             raise_unknown("arm", name, NAMES)
         if words and (not name or name in NAMES):
             raise UserError(f"arm {name!r} takes no settings; write newname:{words[0]}")
-        given[name] = dict(_setting(name, word) for word in words)
+        given[name] = dict(_parse_setting(name, word) for word in words)
     names = [REFERENCE, *(name for name in given if name != REFERENCE)]
-    return [_arm(name, given.get(name, {}), base) for name in names]
+    return [_make_arm(name, given.get(name, {}), base) for name in names]
 
 
 def without_actor(base: PlannerConfig) -> dict[str, Any]:
@@ -147,7 +147,7 @@ def _split_arms(text: str) -> list[tuple[str, list[str]]]:
     return arms
 
 
-def _setting(arm: str, word: str) -> tuple[str, str]:
+def _parse_setting(arm: str, word: str) -> tuple[str, str]:
     field, equals, value = word.partition("=")
     if not equals:
         raise UserError(f"arm {arm!r} must be name:field=value,field=value, got {word!r}")
@@ -156,7 +156,7 @@ def _setting(arm: str, word: str) -> tuple[str, str]:
     return field, value
 
 
-def _arm(name: str, settings: dict[str, str], base: PlannerConfig) -> Arm:
+def _make_arm(name: str, settings: dict[str, str], base: PlannerConfig) -> Arm:
     if name in ("actor", "random"):
         return Arm(name, name, {})
     known: dict[str, dict[str, Any]] = {

@@ -12,7 +12,7 @@ from statistics import median
 from typing import TYPE_CHECKING, Any
 
 from bench.options import SearchRequest
-from bench.report import format_table, number, write_json
+from bench.report import format_number, format_table, write_json
 from latentplan.config.checks import at_least
 from latentplan.config.parsing import option
 
@@ -67,7 +67,8 @@ def run(request: Request) -> int:
     print(f"{machine['name']} ({device.type}, {machine['threads']} threads), {extent}")
     header = ["model", "stepped, ms p50", "compiled", "ratio", "compilation, s", "actions differ by"]
     keys = (("stepped_ms", 1), ("compiled_ms", 1), ("ratio", 2), ("compilation_s", 1), ("largest_difference", 7))
-    print(format_table(header, [[row["model"], *(number(row[key], digits) for key, digits in keys)] for row in rows]))
+    lines = [[row["model"], *(format_number(row[key], digits) for key, digits in keys)] for row in rows]
+    print(format_table(header, lines))
     write_json(request.json, {**sizes, "plans": plans, "machine": machine, "rows": rows})
     return 0
 
@@ -111,14 +112,14 @@ def measure_model(model: Model, state: torch.Tensor, planner: CEMPlanner, plans:
     """
     import torch
 
-    from bench.machine import now
+    from bench.machine import read_clock
     from latentplan.planning import compile_rollout
 
     def search(arm: Model, seed: int) -> tuple[float, torch.Tensor]:
         generator = torch.Generator(state.device).manual_seed(seed)
-        started = now(state.device)
+        started = read_clock(state.device)
         actions = planner.plan(arm, state, generator=generator).actions
-        return now(state.device) - started, actions
+        return read_clock(state.device) - started, actions
 
     arms = (model, compile_rollout(model))
     first = [sum(search(arm, seed)[0] for seed in range(WARM_UP_PLANS)) for arm in arms]

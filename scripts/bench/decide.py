@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from bench.options import ComposeRequest
-from bench.report import format_table, number, write_json
+from bench.report import format_number, format_table, write_json
 from latentplan.commands.flags import overrides
 from latentplan.config import Config, PlannerConfig, UserError, to_dict
 from latentplan.config.checks import at_least
@@ -72,7 +72,11 @@ def run(request: Request) -> int:
         name: measure_decisions(agent, batch, decisions) for name, agent in _agents(model, config, discount).items()
     }
     rows = [
-        [name, *(number(facts["decision_ms"][key], 2) for key in ("p50", "p95", "p99")), f"{facts['model_steps']:,}"]
+        [
+            name,
+            *(format_number(facts["decision_ms"][key], 2) for key in ("p50", "p95", "p99")),
+            f"{facts['model_steps']:,}",
+        ]
         for name, facts in arms.items()
     ]
     machine = describe_machine(device)
@@ -107,13 +111,13 @@ def measure_decisions(agent: Agent, batch: int, decisions: int) -> dict[str, Any
         agent.act(frames)
         if index >= WARM_UP_DECISIONS:
             milliseconds.append(1000.0 * (time.perf_counter() - started))
-    with counted_model_steps(agent.model) as counts:  # type: ignore[attr-defined]
+    with count_model_steps(agent.model) as counts:  # type: ignore[attr-defined]
         agent.act(frames)
     return {"decision_ms": latency_percentiles(np.asarray(milliseconds)), "model_steps": counts["rows"] // batch}
 
 
 @contextmanager
-def counted_model_steps(model: WorldModel) -> Iterator[dict[str, int]]:
+def count_model_steps(model: WorldModel) -> Iterator[dict[str, int]]:
     """Counts the model steps of all rows, under `rows`, inside the `with` block."""
     counts = {"rows": 0}
 

@@ -19,7 +19,7 @@ from typing import Any, Literal
 
 from bench.learn_plot import Curve, Point, plot_runs
 from bench.published_returns import FRAMES, published_returns_of
-from bench.report import format_table, interval, number, write_csv, write_json
+from bench.report import format_interval, format_number, format_table, write_csv, write_json
 from latentplan.commands import train
 from latentplan.commands.flags import overrides, read_request
 from latentplan.config import Config, Device, RunConfig, UserError, make_folder, to_dict
@@ -103,7 +103,7 @@ def run(request: Request) -> int:
     budget, extra = request.budget, request.forwarded
     folders = {(task, seed): out / f"{task}-seed{seed}" for task in tasks for seed in request.seeds}
     for (task, seed), folder in folders.items():  # refuses a mistake in any run before the first run begins
-        asked = read_request(train.Request, _new_run(task, seed, folder, budget, extra))
+        asked = read_request(train.Request, _new_run_flags(task, seed, folder, budget, extra))
         check_same(train.resolve(asked), folder)
     make_folder(out)
     for (task, seed), folder in folders.items():
@@ -155,18 +155,10 @@ def check_same(config: Config, folder: Path) -> None:
     """
     if not (folder / "config.yaml").exists():
         return
-    asked, begun = (_settings(each) for each in (config, read_config(folder / "config.yaml")))
+    asked, begun = (_comparable_settings(each) for each in (config, read_config(folder / "config.yaml")))
     for name, value in asked.items():
         if begun[name] != value:
             raise UserError(f"{folder} was begun with --{name} {begun[name]}, not {value}: choose another --out")
-
-
-def _settings(config: Config) -> dict[str, Any]:
-    from latentplan.envs import default_task
-
-    env = replace(config.env, task=config.env.task or default_task(config.env.domain))
-    sections = to_dict(replace(config, env=env, run=RunConfig(seed=config.run.seed)))
-    return {f"{section}.{name}": value for section, fields in sections.items() for name, value in fields.items()}
 
 
 def first_reaching(curve: Curve, threshold: float) -> Point | None:
@@ -198,11 +190,15 @@ def run_table(curves: Sequence[Curve], thresholds: Sequence[int]) -> str:
     """`run_facts` as a text table; frames and minutes to a threshold share a cell."""
     rows = []
     for facts in run_facts(curves, thresholds):
-        cells = [f"{facts['task']} seed {facts['seed']}", number(facts["env_frames"], 0), number(facts["minutes"])]
+        cells = [
+            f"{facts['task']} seed {facts['seed']}",
+            format_number(facts["env_frames"], 0),
+            format_number(facts["minutes"]),
+        ]
         for threshold in map(str, thresholds):
             frames, minutes = facts["frames_to"][threshold], facts["minutes_to"][threshold]
             cells.append("-" if frames is None else f"{frames:,.0f} / {minutes:.1f}")
-        rows.append([*cells, number(facts["final_return"])])
+        rows.append([*cells, format_number(facts["final_return"])])
     header = ["run", "frames", "minutes", *(f"frames / min to {threshold}" for threshold in thresholds), "final"]
     return format_table(header, rows)
 
@@ -255,11 +251,20 @@ def comparison_table(task: str, rows: Mapping[str, Mapping[str, Any]], threshold
     """The result of `compare` as a text table."""
     table = []
     for method, facts in rows.items():
-        cells = [number(facts["returns"].get(frames), 0) for frames in FRAMES]
-        reached = [number(facts["frames_to"][str(threshold)], 0) for threshold in thresholds]
+        cells = [format_number(facts["returns"].get(frames), 0) for frames in FRAMES]
+        reached = [format_number(facts["frames_to"][str(threshold)], 0) for threshold in thresholds]
         table.append([method, *cells, *reached])
     columns = [*(f"at {frames:,}" for frames in FRAMES), *(f"frames to {threshold}" for threshold in thresholds)]
     return format_table([task, *columns], table)
+
+
+def _comparable_settings(config: Config) -> dict[str, Any]:
+    """The settings by name, with the default task filled in and without the budget and folder of the run."""
+    from latentplan.envs import default_task
+
+    env = replace(config.env, task=config.env.task or default_task(config.env.domain))
+    sections = to_dict(replace(config, env=env, run=RunConfig(seed=config.run.seed)))
+    return {f"{section}.{name}": value for section, fields in sections.items() for name, value in fields.items()}
 
 
 def _nearest_point(curve: Curve, frames: int) -> Point | None:
@@ -281,7 +286,7 @@ def _train(task: str, seed: int, folder: Path, budget: list[str], extra: list[st
         print(f"{folder} is finished and not repeated", flush=True)
         return
     is_begun = (folder / "config.yaml").exists()
-    arguments = ["--resume", str(folder), *budget] if is_begun else _new_run(task, seed, folder, budget, extra)
+    arguments = ["--resume", str(folder), *budget] if is_begun else _new_run_flags(task, seed, folder, budget, extra)
     script = Path(__file__).resolve().parent.parent / "train.py"
     print(f"training {task}, seed {seed}", flush=True)
     training = subprocess.Popen([sys.executable, str(script), *arguments])
@@ -306,11 +311,11 @@ def _read_budget(marker: Path) -> list[str] | None:
     return budget
 
 
-def _new_run(task: str, seed: int, folder: Path, budget: list[str], extra: list[str]) -> list[str]:
+def _new_run_flags(task: str, seed: int, folder: Path, budget: list[str], extra: list[str]) -> list[str]:
     domain, _, name = task.partition("-")
     chosen = ["--domain", domain, *(["--task", name] if name else []), "--seed", str(seed)]
     return [*chosen, "--run-dir", str(folder), *budget, *extra]
 
 
 def _final_row(name: str, facts: dict[str, Any]) -> list[str]:
-    return [name, str(facts["runs"]), number(facts["mean"]), interval((facts["low"], facts["high"]))]
+    return [name, str(facts["runs"]), format_number(facts["mean"]), format_interval((facts["low"], facts["high"]))]

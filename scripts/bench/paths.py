@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 from unittest.mock import patch
 
 from bench.options import ComposeRequest
-from bench.report import format_table, number, write_json
+from bench.report import format_number, format_table, write_json
 from latentplan.commands.flags import overrides
 from latentplan.config import LearningConfig, ModelConfig, UserError
 from latentplan.config.checks import at_least
@@ -73,7 +73,12 @@ def run(request: Request) -> int:
         reference_ms, fast_ms = _milliseconds(model, call, reference, fast, context, repeats, device)
         results.append({"path": name, "reference_ms": reference_ms, "fast_ms": fast_ms})
     rows = [
-        [row["path"], number(row["reference_ms"], 3), number(row["fast_ms"], 3), number(_ratio(row), 2)]
+        [
+            row["path"],
+            format_number(row["reference_ms"], 3),
+            format_number(row["fast_ms"], 3),
+            format_number(_ratio(row), 2),
+        ]
         for row in results
     ]
     machine = describe_machine(device)
@@ -98,16 +103,16 @@ def _milliseconds(
     device: torch.device,
 ) -> tuple[float, float]:
     """Median milliseconds of the reference and of the fast path; the two are called in turns."""
-    from bench.machine import now
+    from bench.machine import read_clock
 
     seconds: tuple[list[float], list[float]] = ([], [])
     for repeat in range(WARM_UP_CALLS + repeats):
         for backend, times, inside in ((reference, seconds[0], nullcontext), (fast, seconds[1], context)):
             model.backend = backend
             with inside():
-                started = now(device)
+                started = read_clock(device)
                 call(model)
-                ended = now(device)
+                ended = read_clock(device)
             if repeat >= WARM_UP_CALLS:
                 times.append(ended - started)
     return 1000.0 * median(seconds[0]), 1000.0 * median(seconds[1])

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from bench.options import ComposeRequest, SearchRequest
 from bench.peers.install import FOLDER, PEERS, PeerError
-from bench.report import format_table, number, write_json
+from bench.report import format_number, format_table, write_json
 from latentplan.commands.flags import overrides
 from latentplan.config import ModelConfig, to_dict
 from latentplan.config.checks import at_least
@@ -159,10 +159,10 @@ def compare(problem: Problem, peers: Sequence[str], plans: int, folder: Path = F
 def own_arms(problem: Problem) -> list[Arm]:
     """This project's planner, a plain loop, and the matrix products alone."""
     from bench.peers.problem import DTYPES
-    from bench.plan_searches import matrix_products, our_search, plain_search, timed
+    from bench.plan_searches import matrix_products, plain_search, planner_search, timed
 
     return [
-        *(Arm(OURS, dtype, timed(our_search(problem, dtype), problem)) for dtype in DTYPES),
+        *(Arm(OURS, dtype, timed(planner_search(problem, dtype), problem)) for dtype in DTYPES),
         Arm(PLAIN, "float32", timed(plain_search(problem), problem)),
         *(Arm(PRODUCTS, dtype, timed(matrix_products(problem, dtype), problem)) for dtype in DTYPES),
     ]
@@ -205,19 +205,22 @@ def comparison_table(result: dict[str, Any]) -> str:
     best, limits = result["best_dtype"], result["matrix_limit_ms"]
     ours = next(row["p50_ms"] for row in result["rows"] if row["planner"] == OURS and row["dtype"] == best)
     lines = [
-        [row["planner"], row["dtype"], *(number(row[f"{p}_ms"]) for p in ("p50", "p95", "p99"))]
-        + [number(row["p50_ms"] / ours, 2), number(row["p50_ms"] / limits[row["dtype"]], 2)]
+        [row["planner"], row["dtype"], *(format_number(row[f"{p}_ms"]) for p in ("p50", "p95", "p99"))]
+        + [format_number(row["p50_ms"] / ours, 2), format_number(row["p50_ms"] / limits[row["dtype"]], 2)]
         for row in result["rows"]
     ]
-    lines += [[PRODUCTS, dtype, number(ms), "-", "-", number(ms / ours, 2), "1.00"] for dtype, ms in limits.items()]
+    lines += [
+        [PRODUCTS, dtype, format_number(ms), "-", "-", format_number(ms / ours, 2), "1.00"]
+        for dtype, ms in limits.items()
+    ]
     header = ["planner", "dtype", "p50 ms", "p95", "p99", "x ours", "x products"]
     return "\n".join(
         [
             format_table(header, lines),
             f"{result['settings']['plans']} searches each; fastest peer / ours: "
-            f"{number(result['ratio_fastest_peer'], 2)} as shipped, "
-            f"{number(result['ratio_fastest_peer_same_dtype'], 2)} in {best}; "
-            f"ours / its matrix products: {number(result['ratio_matrix_limit'], 2)}",
+            f"{format_number(result['ratio_fastest_peer'], 2)} as shipped, "
+            f"{format_number(result['ratio_fastest_peer_same_dtype'], 2)} in {best}; "
+            f"ours / its matrix products: {format_number(result['ratio_matrix_limit'], 2)}",
         ]
     )
 

@@ -8,7 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from bench.machine import now
+from bench.machine import read_clock
 from bench.peers.problem import DTYPES, Problem, build_model, start_state, summed_rewards
 from latentplan.planning import CEMPlanner
 
@@ -21,14 +21,14 @@ def timed(search: Search, problem: Problem) -> Callable[[], float]:
 
     @torch.no_grad()
     def search_ms() -> float:
-        started = now(device)
+        started = read_clock(device)
         search()
-        return 1000.0 * (now(device) - started)
+        return 1000.0 * (read_clock(device) - started)
 
     return search_ms
 
 
-def our_search(problem: Problem, dtype: str, batch: int = 1) -> Search:
+def planner_search(problem: Problem, dtype: str, batch: int = 1) -> Search:
     """A cold search of the project's planner from `batch` starts at once, without terminal value."""
     model, start = build_model(problem, dtype), start_state(problem, batch)
     planner = CEMPlanner(

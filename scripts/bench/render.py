@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from bench.report import format_table, number, write_json
+from bench.report import format_number, format_table, write_json
 from latentplan.config import RENDER_QUALITIES, EnvConfig
 from latentplan.config.checks import at_least
 from latentplan.config.files import DOMAINS, compose
@@ -55,7 +55,7 @@ def run(request: Request) -> int:
         for domain in request.domains
     }
     rows = [
-        [f"{domain}, {quality}", number(facts["frame_ms"], 2), number(facts["pixel_change"], 2)]
+        [f"{domain}, {quality}", format_number(facts["frame_ms"], 2), format_number(facts["pixel_change"], 2)]
         for domain, qualities in measured.items()
         for quality, facts in qualities.items()
     ]

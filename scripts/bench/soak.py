@@ -14,7 +14,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from bench.report import format_table, number, write_json
+from bench.report import format_number, format_table, write_json
 from latentplan.commands.shell import ComputeRequest
 from latentplan.config.checks import above_zero, at_least
 from latentplan.config.parsing import option, raise_unknown
@@ -110,7 +110,7 @@ def run(request: Request) -> int:
     code = 0
     from latentplan.planning import settle
 
-    with _loaded_agents(checkpoint, modes, device, 1000.0 * DEADLINE_SHARE / control_hz) as agents:
+    with _load_agents(checkpoint, modes, device, 1000.0 * DEADLINE_SHARE / control_hz) as agents:
         settle()
         try:
             take_turns(agents, frames, control_hz, decisions, block, tallies)
@@ -202,10 +202,10 @@ def soak_table(rows: Mapping[str, dict[str, Any]]) -> str:
             name,
             f"{row['decisions_due']:,}",
             f"{row['deadline_misses']:,}",
-            number(row["misses_per_10000"]),
-            "-" if name == IDLE else number(row["minus_no_op"], sign=True),
-            *(number(row["decision_ms"][key], 2) for key in ("p50", "p99", "max")),
-            number(row["wake_ms"]["p99"], 2),
+            format_number(row["misses_per_10000"]),
+            "-" if name == IDLE else format_number(row["minus_no_op"], sign=True),
+            *(format_number(row["decision_ms"][key], 2) for key in ("p50", "p99", "max")),
+            format_number(row["wake_ms"]["p99"], 2),
         ]
         for name, row in rows.items()
     ]
@@ -233,7 +233,7 @@ def _record_frames(checkpoint: Path, device: str) -> list[np.ndarray]:
 
 
 @contextlib.contextmanager
-def _loaded_agents(checkpoint: str, modes: Sequence[str], device: str, deadline_ms: float) -> Any:
+def _load_agents(checkpoint: str, modes: Sequence[str], device: str, deadline_ms: float) -> Any:
     """The agents by name, ready to act; agents that search before they act have a deadline."""
     from latentplan.agents.background import BackgroundAgent
     from latentplan.agents.checkpoint import load_agent

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from bench.options import ComposeRequest
-from bench.report import format_table, number, write_json
+from bench.report import format_number, format_table, write_json
 from latentplan.commands.flags import overrides
 from latentplan.config import LearningConfig, ModelConfig, ReplayConfig
 from latentplan.config.checks import at_least
@@ -74,10 +74,10 @@ def _summary(result: dict[str, Any]) -> str:
     rows = [
         [
             name,
-            number(part["ms"], 2),
-            number(100.0 * part["ms"] / total_ms),
-            number(part["flop"] / 1e9, 2),
-            number(part["flop"] / part["ms"] / 1e6) if part["flop"] and part["ms"] > 0 else "-",
+            format_number(part["ms"], 2),
+            format_number(100.0 * part["ms"] / total_ms),
+            format_number(part["flop"] / 1e9, 2),
+            format_number(part["flop"] / part["ms"] / 1e6) if part["flop"] and part["ms"] > 0 else "-",
         ]
         for name, part in {**result["parts"], "in turn": {"ms": total_ms, "flop": result["flop"]}}.items()
     ]

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from bench.ablation_arms import check_checkpoint
-from bench.report import format_table, interval, number, write_json
+from bench.report import format_interval, format_number, format_table, write_json
 from bench.workers import run_in_order
 from latentplan.commands.flags import overrides
 from latentplan.commands.saved import search_settings
@@ -143,7 +143,7 @@ def run(request: Request) -> int:
     conditions = Conditions(checkpoint, seeds, device, changes, push, trained_for)
     for row in run_in_order(partial(play_job, conditions), jobs, workers):
         rows.append(row)
-        print(f"{row['goal']}, {row['player']}: {number(row['mean'], row['digits'])}", flush=True)
+        print(f"{row['goal']}, {row['player']}: {format_number(row['mean'], row['digits'])}", flush=True)
         write_json(request.json, {**about, "rows": rows})
     print(summary_table(rows))
     return 0
@@ -155,7 +155,7 @@ def list_jobs(request: Request) -> list[Job]:
     Raises:
         UserError: There is no row, or a player is unknown.
     """
-    objectives, constraints = _parts(request.objectives), _parts(request.constraints)
+    objectives, constraints = _split_goals(request.objectives), _split_goals(request.constraints)
     if not objectives and not constraints:
         raise UserError("give --objectives 'height > 1.2 | speed -> 2.0' or --constraints 'cart < 0.5', or both")
     known = (*OBJECTIVE_PLAYERS, "unconstrained")
@@ -211,7 +211,7 @@ def play_job(conditions: Conditions, job: Job) -> dict[str, Any]:
     env = make_env(replace(goal_env(config.env), task=own.env.task, objective=own.env.objective))
     try:
         scored = score_env(env, goals, agent if job.player in PLANNING_PLAYERS else None)
-        result = summarize(run_episodes(scored, agent, conditions.seeds, on_step=_pusher(env, conditions)))
+        result = summarize(run_episodes(scored, agent, conditions.seeds, on_step=_make_pusher(env, conditions)))
     finally:
         env.close()
     is_objective = job.objective is not None
@@ -241,19 +241,19 @@ def summary_table(rows: Sequence[dict[str, Any]]) -> str:
         [
             f"{row['goal']} ({row['kind']})",
             row["player"],
-            number(row["mean"], row["digits"]),
-            interval(row["ci95"], row["digits"]),
-            number(row["mean_return"]),
-            interval(row["return_ci95"]),
+            format_number(row["mean"], row["digits"]),
+            format_interval(row["ci95"], row["digits"]),
+            format_number(row["mean_return"]),
+            format_interval(row["return_ci95"]),
             f"{100.0 * row['planned_fraction']:.0f} %",
-            number(row["decision_ms"]["p50"], 2),
+            format_number(row["decision_ms"]["p50"], 2),
         ]
         for row in rows
     ]
     return format_table(header, lines)
 
 
-def _parts(text: str) -> list[str]:
+def _split_goals(text: str) -> list[str]:
     return list(dict.fromkeys(part.strip() for part in split_outside_quotes(text, "|") if part.strip()))
 
 
@@ -264,7 +264,7 @@ def _check_goals(jobs: Sequence[Job], domain: str) -> None:
         read_goals(job.objective, job.constraint, domain)
 
 
-def _pusher(env: SuiteEnv, conditions: Conditions) -> Callable[[Step], None] | None:
+def _make_pusher(env: SuiteEnv, conditions: Conditions) -> Callable[[Step], None] | None:
     """A callback that kicks the body before decisions; kicks depend on the episode's seed and the decision only."""
     if conditions.push == 0.0:
         return None

@@ -52,7 +52,7 @@ def test_executor_hands_over_a_plan_when_its_duration_has_passed():
     clock.advance(3)  # 60 ms
     assert executor.request(STATE, tick=7)
     assert not executor.is_idle and not executor.request(STATE, tick=8)
-    assert executor.asked_ms == {7: 60.0}
+    assert executor.requested_ms == {7: 60.0}
     clock.advance(4)
     assert executor.poll() is None  # 20 ms later
     clock.advance(5)
@@ -83,7 +83,7 @@ def test_executor_drops_the_pending_plan_when_an_episode_begins():
     executor = executor_on(clock)
     executor.request(STATE, tick=0)
     clock.restart(1)
-    assert executor.is_idle and executor.asked_ms == {}
+    assert executor.is_idle and executor.requested_ms == {}
     executor.request(STATE, tick=5)
     clock.advance(50)
     assert executor.poll() == (5, 2)

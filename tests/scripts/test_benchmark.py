@@ -15,7 +15,7 @@ from bench.decide import measure_decisions
 from bench.estimates import interquartile_estimate, interquartile_mean, paired_difference
 from bench.machine import product_limits
 from bench.render import measure_qualities
-from bench.report import format_table, interval, number
+from bench.report import format_interval, format_number, format_table
 from bench.train_update import PARTS, measure_graph, measure_update
 
 from latentplan.agents.actor import ActorAgent
@@ -97,10 +97,10 @@ def test_every_flag_of_the_benchmarks_keeps_its_default():
 
 
 def test_format_table_aligns_columns_and_marks_missing_values():
-    table = format_table(["arm", "return"], [["a", number(12.345)], ["longer", number(None)]])
+    table = format_table(["arm", "return"], [["a", format_number(12.345)], ["longer", format_number(None)]])
     assert table.splitlines() == ["arm     return", "------  ------", "a         12.3", "longer       -"]
-    assert interval((None, None)) == "-"
-    assert interval((-1.0, 2.0), sign=True) == "-1.0 to +2.0"
+    assert format_interval((None, None)) == "-"
+    assert format_interval((-1.0, 2.0), sign=True) == "-1.0 to +2.0"
 
 
 def test_parse_arms_puts_the_full_planner_first():
