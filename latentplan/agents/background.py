@@ -40,17 +40,17 @@ class BackgroundAgent(ModelAgent):
     """Takes each action from the newest plan that is due, or from the actor, while a worker searches the next plan.
 
     A decision costs one update of the belief and a few model steps. All environments of a batch share each
-    search, so `reset` drops the plans of all environments, whatever its mask. The agent has to be closed: call `close`
+    search, so `reset` drops the plans of all environments, also with a mask. The agent has to be closed: call `close`
     or use a `with` block.
 
     Attributes:
         last_source: Origin of the most recent action: "plan", "tail" (the rest of a plan whose successor is late) or
             "actor".
-        plan_age: Decisions since the one that the present plan was made for; None where the actor acted.
+        plan_age: Decisions since the first decision of the present plan; None where the actor acted.
         scheduler: Decides when plans are requested and which plan is due; see `PlanScheduler`.
 
     Args:
-        model: The world model; a worker process gets a copy of it, made now.
+        model: The world model; a worker process gets a copy, made by the constructor.
         config: Settings the model was trained with.
         discount: Discount per decision, as learned.
         planner: Settings of the search; None takes the settings in `config`.
@@ -88,7 +88,7 @@ class BackgroundAgent(ModelAgent):
         self.plan_age: int | None = None
 
     def reset(self, mask: np.ndarray | None = None) -> None:
-        """Forgets the past of all environments, or of those where mask (batch,) is true, and all plans."""
+        """Forgets the past of all environments, or only of environments where mask (batch,) is true, and all plans."""
         super().reset(mask)
         self.scheduler.reset()
 
@@ -97,8 +97,8 @@ class BackgroundAgent(ModelAgent):
     ) -> None:
         """Sets the objective and the constraints of all plans requested from now on.
 
-        Plans made before stay in use until the first new plan is due. Where no plan is due the actor acts for the
-        reward that it was trained on.
+        Plans made before stay in use until the first new plan is due. Where no plan is due, the actor acts for its
+        own training reward.
 
         Args:
             objective: See `PlanningAgent.set_objective`.

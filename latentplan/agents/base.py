@@ -58,7 +58,7 @@ class ModelAgent:
         model: The world model; the agent puts it into evaluation mode and does not change its weights.
         config: Settings the model was trained with.
         noise_std: Standard deviation of Gaussian noise added to each action, for exploration.
-        noise_correlation: Correlation of that noise between one decision and the next, in [0, 1).
+        noise_correlation: Correlation of this noise between one decision and the next, in [0, 1).
         seed: Seed of the agent's own random stream.
     """
 
@@ -90,7 +90,7 @@ class ModelAgent:
         self.generator.manual_seed(seed)
 
     def reset(self, mask: np.ndarray | None = None) -> None:
-        """Forgets the past of all environments, or of those where mask (batch,) is true.
+        """Forgets the past of all environments, or only of environments where mask (batch,) is true.
 
         Raises:
             ValueError: The mask has another length than the batch.

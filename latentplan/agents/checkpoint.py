@@ -36,13 +36,13 @@ def save_checkpoint(folder: Path, model: WorldModel, config: Config, info: dict[
     """Writes a checkpoint: float16 weights and a description; each file is replaced whole.
 
     Args:
-        folder: Folder of the checkpoint, made where it is missing.
+        folder: Folder of the checkpoint; a missing folder is made.
         model: The world model.
         config: Settings of the run.
         info: Further facts for the description: domain, task, discount, env_frames, metrics and the like.
 
     Raises:
-        FloatingPointError: A weight is not finite in float16; the folder is left as it was.
+        FloatingPointError: A weight is not finite in float16; the folder is not changed.
     """
     folder.mkdir(parents=True, exist_ok=True)
     part = folder / f"{WEIGHTS}.part"
@@ -99,7 +99,7 @@ def load_model(path: str | Path, device: str = "cpu") -> tuple[WorldModel, Confi
     except OSError as error:
         raise UserError(f"{weights} cannot be read: {error.strerror}") from None
     if hashlib.sha256(content).hexdigest() != info["sha256"]:
-        raise UserError(f"{weights} is damaged: its checksum is not the one in {INFO}")
+        raise UserError(f"{weights} is damaged: its checksum differs from the checksum in {INFO}")
     try:
         config = from_dict(info["config"])
     except (AttributeError, TypeError, ValueError) as error:
@@ -127,9 +127,9 @@ def load_agent(path: str | Path, mode: str = "planner", device: str = "cpu", **s
             planner at doubtful decisions; see `GatedAgent`), `background` (acts without waiting for the planner, and
             has to be closed; see `BackgroundAgent`) or `random`; see `latentplan.agents.modes`.
         device: `cpu` or `cuda`.
-        **settings: For modes that plan, planner settings that replace the trained ones, such as `horizon=10`. Also the
-            mode's own options: `planning_budget` and `signal` of `gated`; `worker`, `max_age`, `fresh_ticks` and
-            `make_executor` of `background`.
+        **settings: For modes that plan, planner settings in place of the settings of the training, such as
+            `horizon=10`. Also the mode's own options: `planning_budget` and `signal` of `gated`; `worker`, `max_age`,
+            `fresh_ticks` and `make_executor` of `background`.
 
     Returns:
         An `Agent`: `act(frame)` takes uint8 frames (64, 64, 3) or (batch, 64, 64, 3) and returns float32 actions in
@@ -184,7 +184,7 @@ def _first_not_finite(state: dict[str, torch.Tensor]) -> str | None:
 
 
 def _find_checkpoint(root: Path) -> Path | None:
-    """The root if it is a checkpoint, else the best or last checkpoint of the run in it; None if there is none."""
+    """The root if it is a checkpoint, or else the best or last checkpoint of a run in the root; None without one."""
     for folder in (root, root / "checkpoints" / "best", root / "checkpoints" / "last"):
         if (folder / INFO).is_file() and (folder / WEIGHTS).is_file():
             return folder

@@ -1,6 +1,6 @@
 """Export of the actor as a program: a file that runs with torch alone, without this package.
 
-One call is one decision. Inputs and outputs are plain tensors, and the belief passes through them:
+One call is one decision. Inputs and outputs are plain tensors, also the belief:
 
     action, deter, stoch = program(frame, deter, stoch, action, is_first)
 

@@ -29,9 +29,9 @@ class GatedAgent(PlanningAgent):
 
     The signals of a decision:
 
-        mismatch    KL(posterior || prior) of the latent at this frame: how far the frame is from the prediction;
-        value       |V(s) - (return of two imagined actor steps + discounted V)|: how far the value head contradicts
-                    the model's rollout of the actor;
+        mismatch    KL(posterior || prior) of the latent at this frame: distance of the frame from the prediction;
+        value       |V(s) - (return of two imagined actor steps + discounted V)|: contradiction between the value head
+                    and the model's rollout of the actor;
         both        the larger of mismatch and value;
         random      standard normal noise: the baseline, which plans as often at random decisions.
 
@@ -39,27 +39,27 @@ class GatedAgent(PlanningAgent):
     each decision the threshold moves by `threshold += 0.1 * (planned - planning_budget)`, also after the first decision
     of an episode. After N decisions the share of planned decisions therefore differs from the budget by exactly the
     total change of the threshold divided by 0.1 N, for any signal (Gibbs and Candes 2021, "Adaptive conformal
-    inference", proposition 4.1). The threshold starts one standard deviation above the normal quantile: until it has
-    fallen to the quantile, the agent makes ten plans fewer than the budget allows, and can make them later when many
-    decisions must be planned at once. A reset does not change the threshold, which is calibrated to the agent and not
-    to an episode.
+    inference", proposition 4.1). The threshold starts one standard deviation above the normal quantile: while the
+    threshold falls to the quantile, the agent makes ten plans fewer than the budget allows, as a reserve for moments at
+    which many decisions must be planned. A reset does not change the threshold, which is calibrated to the agent and
+    not to an episode.
 
-    Doubtful decisions never raise the planned share of all decisions above the budget: where not all of them fit, the
-    environments with the highest signal plan first. Three kinds of decisions are planned even beyond the budget, and
-    later decisions save as many plans: first decisions of an episode, decisions after the end of the last plan under an
-    untrained goal, and decisions with a NaN signal.
+    Doubtful decisions never raise the planned share of all decisions above the budget: if the budget does not cover all
+    doubtful decisions, the environments with the highest signal plan first. Three kinds of decisions are planned even
+    beyond the budget, and later decisions save as many plans: first decisions of an episode, decisions after the end of
+    the last plan under an untrained goal, and decisions with a NaN signal.
 
     While the actor acts, the last plan ages: the next search starts from the plan shifted by the decisions in between,
     or without a warm start after the end of the plan. The actor was trained on the task's reward. Under another
     objective or a constraint (an untrained goal) the agent therefore executes the rest of the last plan instead of the
     actor's action, and plans again after the end of the plan. The signal (except `random`) is then the sum of the
     mismatches since the last search, which grows faster where the frames differ more from the rollout. A goal that the
-    model learned to pursue (`conditioned`) has its own actor and value head, which replace those of the task. The
+    model learned to pursue (`conditioned`) has its own actor and value head, which replace the task's. The
     environments of a batch are gated one by one, and share the threshold.
 
     Attributes:
-        last_source: Origin of the most recent action: "plan", "tail" (the rest of an older plan) or "actor"; a list of
-            these for a batch of frames.
+        last_source: Origin of the most recent action: "plan", "tail" (the rest of an older plan) or "actor"; a list
+            with one origin per environment for a batch of frames.
         planned_fraction: Share of decisions so far at which a search was requested; 0 before the first decision.
 
     Args:
@@ -210,7 +210,7 @@ class GatedAgent(PlanningAgent):
         return signals
 
     def _value_gap(self, state: State, action: Tensor) -> Tensor:
-        """Difference between a state's value and the return of the actor's imagined steps from it, (batch,)."""
+        """Difference between the value of a state and the return of the actor's rollout from the state, (batch,)."""
         with self.model.trunk_precision():
             gap, weight = -self._actor_model.value(state), 1.0
             for step in range(GAP_STEPS):
@@ -251,7 +251,7 @@ class RunningScale:
         """Values (batch,) in standard deviations from the mean, 0 while the deviation is 0; then updates both.
 
         Args:
-            values: NaN and infinity come back as they are, and do not enter the statistics.
+            values: The values, (batch,); NaN and infinity are returned unchanged and do not enter the statistics.
             counts: Values that enter the statistics, (batch,) bool.
         """
         scores = values - self.mean if self.num else values * 0.0

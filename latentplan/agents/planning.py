@@ -54,7 +54,7 @@ class PlanningAgent(ModelAgent):
         self.controller = ModelPredictiveController(search, self.imagined, generator=self.generator)
 
     def reset(self, mask: np.ndarray | None = None) -> None:
-        """Forgets the past and the last plan of all environments, or of those where mask (batch,) is true."""
+        """Forgets past and last plan of all environments, or only of environments where mask (batch,) is true."""
         super().reset(mask)
         self.controller.reset(None if self.state is None else self._is_reset)
 

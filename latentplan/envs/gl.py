@@ -71,7 +71,7 @@ def explain_gl_errors() -> Iterator[None]:
         yield
     except UserError:
         raise
-    except Exception as error:  # each backend raises types of its own
+    except Exception as error:  # each backend raises other types
         backend = os.environ.get("MUJOCO_GL")
         reason = str(error).strip().splitlines()[0] if str(error).strip() else type(error).__name__
         raise UserError(f"cannot render with MUJOCO_GL={backend}: {reason}; {REMEDY}") from error

@@ -1,15 +1,15 @@
-"""Environments by the names in the settings: looks up the suite in `latentplan.config.suites` and calls its factory.
+"""Environments by name: looks up the suite in `latentplan.config.suites` and calls the suite's factory.
 
 A suite's factory is called as `factory(config, seed)`, with an `EnvConfig` and the seed of the first reset (None draws
 one), and returns a `gymnasium.Env` with these spaces and values:
 
-    observation_space       Box, uint8 (64, 64, 3); every observation is an array of its own
+    observation_space       Box, uint8 (64, 64, 3); every observation is a new array
     action_space            Box in [-1, 1], float32 (action,)
     reset                   depends on `seed` alone where one is given, else continues the random stream
     step                    holds the action for `config.action_repeat` control steps and sums the rewards
     info["env_frames"]      control steps that this step took; 0 from `reset`
 
-`latentplan.envs.wrap_user_env` makes such an environment of any other with image observations. Further attributes are
+`latentplan.envs.wrap_user_env` adapts any gymnasium environment with image observations. Further attributes are
 optional; each of them enables one feature:
 
     decisions_per_episode   decisions until the time limit (the discount is derived from it)
@@ -62,7 +62,7 @@ def default_task(domain: str, suite: str = DEFAULT_SUITE) -> str:
 
 
 def describe_unknown_name(kind: str, name: str, available: Iterable[str]) -> str:
-    """An error message for an unknown name, with all available names and the nearest of them."""
+    """An error message for an unknown name, with all available names and the nearest name."""
     choices = sorted(available)
     nearest = difflib.get_close_matches(name, choices, n=1, cutoff=0.0)[0]
     return f"unknown {kind} {name!r}; available: {', '.join(choices)}. Did you mean {nearest!r}?"

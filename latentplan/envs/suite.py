@@ -34,8 +34,8 @@ class SuiteEnv(gymnasium.Env[np.ndarray, np.ndarray]):
 
     An observation is a uint8 frame (64, 64, 3), always a new array. An action is float32 (action,) in [-1, 1], scaled
     to the actuators' range. `reset(seed=s)` depends on s alone; `reset()` continues the random stream. The time limit
-    truncates an episode; only the task terminates it. `info["env_frames"]` is the number of control steps that a step
-    took, which is smaller than the action repeat where an episode ends early. `info["labels"]` holds the true
+    truncates an episode; only the task terminates an episode. `info["env_frames"]` is the number of control steps that
+    a step took, which is smaller than the action repeat where an episode ends early. `info["labels"]` holds the true
     quantities at the frame, float32 (label,).
 
     Attributes:

@@ -31,7 +31,7 @@ def make_vector_env(
     make_env: Callable[[], gymnasium.Env[Any, Any]] | None = None,
     episode_decisions: int | None = None,
 ) -> VectorEnv[np.ndarray, np.ndarray, Any]:
-    """Several environments behind one `step`, each in a process of its own if there is more than one.
+    """Several environments behind one `step`; two or more environments run in separate processes.
 
     Finished episodes do not restart by themselves, so `step` always returns the result of its own action. Restart
     finished environments with `vector_env.reset(options={"reset_mask": ended})`, where `ended` is a bool array

@@ -44,7 +44,7 @@ class VirtualClock:
         self.restart(0)
 
     def restart(self, seed: int) -> None:
-        """Begins an episode at 0 ms; the durations drawn in it depend on the seed alone."""
+        """Begins an episode at 0 ms; the durations of the episode depend on the seed alone."""
         self.now_ms, self.episode = 0.0, self.episode + 1
         charges = self.latency.charges(derive_seed(seed, "latency"))
         self._charge_decision: Charge = charges[0]

@@ -125,7 +125,7 @@ class World(Protocol):
     """The order in which an environment and an agent act during one episode.
 
     Attributes:
-        record: Counts what happens in the episode.
+        record: Counts the rewards, frames and decisions of the episode.
     """
 
     record: EpisodeRecord
@@ -184,7 +184,7 @@ def play_episode(env: Any, agent: Agent, index: int, seed: int, world: World, on
     """
     frame, _ = env.reset(seed=seed)
     agent.reset()
-    agent.seed(derive_seed(seed, "agent"))  # another stream than the start's, so that actions do not correlate with it
+    agent.seed(derive_seed(seed, "agent"))  # independent of the stream of the start
     world.begin(seed)
     record, decision, is_over = world.record, 0, False
     while not is_over:

@@ -226,7 +226,7 @@ def score_env(env: SuiteEnv, goals: Goals, planner: Any | None) -> ScoredEnv:
         planner: A planning agent, which then pursues the goals; None for an agent that does not plan.
 
     Raises:
-        UserError: The environment does not report true quantities, or the agent does not predict one that a goal names.
+        UserError: The environment does not report true quantities, or the agent does not predict a quantity of a goal.
     """
     if planner is None:
         return ScoredEnv(env, goals)

@@ -80,7 +80,7 @@ class DelayedActions:
 
     @property
     def latest(self) -> Action:
-        """The action of the latest decision, (action,), whether or not it has taken effect yet."""
+        """The action of the latest decision, (action,), also before it takes effect."""
         return self._latest
 
     def replace(self, action: Action, delay_periods: float) -> None:
@@ -169,7 +169,7 @@ class RunningWorld:
         self.clock.restart(seed)
 
     def decide(self, agent: Agent, frame: Frame) -> Action:
-        """The agent's latest action, (action,); a new one unless the agent is still deciding on an earlier frame."""
+        """The agent's latest action, (action,): a new action unless the agent is still deciding on an earlier frame."""
         self.clock.advance(self._periods)
         if self._actions.is_waiting:
             self.record.deadline_misses += 1

@@ -34,7 +34,7 @@ def planning_degree(shortfalls: Tensor) -> Tensor:
     """Degree to which a clause is met, in (0, 1], with a gradient wherever the clause is not met.
 
     The degree is the mean of `scoring_degree` and of 1 / (1 + shortfall), which falls slowly, so that a search far from
-    the goal still gets closer to it.
+    the goal still makes progress.
 
     Args:
         shortfalls: Shortfalls in margins, any shape; a clause is met at 0 and below.
@@ -60,8 +60,8 @@ def box_degree(low: Tensor, high: Tensor, values: Tensor, scales: Tensor) -> Ten
 def box_of(expression: Expression, quantities: Sequence[str]) -> dict[str, Interval] | None:
     """The box of an expression, as intervals by quantity; None if the expression is not a box.
 
-    An expression is a box if it is one term of clauses joined by `and`, each between a quantity, or its absolute value,
-    and a number. A positive weight of the only term does not change the best plan and is ignored.
+    An expression is a box if it has one term, and the term consists of clauses joined by `and`, each between a quantity
+    (or its absolute value) and a number. A positive weight of the term does not change the best plan and is ignored.
 
     Args:
         expression: The objective.

@@ -1,8 +1,8 @@
 """Objectives and constraints of the planner, made from expressions over quantities that the world model predicts.
 
 The model has `label_names`, states with `features` (rows, feature), and `probe(features)`, the predicted quantities.
-Planning differs from scoring in two points: degrees fall more slowly, so that a search far from the goal still gets
-closer to it, and a plan keeps a distance from the limit of each constraint, because predictions have errors.
+Planning differs from scoring in two points: degrees fall more slowly, so that a search far from the goal still
+makes progress, and a plan keeps a distance from the limit of each constraint, because predictions have errors.
 """
 
 from __future__ import annotations

@@ -170,7 +170,7 @@ class _Parser:
             elif isinstance(node, Clause) and node.relation != "->":
                 found.append(node)
             else:
-                self._fail(node, "a constraint is an inequality such as 'cart < 0.5', or several joined by 'and'")
+                self._fail(node, "a constraint is an inequality such as 'cart < 0.5', or inequalities joined by 'and'")
         return found
 
     def _tokenize(self) -> list[_Token]:
@@ -185,7 +185,7 @@ class _Parser:
             token = _Token(str(match and match.lastgroup), match[0] if match else self.text[position], position)
             if match is None:
                 is_goal = token.text == ":" and tokens and tokens[-1].text == "goal"
-                self._fail(token, 'write goal:FILE or goal:"FILE"' if is_goal else f"{token.text!r} means nothing here")
+                self._fail(token, 'write goal:FILE or goal:"FILE"' if is_goal else f"unexpected {token.text!r}")
             if len(tokens) == _MAX_TOKENS:
                 self._fail(token, f"an expression has at most {_MAX_TOKENS} numbers, names and signs")
             tokens.append(token)

@@ -84,7 +84,7 @@ def filming(
         planner: The agent, if it plans; None leaves the right side empty.
         every: Decisions per frame of the film; the end of the episode always gets a frame. The film keeps the duration
             of the episode.
-        goals: Scores of an objective or constraints; the film then shows them in a strip.
+        goals: Scores of an objective or constraints; the film shows the scores in a strip.
 
     Yields:
         The callback, to be called with every step.

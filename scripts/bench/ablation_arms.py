@@ -22,7 +22,7 @@ class Arm(NamedTuple):
     Attributes:
         name: Name of the row in the table.
         mode: `planner`, `actor` or `random`.
-        planner: Settings of the search that replace those of the checkpoint.
+        planner: Settings of the search that replace the settings of the checkpoint.
     """
 
     name: str
@@ -53,7 +53,7 @@ def parse_arms(text: str, base: PlannerConfig) -> list[Arm]:
     """The arms of a text such as `full,actor,wide:init_std=1.0,num_iterations=6`; the reference always comes first.
 
     Args:
-        text: Known names, and `name:field=value,field=value` for settings that replace those of `base`.
+        text: Known names, and `name:field=value,field=value` for settings that replace settings of `base`.
         base: Settings of the search in the checkpoint.
 
     Raises:

@@ -54,7 +54,7 @@ class Request(ComposeRequest):
         at_least(self, batch=1, decisions=1)
         for name in ("domain", "preset", "action_dim"):
             if self.checkpoint is not None and getattr(self, name) is not None:
-                raise UserError(f"--{name.replace('_', '-')} has no effect with --checkpoint; give one of them")
+                raise UserError(f"--{name.replace('_', '-')} has no effect with --checkpoint; give one of the two")
 
 
 def run(request: Request) -> int:

@@ -49,7 +49,7 @@ class Request:
         seeds: Seeds of each task.
         frames: Simulator frames of each run; without frames and minutes, a run has the budget of the preset.
         minutes: Minutes of each run; with frames given too, a run ends at the first of the two limits.
-        thresholds: Evaluation returns for which the frames and minutes to reach them are reported.
+        thresholds: Evaluation returns; the frames and minutes until each of these returns are reported.
         mode: Agent whose evaluation returns are reported.
         out: Folder of the runs and results; finished runs in this folder are not repeated.
         preset: Machine class, as for training; None takes `gpu` where CUDA is usable, else `cpu`.

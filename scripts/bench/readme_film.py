@@ -17,7 +17,7 @@ from latentplan.config import EnvConfig
 from latentplan.envs import make_env
 from latentplan.reporting.film import PANEL_SIZE, compose_frame
 
-FIRST, LAST = 80, 190  # decisions of the film; before them the walker stands up and begins to walk
+FIRST, LAST = 80, 190  # decisions of the film, after the walker has stood up and begun to walk
 QUALITY = 60  # of the WebP encoder, in [0, 100]
 
 

@@ -52,7 +52,7 @@ class Trial:
 
         Args:
             mode: Mode of the agent.
-            settings: Settings of the search that replace those of the checkpoint.
+            settings: Settings of the search that replace the settings of the checkpoint.
             control_hz: Decisions per second of an environment that does not wait; None for one that waits.
             prepare: Changes the agent before it plays.
         """
@@ -97,7 +97,7 @@ def measure_replanning(trial: Trial) -> Iterator[Row]:
 def measure_error(trial: Trial) -> Iterator[Row]:
     """Yields the distance between imagined and observed latents and rewards by model steps, in episodes of the actor.
 
-    Each row also holds the errors of a model that predicts no change: latent and reward stay as they are at the start.
+    Each row also holds the errors of predicting no change, with latent and reward as at the start.
     """
     from latentplan.agents.checkpoint import load_agent
 

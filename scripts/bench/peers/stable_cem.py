@@ -44,10 +44,10 @@ def make_search(problem: Problem, model: WorldModel) -> Search:
     )
     space = gymnasium.spaces.Box(-1.0, 1.0, (1, problem.action_dim))
     solver.configure(action_space=space, n_envs=1, config=SimpleNamespace(horizon=problem.horizon, action_block=1))
-    nothing = {"start": torch.zeros(1, 1)}
+    info = {"start": torch.zeros(1, 1)}
 
     def search() -> Tensor:
-        plan: dict[str, Any] = solver.solve(nothing)
+        plan: dict[str, Any] = solver.solve(info)
         action: Tensor = plan["actions"][0, 0].clamp(-1.0, 1.0)
         return action
 
