@@ -11,7 +11,7 @@ from latentplan.agents.actor import ActorAgent
 from latentplan.agents.background import BackgroundAgent
 from latentplan.config import Config, PlannerConfig, UserError
 from latentplan.models import WorldModel
-from tests.agents.small_agents import SIZES
+from tests.agents.small_agents import SIZES, make_plain_model
 
 CONFIG = Config(
     model=SIZES,
@@ -21,16 +21,12 @@ CONFIG = Config(
 
 @pytest.fixture(scope="module")
 def model():
-    torch.manual_seed(0)
-    model = WorldModel(CONFIG.model, action_dim=2)
-    with torch.no_grad():
-        for head in (model.reward_head, model.actor):
-            head.mlp.output.weight.normal_(std=0.3)
-    return model
+    return make_plain_model()
 
 
 @pytest.fixture
 def film():
+    """Twelve frames of three environments, (time, environment, 64, 64, 3)."""
     return np.random.default_rng(0).integers(0, 256, (12, 3, 64, 64, 3), dtype=np.uint8)
 
 

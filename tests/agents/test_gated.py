@@ -11,8 +11,7 @@ from latentplan.agents.actor import ActorAgent
 from latentplan.agents.gated import SIGNALS, GatedAgent, RunningScale
 from latentplan.agents.planning import PlanningAgent
 from latentplan.config import Config, PlannerConfig
-from latentplan.models import WorldModel
-from tests.agents.small_agents import SIZES
+from tests.agents.small_agents import SIZES, make_plain_model
 
 CONFIG = Config(
     model=SIZES,
@@ -24,17 +23,12 @@ CONFIG = Config(
 
 @pytest.fixture(scope="module")
 def model():
-    torch.manual_seed(0)
-    model = WorldModel(CONFIG.model, action_dim=2)
-    with torch.no_grad():
-        for head in (model.reward_head, model.value_head, model.actor):
-            head.mlp.output.weight.normal_(std=0.3)
-    return model
+    return make_plain_model(heads=("reward_head", "value_head", "actor"))
 
 
 @pytest.fixture
 def film():
-    """Frames of three environments, (time, environment, 64, 64, 3)."""
+    """Forty frames of three environments, (time, environment, 64, 64, 3)."""
     return np.random.default_rng(0).integers(0, 256, (40, 3, 64, 64, 3), dtype=np.uint8)
 
 

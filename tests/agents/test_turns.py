@@ -13,12 +13,12 @@ from latentplan.agents.checkpoint import load_agent, save_checkpoint
 from latentplan.agents.export import export_actor
 from latentplan.agents.gated import GatedAgent
 from latentplan.agents.planning import PlanningAgent
-from latentplan.config import Config, LearningConfig, ModelConfig, PlannerConfig, UserError
-from latentplan.models import WorldModel
+from latentplan.config import Config, LearningConfig, UserError
+from tests.agents import small_agents
+from tests.agents.small_agents import make_plain_model
 
-SIZES = ModelConfig(deter_dim=16, hidden_dim=16, encoder_channels=(8, 8), decoder_channels=2, num_bins=15, turns=4)
-PLANNER = PlannerConfig(horizon=3, num_samples=24, num_elites=6, num_iterations=2, num_policy_samples=4)
-CONFIG = Config(model=SIZES, planner=PLANNER, learning=LearningConfig(turned_share=0.5))
+SIZES = dataclasses.replace(small_agents.SIZES, turns=4)
+CONFIG = dataclasses.replace(small_agents.CONFIG, model=SIZES, learning=LearningConfig(turned_share=0.5))
 INFO = {"domain": "reacher", "task": "easy", "env_frames": 1, "discount": 0.9}
 MAKERS = {
     "planner": lambda model: PlanningAgent(model, CONFIG, 0.9),
@@ -30,12 +30,7 @@ MAKERS = {
 
 @pytest.fixture(scope="module")
 def model():
-    torch.manual_seed(0)
-    model = WorldModel(SIZES, action_dim=2, labels={"distance": 0.1})
-    with torch.no_grad():
-        for head in (model.reward_head, model.value_head, model.actor):
-            head.mlp.output.weight.normal_(std=0.3)
-    return model
+    return make_plain_model(SIZES, ("reward_head", "value_head", "actor"), {"distance": 0.1})
 
 
 @pytest.fixture(params=list(MAKERS))
@@ -50,12 +45,6 @@ def make(request):
     for agent in made:
         if isinstance(agent, BackgroundAgent):
             agent.close()
-
-
-@pytest.fixture
-def film():
-    """Five frames of three environments, (time, environment, 64, 64, 3)."""
-    return np.random.default_rng(0).integers(0, 256, (5, 3, 64, 64, 3), dtype=np.uint8)
 
 
 def test_act_returns_one_action_per_frame(make, model, film):

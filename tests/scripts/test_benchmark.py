@@ -3,6 +3,7 @@
 import csv
 import importlib
 import json
+import sys
 from dataclasses import replace
 
 import benchmark
@@ -67,6 +68,11 @@ def test_main_refuses_bad_flags_in_one_line_that_names_the_flag(capsys, argument
     assert captured.err.startswith("error: ")
     assert captured.err.count("\n") == 1
     assert named in captured.err
+
+
+def test_benchmark_modules_do_not_shadow_the_standard_library(root):
+    names = {path.stem for path in (root / "scripts" / "bench").iterdir()}
+    assert not names & sys.stdlib_module_names
 
 
 def test_help_lists_every_command_and_every_flag(capsys):
