@@ -148,10 +148,10 @@ def measure_graph(config: Config, action_dim: int, device: torch.device, updates
 
 def synthetic_replay(config: Config, action_dim: int, device: torch.device) -> Replay:
     """A replay of random frames, actions and rewards, in episodes that are four sequences long."""
-    where = device if config.replay.on_device else torch.device("cpu")
+    storage = device if config.replay.on_device else torch.device("cpu")
     length = config.learning.sequence_length
     num_rows = max(NUM_ROWS, 8 * length)
-    replay = Replay(num_rows, action_dim, config.model.deter_dim, 1, where)
+    replay = Replay(num_rows, action_dim, config.model.deter_dim, 1, storage)
     rng = np.random.default_rng(0)
     rows = Rows(
         frames=rng.integers(0, 256, (num_rows, 64, 64, 3), dtype=np.uint8),

@@ -130,7 +130,7 @@ def test_act_keeps_a_pending_reset_when_a_decision_fails(model, film):
     assert np.allclose(agent.act(film[1]), fresh.act(film[1]), atol=1e-5)
 
 
-def test_set_objective_takes_the_goal_actor_at_once_when_the_model_learned_goals(film):
+def test_set_objective_changes_to_the_actor_of_a_learned_goal_at_once(film):
     torch.manual_seed(0)
     model = WorldModel(CONFIG.model, action_dim=2, labels={"cart": 1.0}, goal_dim=8)
     with torch.no_grad():

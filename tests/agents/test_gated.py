@@ -273,7 +273,7 @@ def test_running_scale_has_the_mean_and_std_of_all_values():
 
 
 @pytest.mark.parametrize(("options", "words"), [({"planning_budget": 1.2}, "1.2"), ({"signal": "noise"}, "mismatch")])
-def test_gated_agent_refuses_budgets_and_signals_that_do_not_exist(model, options, words):
+def test_gated_agent_refuses_a_budget_above_1_and_an_unknown_signal(model, options, words):
     with pytest.raises(ValueError, match=words):
         make(model, **options)
 
@@ -290,7 +290,7 @@ def test_gated_agent_executes_the_rest_of_the_plan_under_an_untrained_goal(model
     horizon = agent.controller.planner.horizon
     assert set(sources) == {"plan", "tail"} and sources[0] == "plan"
     longest = max(len(run) for run in "".join(source[0] for source in sources).split("p"))
-    assert 1 <= longest <= horizon - 1  # a search follows a plan that has run out
+    assert 1 <= longest <= horizon - 1  # a search follows the end of a plan
 
 
 def test_gated_agent_plans_at_once_when_an_objective_is_set(model, film):

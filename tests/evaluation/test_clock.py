@@ -46,7 +46,7 @@ def executor_on(clock):
 STATE = torch.zeros(1, 2)
 
 
-def test_executor_hands_over_a_plan_when_its_duration_has_passed():
+def test_executor_returns_a_plan_when_its_duration_has_passed():
     clock = VirtualClock(50.0, constant(0, 30))
     executor = executor_on(clock)
     clock.advance(3)  # 60 ms
@@ -61,7 +61,7 @@ def test_executor_hands_over_a_plan_when_its_duration_has_passed():
 
 
 @pytest.mark.parametrize("control_hz", [30.0, 60.0, 70.0, 90.0, 144.0])
-def test_executor_hands_over_a_plan_of_one_period_at_the_end_of_the_period(control_hz):
+def test_executor_returns_a_plan_of_one_period_at_the_end_of_the_period(control_hz):
     clock = VirtualClock(control_hz, constant(0, 1000.0 / control_hz))
     executor = executor_on(clock)
     for tick in range(1000):
@@ -71,7 +71,7 @@ def test_executor_hands_over_a_plan_of_one_period_at_the_end_of_the_period(contr
         assert executor.poll() is not None
 
 
-def test_executor_hands_over_a_plan_at_once_when_it_takes_no_time():
+def test_executor_returns_a_plan_at_once_when_it_takes_no_time():
     for clock in (VirtualClock(50.0, constant(0, 0)), VirtualClock(None, Latency())):
         executor = executor_on(clock)
         executor.request(STATE, tick=0)

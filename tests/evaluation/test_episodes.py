@@ -87,7 +87,7 @@ def test_run_episodes_plays_each_episode_independently_of_earlier_ones():
     assert together == alone[::-1]
 
 
-def test_run_episodes_seeds_the_agent_with_a_stream_of_its_own():
+def test_run_episodes_seeds_the_agent_with_another_seed_than_the_start():
     class Recorder(NoisyAgent):
         def seed(self, seed):
             self.given = seed

@@ -124,7 +124,7 @@ def test_zeros_clamped_into_the_bounds_hold_before_the_first_decision():
     assert tape[0][:3] == [0.25] * 3
 
 
-def test_action_comes_more_substeps_late_when_the_period_is_shorter():
+def test_action_is_delayed_by_more_substeps_when_the_period_is_shorter():
     slow, fast = (play(10.0, control_hz)[0][0] for control_hz in (10.0, 50.0))
     assert (slow.count(0.0), fast.count(0.0)) == (1, 5)
 

@@ -91,7 +91,7 @@ def test_block_of_an_own_model_runs(blocks):
     assert names["action"].item() < 0.0  # towards the origin from the right side
 
 
-def test_block_of_training_hands_over_the_config_and_the_environment(blocks, monkeypatch):
+def test_block_of_training_passes_the_config_and_the_environment(blocks, monkeypatch):
     calls = []
     signature = inspect.signature(latentplan.training.train)
     monkeypatch.setattr(latentplan.training, "train", lambda *given, **named: calls.append((given, named)))

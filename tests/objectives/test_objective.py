@@ -118,7 +118,7 @@ def test_build_objective_adds_the_guide_when_expression_has_no_return():
 
 
 @pytest.mark.parametrize(("use_value", "needs"), [(None, True), (True, True), (False, False)])
-def test_build_goals_uses_the_terminal_value_when_the_planner_may(use_value, needs):
+def test_build_goals_uses_the_terminal_value_if_the_planner_allows_it(use_value, needs):
     model = Cart()
     model.labels = SCALES
     goals = {"model": model, "env": EnvConfig(domain="cartpole", task="swingup"), "encode_goal": None}
@@ -135,7 +135,7 @@ def test_guide_is_a_quarter_of_the_return_at_the_rate_of_the_value(horizon, disc
     planner = CEMPlanner(action_dim=1, horizon=3, goal_horizon=horizon, discount=discount)
     env = EnvConfig(domain="cartpole", task="swingup")
     pursued, _ = build_goals("0 * cart", (), model=model, env=env, planner=planner, encode_goal=None)
-    end = [-0.1 / (1.0 - discount), 0.0]  # its value is that of a reward of one in every future step
+    end = [-0.1 / (1.0 - discount), 0.0]  # the value equals a reward of one in every future step
     rollout = rollout_of(torch.tensor([[[0.0, 0.0]], [end]]))
     beyond = terminal_value()(rollout).item() * (1.0 - discount)  # with the discount of this rollout at its end
     assert pursued(rollout).item() == pytest.approx(0.25 * horizon * beyond)

@@ -108,7 +108,7 @@ def test_read_run_names_the_folder_when_results_are_damaged(tmp_path, name, text
         read_run("walker-walk", 0, tmp_path, "planner")
 
 
-def test_interquartile_estimate_covers_the_truth_at_its_level_for_few_runs():
+def test_interquartile_estimate_covers_the_mean_at_its_confidence_level_for_few_runs():
     rng, held = np.random.default_rng(0), 0
     for _ in range(400):
         low, high = interquartile_estimate([rng.normal(size=2), rng.normal(size=3)])[1:]

@@ -77,7 +77,7 @@ def test_build_model_rewards_differ_between_states():
     assert returns.std() > 0.01
 
 
-def test_matrix_products_are_those_of_a_search_except_the_std_of_the_prior():
+def test_matrix_products_equal_a_search_without_the_std_of_the_prior():
     products = counted_flop(matrix_products(PROBLEM, "float32"))
     assert products == PROBLEM.iterations * sum(2 * m * k * n for m, k, n in product_shapes(PROBLEM))
     std = 2 * PROBLEM.iterations * PROBLEM.horizon * PROBLEM.samples * MODEL.hidden_dim * MODEL.latent_dim
