@@ -31,11 +31,11 @@ class CorrelatedNoise:
             is_new: Environments whose episode begins, (batch,) bool: their noise is independent of the past. None
                 stands for no environment.
         """
-        fresh, kept = torch.randn(like.shape, generator=generator, device=like.device), self.correlation
-        noise = fresh
-        if self.last is not None and kept > 0.0:
-            noise = kept * self.last + (1.0 - kept**2) ** 0.5 * fresh
-            noise = noise if is_new is None else torch.where(is_new[:, None], fresh, noise)
+        white = torch.randn(like.shape, generator=generator, device=like.device)
+        noise = white
+        if self.last is not None and self.correlation > 0.0:
+            noise = self.correlation * self.last + (1.0 - self.correlation**2) ** 0.5 * white
+            noise = noise if is_new is None else torch.where(is_new[:, None], white, noise)
         self.last = noise
         return noise
 

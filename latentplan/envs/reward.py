@@ -1,4 +1,4 @@
-"""Rewards that the user writes as an expression, in place of the task's reward."""
+"""Reward given by an expression over named quantities, in place of the task's reward."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from latentplan.objectives.parser import parse_reward
 
 
 class ObjectiveReward:
-    """The reward of one control step by an expression over a body's quantities.
+    """The reward of one control step: the value of an expression over the quantities of a body.
 
     Args:
         text: An expression in the language of test-time objectives, without `return`, goal images and later phases.

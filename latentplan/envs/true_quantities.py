@@ -56,11 +56,11 @@ def _walker(physics: Any) -> tuple[float, ...]:
     height, speed, upright = physics.torso_height(), physics.horizontal_velocity(), physics.torso_upright()
     standing = _tolerance(height, (_WALKER_STAND_HEIGHT, np.inf), margin=_WALKER_STAND_HEIGHT / 2)
     stand = (3 * standing + (1 + upright) / 2) / 4
-    moving = [stand * (5 * _reached(speed, goal, abs(goal) / 2, 0.5) + 1) / 6 for goal in _WALKER_SPEEDS]
+    moving = [stand * (5 * _speed_reward(speed, goal, abs(goal) / 2, 0.5) + 1) / 6 for goal in _WALKER_SPEEDS]
     return (height, speed, upright, stand, *moving)
 
 
-def _reached(speed: float, goal: float, margin: float, value_at_margin: float) -> float:
+def _speed_reward(speed: float, goal: float, margin: float, value_at_margin: float) -> float:
     """The suite's reward for a speed of at least `goal`, in the direction of the goal's sign."""
     bounds = (abs(goal), np.inf)
     along = float(np.sign(goal) * speed)
@@ -80,7 +80,9 @@ def _cartpole(physics: Any) -> tuple[float, ...]:
 
 def _cheetah(physics: Any) -> tuple[float, ...]:
     speed, torso = physics.speed(), physics.named.data.xmat["torso", "zz"]
-    rewards = [_reached(speed, goal, _CHEETAH_RUN_SPEED, 0.0) for goal in (_CHEETAH_RUN_SPEED, -_CHEETAH_RUN_SPEED)]
+    rewards = [
+        _speed_reward(speed, goal, _CHEETAH_RUN_SPEED, 0.0) for goal in (_CHEETAH_RUN_SPEED, -_CHEETAH_RUN_SPEED)
+    ]
     return (speed, physics.named.data.xpos["torso", "z"], torso, *rewards)
 
 

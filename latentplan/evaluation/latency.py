@@ -15,8 +15,7 @@ from latentplan.config import UserError, derive_seed
 
 MEASURED = "measured"
 _FORMATS = 'a JSON list of milliseconds, {"decision_ms": [...]}, or one number per line'
-
-_LONGEST_MS = 1e9  # eleven days
+_MAX_MS = 1e9  # eleven days
 
 Milliseconds = NDArray[np.float64]
 Charge = Callable[[float], float]  # from measured milliseconds to charged milliseconds
@@ -44,10 +43,9 @@ class Latency:
         return self.decision_ms is not None
 
     def charges(self, seed: int) -> tuple[Charge, Charge]:
-        """The charges of decisions and of plans in an episode: two streams that depend on its seed alone."""
-        return _charge(self.decision_ms, derive_seed(seed, "decision_ms")), _charge(
-            self.plan_ms, derive_seed(seed, "plan_ms")
-        )
+        """The charges of decisions and of plans in an episode: two random streams that depend on the seed alone."""
+        decision = _make_charge(self.decision_ms, derive_seed(seed, "decision_ms"))
+        return decision, _make_charge(self.plan_ms, derive_seed(seed, "plan_ms"))
 
 
 def read_latency(text: str) -> Latency:
@@ -61,7 +59,7 @@ def read_latency(text: str) -> Latency:
     if text == MEASURED:
         return Latency()
     try:
-        content = _parsed(Path(text).read_text())
+        content = _parse(Path(text).read_text())
     except OSError as error:
         raise UserError(f"--latency {text}: {error.strerror}; give {MEASURED!r} or a file of milliseconds") from None
     except (ValueError, RecursionError):
@@ -70,20 +68,20 @@ def read_latency(text: str) -> Latency:
     unknown = [name for name in durations if name not in ("decision_ms", "plan_ms")]
     if unknown or "decision_ms" not in durations:
         raise UserError(f"--latency {text}: the keys are decision_ms and, if plans differ, plan_ms; got {unknown}")
-    decision_ms = _checked(text, "decision_ms", durations["decision_ms"])
-    plan_ms = _checked(text, "plan_ms", durations["plan_ms"]) if "plan_ms" in durations else decision_ms
+    decision_ms = _check_durations(text, "decision_ms", durations["decision_ms"])
+    plan_ms = _check_durations(text, "plan_ms", durations["plan_ms"]) if "plan_ms" in durations else decision_ms
     return Latency(text, decision_ms, plan_ms)
 
 
-def _charge(durations: Milliseconds | None, seed: int) -> Charge:
+def _make_charge(durations: Milliseconds | None, seed: int) -> Charge:
     if durations is None:
         return lambda measured_ms: measured_ms
     rng, known = np.random.default_rng(seed), durations
     return lambda measured_ms: float(rng.choice(known))
 
 
-def _parsed(text: str) -> Any:
-    """The content of a file of durations: JSON, else one number per line."""
+def _parse(text: str) -> Any:
+    """The content of a file of durations, as JSON or as one number per line."""
     try:
         content = json.loads(text)
     except json.JSONDecodeError:
@@ -91,11 +89,11 @@ def _parsed(text: str) -> Any:
     return content if isinstance(content, list | dict) else [content]
 
 
-def _checked(text: str, name: str, values: Any) -> Milliseconds:
+def _check_durations(text: str, name: str, values: Any) -> Milliseconds:
     if not isinstance(values, list) or not values:
         raise UserError(f"--latency {text}: {name} must be a list of at least one number; write {_FORMATS}")
     for value in values:
         is_number = isinstance(value, int | float) and not isinstance(value, bool)
-        if not is_number or not 0 <= value <= _LONGEST_MS:  # NaN is in no interval
-            raise UserError(f"--latency {text}: {name} must lie in 0 to {_LONGEST_MS:g}, got {value!r}")
+        if not is_number or not 0 <= value <= _MAX_MS:  # NaN is in no interval
+            raise UserError(f"--latency {text}: {name} must lie in 0 to {_MAX_MS:g}, got {value!r}")
     return np.asarray(values, dtype=np.float64)

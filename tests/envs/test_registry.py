@@ -1,4 +1,4 @@
-"""The table of environment suites: an entry is enough to train and evaluate in a new suite."""
+"""The table of environment suites: one entry is enough to train and evaluate in a new suite."""
 
 import csv
 import json
@@ -56,7 +56,7 @@ def test_make_env_calls_the_factory_of_the_suite():
         ({"suite": ["lamps"]}, r"unknown suite \['lamps'\]"),
     ],
 )
-def test_unknown_names_are_refused_before_anything_is_made(config, message):
+def test_compose_refuses_unknown_suites_and_domains(config, message):
     with pytest.raises(UserError, match=message):
         compose({"env": config}, {}, "cpu")
 

@@ -1,4 +1,4 @@
-"""Latencies: files of durations, and what is charged for decisions and plans."""
+"""Latencies: files of durations, and the charges of decisions and plans."""
 
 import json
 

@@ -1,4 +1,4 @@
-"""Every example runs, and what it prints and draws is what it promises."""
+"""Every example runs, prints the expected numbers and draws its picture."""
 
 import ast
 import re
@@ -31,7 +31,7 @@ def run_example(root, run_python, tmp_path):
 
 
 def assert_is_drawn(path):
-    """The picture can be read, is of a size to look at, and is not blank."""
+    """The picture can be read, has at least 300 x 300 pixels, and is not blank."""
     picture = cv2.imread(str(path))
     assert picture.shape[0] >= 300 and picture.shape[1] >= 300
     assert picture.std() > 10.0

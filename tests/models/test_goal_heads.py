@@ -90,10 +90,10 @@ def test_box_view_value_and_policy_depend_on_the_box(knowing, state):
 
 
 def test_plan_for_a_box_accepts_constraints(knowing, state):
-    from latentplan.objectives.objective import plan_constraint
+    from latentplan.objectives.objective import build_constraint
     from latentplan.objectives.parser import parse_constraints
 
     planner = CEMPlanner(action_dim=3, horizon=3, num_samples=16, num_elites=4, num_policy_samples=4)
-    constraint = plan_constraint(parse_constraints("height < 0.3", LABELS))
+    constraint = build_constraint(parse_constraints("height < 0.3", LABELS))
     plan = planner.plan(knowing, state, objective=conditioned(BoxView(GOAL, 2)), constraints=[constraint])
     assert plan.actions.shape == (5, 3, 3) and plan.info["violation"].shape == (5,)
