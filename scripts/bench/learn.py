@@ -17,8 +17,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
+from bench.anchors import FRAMES, published_returns_of
 from bench.learn_plot import Curve, Point, plot_runs
-from bench.published_returns import FRAMES, published_returns_of
 from bench.report import format_interval, format_number, format_table, write_csv, write_json
 from latentplan.commands import train
 from latentplan.commands.flags import overrides, read_request

@@ -7,10 +7,10 @@ from dataclasses import replace
 import benchmark
 import numpy as np
 import pytest
+from bench.anchors import METHODS, published_returns_of
 from bench.estimates import interquartile_estimate, mean_estimate
 from bench.learn import check_same, compare, first_reaching, read_run, run_facts
 from bench.learn_plot import MARKERS, Curve, Point
-from bench.published_returns import METHODS, published_returns_of
 
 from latentplan.config import Config, EnvConfig, PlannerConfig, RunConfig, UserError
 from latentplan.config.files import dump_config
