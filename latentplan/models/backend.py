@@ -8,7 +8,8 @@ same results up to rounding; `latentplan.models.fast.accelerate` chooses one for
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, Any
+from functools import partial
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -17,6 +18,23 @@ from latentplan.models.dynamics import Gaussian, State
 
 if TYPE_CHECKING:
     from latentplan.models.world_model import WorldModel
+
+
+class FrameFunctions(NamedTuple):
+    """Belief update and actor of a model for one frame per row, with the weights that the model had when asked.
+
+    The results are float32 and carry no gradients.
+
+    Attributes:
+        advance: `advance(state, action)` returns the deterministic state (rows, deter) after action (rows, action).
+        see: `see(deter, frames)` returns the belief, with the posterior's mean, for deter (rows, deter) and uint8
+            frames (rows, 64, 64, 3).
+        act: `act(state)` returns mean in [-1, 1] and std of the actor's action, (rows, action) each.
+    """
+
+    advance: Callable[[State, Tensor], Tensor]
+    see: Callable[[Tensor, Tensor], State]
+    act: Callable[[State], tuple[Tensor, Tensor]]
 
 
 class Backend:
@@ -79,20 +97,11 @@ class Backend:
         with model.trunk_precision():
             return model.value_head.mean(model.value_head(state.features))
 
-    # For agents, which get one frame at a time: float32 and without gradients.
+    # For agents, which get one frame at a time.
 
-    def advance(self, model: WorldModel, state: State, action: Tensor) -> Tensor:
-        """The deterministic state (rows, deter) after action (rows, action)."""
-        return model.dynamics.advance(state, action)
-
-    def see(self, model: WorldModel, deter: Tensor, frames: Tensor) -> State:
-        """The belief with the posterior's mean for deter (rows, deter) and uint8 frames (rows, 64, 64, 3)."""
-        return model.see(deter, frames)
-
-    def act(self, model: WorldModel, state: State) -> tuple[Tensor, Tensor]:
-        """Mean in [-1, 1] and std of the actor's action, (rows, action) each."""
-        mean, std = model.actor(state.features)
-        return mean, std
+    def frame_functions(self, model: WorldModel) -> FrameFunctions:
+        """Belief update and actor with the model's present weights; an agent asks again at every decision."""
+        return FrameFunctions(model.dynamics.advance, model.see, partial(_act, model))
 
     # For learners, with gradients.
 
@@ -121,6 +130,11 @@ class Backend:
         """Move each of the slow tensors by a share in [0, 1] of its distance to the fast one, in place."""
         for one, other in zip(slow, fast, strict=True):
             one.lerp_(other, rate)
+
+
+def _act(model: WorldModel, state: State) -> tuple[Tensor, Tensor]:
+    mean, std = model.actor(state.features)
+    return mean, std
 
 
 def _advance_by_mean(model: WorldModel, state: State, action: Tensor) -> State:

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Hashable, Sequence
+from functools import partial
 from operator import attrgetter
 from typing import Any
 
 import torch
 from torch import Tensor, nn
 
-from latentplan.models.backend import Backend
+from latentplan.models.backend import Backend, FrameFunctions
 from latentplan.models.dynamics import Gaussian, Rssm, State
 from latentplan.models.fast import compiled, one_frame, pointwise, unroll
 from latentplan.models.fast import rollout as rollouts
@@ -67,7 +68,7 @@ class _ConvertingBackend(Backend):
     def __init__(self, trunk_dtype: torch.dtype) -> None:
         super().__init__(trunk_dtype)
         self._rollout_weights = ConvertedWeights(ROLLOUT_PARTS, _convert_for_rollouts)
-        self._frame_weights = ConvertedWeights(FRAME_PARTS, _convert_for_frames)
+        self._frame_functions = ConvertedWeights(FRAME_PARTS, _convert_for_frames)
 
     @staticmethod
     def can_compute(model: WorldModel) -> bool:
@@ -82,17 +83,10 @@ class _ConvertingBackend(Backend):
         """See `Backend.propose`; gradients do not reach the weights."""
         return rollouts.propose(self._weights(model), state, noise)
 
-    def advance(self, model: WorldModel, state: State, action: Tensor) -> Tensor:
-        """See `Backend.advance`."""
-        return one_frame.advance(self._frame_weights.of(model, torch.float32), state, action)
-
-    def see(self, model: WorldModel, deter: Tensor, frames: Tensor) -> State:
-        """See `Backend.see`."""
-        return one_frame.see(self._frame_weights.of(model, torch.float32), deter, frames)
-
-    def act(self, model: WorldModel, state: State) -> tuple[Tensor, Tensor]:
-        """See `Backend.act`."""
-        return one_frame.act(self._frame_weights.of(model, torch.float32), state)
+    def frame_functions(self, model: WorldModel) -> FrameFunctions:
+        """See `Backend.frame_functions`."""
+        functions: FrameFunctions = self._frame_functions.of(model, torch.float32)
+        return functions
 
     def _weights(self, model: WorldModel) -> rollouts.Weights:
         kind = model.device.type
@@ -167,5 +161,7 @@ def _convert_for_rollouts(model: WorldModel, dtype: torch.dtype) -> rollouts.Wei
     return rollouts.convert_weights(model.dynamics, model.reward_head, model.value_head, model.actor, dtype)
 
 
-def _convert_for_frames(model: WorldModel, dtype: torch.dtype) -> one_frame.FrameWeights:
-    return one_frame.convert_weights(model)
+def _convert_for_frames(model: WorldModel, dtype: torch.dtype) -> FrameFunctions:
+    weights = one_frame.convert_weights(model)
+    advance, see, act = (partial(function, weights) for function in (one_frame.advance, one_frame.see, one_frame.act))
+    return FrameFunctions(advance, see, act)
