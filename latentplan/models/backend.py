@@ -1,8 +1,8 @@
 """The computations of a world model that can be made faster, and their reference in plain torch.
 
-A `WorldModel` asks its backend for everything that planners, agents and learners need often. `Backend` is the
+A `WorldModel` leaves to its backend every computation that planners, agents and learners need often. `Backend` is the
 reference: it works on every device, with every kind of dynamics. The backends in `latentplan.models.fast` return the
-same results up to rounding; `latentplan.models.fast.accelerate` chooses one for a model.
+same results up to rounding; `latentplan.models.fast.accelerate` chooses the backend of a model.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ class Backend:
     # For planners.
 
     def step(self, model: WorldModel, state: State, action: Tensor) -> tuple[State, Tensor]:
-        """The state after action (rows, action) by the mean of the prior, and the reward (rows,); passes gradients."""
+        """The state after action (rows, action), by the mean of the prior, and the reward (rows,); passes gradients."""
         with model.trunk_precision():
             following = _advance_by_mean(model, state, action)
             return following, model.reward_head.mean(model.reward_head(following.features))
@@ -63,7 +63,7 @@ class Backend:
         return self.step(model, state, action)
 
     def rollout(self, model: WorldModel, state: State, actions: Tensor) -> tuple[Tensor, State]:
-        """Repeated steps along actions (rows, horizon, action).
+        """Rewards and last state of repeated steps along actions (rows, horizon, action).
 
         Gradients reach the state and the actions. A faster backend need not pass gradients to the weights.
 
@@ -127,9 +127,15 @@ class Backend:
 
     @torch.no_grad()
     def move_towards(self, slow: Sequence[Tensor], fast: Sequence[Tensor], rate: float | Tensor) -> None:
-        """Move each of the slow tensors by a share in [0, 1] of its distance to the fast one, in place."""
-        for one, other in zip(slow, fast, strict=True):
-            one.lerp_(other, rate)
+        """Moves each slow tensor towards the fast tensor at its place, by the share `rate` of their distance, in place.
+
+        Args:
+            slow: Tensors that are changed, such as averaged weights.
+            fast: Tensors of the same shapes.
+            rate: Share of the distance, in [0, 1].
+        """
+        for slow_tensor, fast_tensor in zip(slow, fast, strict=True):
+            slow_tensor.lerp_(fast_tensor, rate)
 
 
 def _act(model: WorldModel, state: State) -> tuple[Tensor, Tensor]:
