@@ -16,7 +16,7 @@ UPDATE_SHIFT = 1.0  # subtracted before the update gate's sigmoid, so that untra
 
 
 class State(NamedTuple):
-    """A latent state: the deterministic state of the GRU, `deter` (rows, deter), and the latent, `stoch` (rows, latent)."""
+    """A latent state: the GRU's deterministic state `deter` (rows, deter), and the latent `stoch` (rows, latent)."""
 
     deter: Tensor
     stoch: Tensor

@@ -22,14 +22,14 @@ _version_of = attrgetter("_version")  # a count of writes in place
 
 
 class ConvertedWeights:
-    """A converted copy of some weights, made again when one of them was replaced or written to in place.
+    """A conversion of some weights, made again when one of these weights was replaced or changed in place.
 
-    Writes through `parameter.data` go unnoticed. A copy or a pickle of this object starts empty, because converted
+    Changes in place of `parameter.data` go unnoticed. A copy or a pickle of this object starts empty, because converted
     weights can hold pointers.
 
     Args:
         parts: Names of the model's modules whose weights are converted.
-        convert: Makes the converted weights of a model, with products in a dtype.
+        convert: `convert(model, dtype)` returns the conversion for matrix products in this dtype.
     """
 
     def __init__(self, parts: tuple[str, ...], convert: Callable[[WorldModel, torch.dtype], Any]) -> None:
@@ -41,7 +41,7 @@ class ConvertedWeights:
         return {**self.__dict__, "_places": None, "_kept": None}
 
     def of(self, model: WorldModel, dtype: torch.dtype) -> Any:
-        """The converted weights of a model as they are now."""
+        """The conversion of the model's present weights, for matrix products in a dtype."""
         parameters = self._parameters(model)
         if parameters[0].is_inference():  # torch does not count writes to such tensors
             return self._convert(model, dtype)
@@ -53,7 +53,10 @@ class ConvertedWeights:
         return kept[1]
 
     def _parameters(self, model: WorldModel) -> list[Tensor]:
-        """The parameters of the parts; where they are is kept, because a walk through modules outlasts a step."""
+        """The parameters of the parts.
+
+        The dictionary and name of each parameter are kept, because a walk through all modules takes longer than a step.
+        """
         parts, places = tuple(map(model._modules.get, self._parts)), self._places
         if places is None or places[0] != parts:
             owners = [module._parameters for part in parts if part is not None for module in part.modules()]
@@ -63,7 +66,7 @@ class ConvertedWeights:
 
 
 class _ConvertingBackend(Backend):
-    """Rollouts and single frames with weights that are converted once, for dynamics of the class `Rssm`."""
+    """Rollouts and single frames with weights that are converted once, for dynamics of class `Rssm`."""
 
     def __init__(self, trunk_dtype: torch.dtype) -> None:
         super().__init__(trunk_dtype)
@@ -97,7 +100,7 @@ class _ConvertingBackend(Backend):
 
 
 class CpuBackend(_ConvertingBackend):
-    """Rollouts, steps and values in one compiled call each, where the processor multiplies bfloat16; else torch."""
+    """One compiled call for each rollout, step and value if the processor multiplies bfloat16; else calls of torch."""
 
     def __init__(self) -> None:
         super().__init__(torch.bfloat16)
@@ -122,8 +125,8 @@ class CpuBackend(_ConvertingBackend):
 class GpuBackend(_ConvertingBackend):
     """Fewer kernels per step: the gradients of the recurrence are written out, and elementwise work is compiled.
 
-    The trunk is float32, because converting operands takes longer than products of this size save. Where the tensors
-    are on a CPU the same arithmetic runs uncompiled.
+    The trunk is float32, because converting operands takes longer than products of this size save. For tensors on a CPU
+    the same arithmetic runs uncompiled.
     """
 
     def __init__(self) -> None:
@@ -163,5 +166,6 @@ def _convert_for_rollouts(model: WorldModel, dtype: torch.dtype) -> rollouts.Wei
 
 def _convert_for_frames(model: WorldModel, dtype: torch.dtype) -> FrameFunctions:
     weights = one_frame.convert_weights(model)
-    advance, see, act = (partial(function, weights) for function in (one_frame.advance, one_frame.see, one_frame.act))
-    return FrameFunctions(advance, see, act)
+    return FrameFunctions(
+        partial(one_frame.advance, weights), partial(one_frame.see, weights), partial(one_frame.act, weights)
+    )
