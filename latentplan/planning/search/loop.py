@@ -24,7 +24,7 @@ from torch import Tensor
 from torch.utils._pytree import tree_map
 
 from latentplan.planning.model import Model, State, action_dtype, count_rows, state_device, supports
-from latentplan.planning.objectives import Constraint, Term, seen_for
+from latentplan.planning.objectives import Constraint, Term, apply_view
 from latentplan.planning.plan import Plan, WarmStart, shift_plan
 from latentplan.planning.search.deadline import Budget, Pace
 from latentplan.planning.search.elites import Elites, Scores, mean_return, move_towards, select_elites
@@ -128,7 +128,7 @@ class Search:
     """
 
     def __init__(self, options: SearchOptions, problem: Problem, generator: Generators) -> None:
-        model, objective = seen_for(problem.model, problem.objective)
+        model, objective = apply_view(problem.model, problem.objective)
         self.options, self.model, self.state = options, model, problem.state
         self.batch, self.device = count_rows(self.state), state_device(self.state)
         self.dtype = action_dtype(self.state)
