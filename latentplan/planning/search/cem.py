@@ -10,13 +10,12 @@ from typing import Any
 
 import torch
 
-from latentplan.config.search import WIDEST_STD, check_whole
+from latentplan.config.search import WIDEST_STD, SearchOptions, check_whole
 from latentplan.planning.model import Bound, Model, State, per_dimension
 from latentplan.planning.objectives import Constraint, Term
 from latentplan.planning.plan import Plan
 from latentplan.planning.search.deadline import Pace
 from latentplan.planning.search.loop import Problem, Search
-from latentplan.planning.search.options import SearchOptions
 from latentplan.planning.search.sampling import Generators
 
 

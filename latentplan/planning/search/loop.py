@@ -23,13 +23,13 @@ import torch
 from torch import Tensor
 from torch.utils._pytree import tree_map
 
+from latentplan.config.search import SearchOptions
 from latentplan.planning.model import Model, State, action_dtype, count_rows, state_device, supports
 from latentplan.planning.objectives import Constraint, Term, apply_view
 from latentplan.planning.plan import Plan, WarmStart, shift_plan
 from latentplan.planning.search.deadline import Budget, Pace
 from latentplan.planning.search.elites import Elites, Scores, mean_return, move_towards, select_elites
 from latentplan.planning.search.gradient import ascend
-from latentplan.planning.search.options import SearchOptions
 from latentplan.planning.search.sampling import Generators, Streams
 from latentplan.planning.search.scorer import Scorer
 

@@ -11,11 +11,11 @@ from collections.abc import Callable, Sequence
 from typing import Any, Protocol
 
 from latentplan.config import UserError
+from latentplan.config.search import SearchOptions
 from latentplan.planning.model import Bound, State
 from latentplan.planning.objectives import Constraint, Term
 from latentplan.planning.plan import Plan
 from latentplan.planning.search.cem import CEMPlanner, icem_planner, mppi_planner
-from latentplan.planning.search.options import SearchOptions
 from latentplan.planning.search.sampling import Generators
 
 

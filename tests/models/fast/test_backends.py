@@ -1,4 +1,4 @@
-"""Every fast path returns what the reference returns."""
+"""Every fast path returns the results of the reference."""
 
 import pytest
 import torch
