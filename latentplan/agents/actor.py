@@ -42,7 +42,7 @@ class ActorAgent(ModelAgent):
         return super().act(frame)
 
     def _choose(self, state: State) -> Tensor:
-        raw = self.model.backend.act(self.model, flat(state))
+        raw = self._frame_functions.act(flat(state))
         mean, std = (mean_over_turns(part, state) for part in raw)
         if not self.explore:
             return mean

@@ -12,6 +12,7 @@ from torch import Tensor
 from latentplan.agents.noise import CorrelatedNoise
 from latentplan.config import Config
 from latentplan.models import State, WorldModel
+from latentplan.models.backend import FrameFunctions
 from latentplan.models.symmetry import TurnedModel, first_turn, flat, folded, per_turn, turned
 from latentplan.objectives.expression import Expression
 from latentplan.objectives.objective import build_goals, read_goal_image
@@ -64,6 +65,7 @@ class ModelAgent:
 
     last_source: str | list[str] = "actor"
     steps_ahead: int = 0
+    _frame_functions: FrameFunctions  # with the weights of the present decision
 
     def __init__(
         self,
@@ -119,6 +121,7 @@ class ModelAgent:
         """
         single = frame.ndim == 3
         frames = self._check_frames(frame[None] if single else frame)
+        self._frame_functions = self.model.backend.frame_functions(self.model)
         state = self._update_belief(frames)
         action = self._choose(state)
         if self.noise_std > 0.0:
@@ -187,14 +190,14 @@ class ModelAgent:
         frames, turns = turned(frames, self._turns), self._turns
         if self.state is None or self._action is None:
             return folded(self._posterior(self.model.dynamics.initial(len(frames)).deter, frames), turns)
-        deter = self.model.backend.advance(self.model, flat(self.state), per_turn(self._action, turns))
+        deter = self._frame_functions.advance(flat(self.state), per_turn(self._action, turns))
         if self._is_reset is not None:
             deter = torch.where(per_turn(self._is_reset, turns)[:, None], 0.0, deter)
         return folded(self._posterior(deter, frames), turns)
 
     def _posterior(self, deter: Tensor, frames: Tensor) -> State:
         """The state at the posterior's mean, for the GRU's state (rows, deter) and frames (rows, 64, 64, 3)."""
-        return self.model.backend.see(self.model, deter, frames)
+        return self._frame_functions.see(deter, frames)
 
     def _check_frames(self, frames: np.ndarray) -> Tensor:
         """The frames (batch, 64, 64, 3) on the model's device.

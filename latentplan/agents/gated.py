@@ -16,7 +16,7 @@ from latentplan.config import Config, PlannerConfig
 from latentplan.models import State, WorldModel, kl_divergence
 from latentplan.models.symmetry import flat, mean_over_turns
 from latentplan.objectives.expression import Expression
-from latentplan.planning.objectives import Constraint, Term, seen_for
+from latentplan.planning.objectives import Constraint, Term, apply_view
 
 SIGNALS = ("mismatch", "value", "both", "random")
 GAP_STEPS = 2  # one model step costs about as much as encoding the frame
@@ -106,7 +106,7 @@ class GatedAgent(PlanningAgent):
     ) -> None:
         """See `PlanningAgent.set_objective`."""
         super().set_objective(objective, constraints)
-        self._actor_model, _ = seen_for(self.imagined, self.controller.objective)
+        self._actor_model, _ = apply_view(self.imagined, self.controller.objective)
 
     @property
     def planned_fraction(self) -> float:

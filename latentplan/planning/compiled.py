@@ -29,14 +29,16 @@ def compile_rollout(model: Model, **options: Any) -> Model:
     Raises:
         torch._dynamo.exc.BackendCompilerFailed: While planning, if torch finds no C++ compiler.
     """
-    return _Compiled(model, options)
+    return _CompiledModel(model, options)
 
 
-class _Compiled:
+class _CompiledModel:
+    """A model around another one, with a compiled rollout."""
+
     def __init__(self, model: Model, options: dict[str, Any]) -> None:
         self._model, self._options = model, options
-        own = model.rollout if supports(model, "rollout") else partial(_step_through, model)  # type: ignore[attr-defined]
-        self.rollout = torch.compile(own, **options)
+        rollout = model.rollout if supports(model, "rollout") else partial(_step_through, model)  # type: ignore[attr-defined]
+        self.rollout = torch.compile(rollout, **options)
 
     def __getattr__(self, name: str) -> Any:  # called for attributes that this class lacks
         return getattr(self._model, name)
@@ -49,6 +51,7 @@ class _Compiled:
 
 
 def _step_through(model: Model, state: State, actions: Tensor) -> tuple[Tensor, State]:
+    """Returns rewards (rows, horizon) and the last state of steps along actions (rows, horizon, action)."""
     rewards = []
     for step in range(actions.shape[1]):
         state, reward = take_step(model, state, actions[:, step])

@@ -10,7 +10,7 @@ A model needs one method, `step`. Optional methods and attributes are detected b
     rollout(state, actions (rows, horizon, action)) -> (rewards (rows, horizon), last_state)     fused fast path
     fast_step(state, action)                         the same as step, faster; need not pass gradients
     propose(state, num, horizon, generators) -> actions (batch num, horizon, action)    fused: sequences of the policy,
-                                                     its mode first, then samples, one generator per row of state
+                                                     the mode first, then samples, one generator per row of state
     particles(state, num) -> state                   `num` versions of each row, batch-major: (batch num) rows
     num_particles                                    number of versions in which every candidate is scored, default 1
 

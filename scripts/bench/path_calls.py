@@ -36,8 +36,8 @@ def frame_calls(model: WorldModel) -> Calls:
 
     @torch.inference_mode()
     def decide(model: WorldModel) -> Any:
-        deter = model.backend.advance(model, state, action)
-        return model.backend.act(model, model.backend.see(model, deter, frames))
+        advance, see, act = model.backend.frame_functions(model)
+        return act(see(advance(state, action), frames))
 
     return {"one frame": decide}
 
