@@ -109,7 +109,7 @@ def load_model(path: str | Path, device: str = "cpu") -> tuple[WorldModel, Confi
         state = {name: value.float() for name, value in load_file(weights).items()}
         model.load_state_dict(state)
     except (RuntimeError, SafetensorError, TypeError, ValueError) as error:
-        raise UserError(f"{weights} does not fit its own settings: {str(error).splitlines()[0]}") from None
+        raise UserError(f"{weights} does not fit its own settings: {str(error).splitlines()[-1].strip()}") from None
     if broken := _first_not_finite(state):
         raise UserError(f"{weights} cannot be used: {broken} is not finite")
     try:

@@ -93,7 +93,7 @@ def export_actor(agent_or_checkpoint: ModelAgent | str | Path, path: str | Path,
         model = agent_or_checkpoint.model
     else:
         model, _, _ = load_model(agent_or_checkpoint)
-    if not isinstance(model.dynamics, Rssm):
+    if type(model.dynamics) is not Rssm:
         raise UserError(
             f"only agents with dynamics of the class Rssm can be exported, got {type(model.dynamics).__name__}"
         )

@@ -37,7 +37,9 @@ class Gaussian(NamedTuple):
 class Dynamics(nn.Module):
     """Transitions of latent states. A subclass defines single steps; this class computes sequences of steps.
 
-    A subclass sets `latent_dim` and `deter_dim`, and defines `advance`, `prior` and `posterior`.
+    A subclass sets `latent_dim` and `deter_dim`, and defines `advance`, `prior` and `posterior`. Everything that it
+    remembers is in `deter`: one vector of `ModelConfig.deter_dim` numbers per row, zeros at the start of an episode,
+    which the replay stores in float16.
     """
 
     latent_dim: int

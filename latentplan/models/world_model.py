@@ -12,7 +12,7 @@ from latentplan.config import ModelConfig
 from latentplan.config.quantities import TASK_PREFIX
 from latentplan.models.backend import Backend
 from latentplan.models.decoder import Decoder
-from latentplan.models.dynamics import Rssm, State
+from latentplan.models.dynamics import Dynamics, Rssm, State
 from latentplan.models.encoder import Encoder
 from latentplan.models.goal_heads import GoalHeads
 from latentplan.models.heads import Actor, Mlp, ScalarHead, sample_action
@@ -45,7 +45,9 @@ class WorldModel(nn.Module):
         self.config, self.action_dim, self.labels = config, action_dim, dict(labels or {})
         embedding_dim, features = config.hidden_dim, config.deter_dim + config.latent_dim
         self.encoder = Encoder(config.encoder_channels, embedding_dim)
-        self.dynamics = Rssm(config.latent_dim, config.deter_dim, config.hidden_dim, action_dim, embedding_dim)
+        self.dynamics: Dynamics = Rssm(
+            config.latent_dim, config.deter_dim, config.hidden_dim, action_dim, embedding_dim
+        )
         self.decoder = Decoder(features, config.decoder_channels)
         self.reward_head = ScalarHead(features, config.hidden_dim, config.num_bins)
         self.continue_head = Mlp(features, config.hidden_dim, 1)
@@ -77,7 +79,7 @@ class WorldModel(nn.Module):
     @property
     def device(self) -> torch.device:
         """The device of the parameters."""
-        return self.dynamics.prior_output.weight.device
+        return self.label_scales.device
 
     @property
     def label_names(self) -> tuple[str, ...]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Hashable, Sequence
 from functools import partial
 from operator import attrgetter
-from typing import Any
+from typing import Any, cast
 
 import torch
 from torch import Tensor, nn
@@ -136,17 +136,17 @@ class GpuBackend(_ConvertingBackend):
         self, model: WorldModel, embeddings: Tensor, actions: Tensor, deter: Tensor, noise: Tensor
     ) -> tuple[State, Gaussian]:
         """See `Backend.observe`."""
-        return unroll.observe(model.dynamics, embeddings, actions, deter, noise)
+        return unroll.observe(_rssm(model), embeddings, actions, deter, noise)
 
     def predict(self, model: WorldModel, start: State, actions: Tensor) -> tuple[Tensor, Gaussian]:
         """See `Backend.predict`."""
-        return unroll.predict(model.dynamics, start, actions)
+        return unroll.predict(_rssm(model), start, actions)
 
     def imagine(
         self, model: WorldModel, start: State, action_noise: Tensor, noise: Tensor, decay: float
     ) -> tuple[Tensor, Tensor]:
         """See `Backend.imagine`; the weights of the dynamics get no gradient."""
-        return unroll.imagine(model.dynamics, model.actor, start, action_noise, noise, decay)
+        return unroll.imagine(_rssm(model), model.actor, start, action_noise, noise, decay)
 
     def call(self, function: Callable[..., Any], *arguments: Any) -> Any:
         """See `Backend.call`."""
@@ -160,8 +160,12 @@ class GpuBackend(_ConvertingBackend):
         torch._foreach_add_(list(slow), steps)
 
 
+def _rssm(model: WorldModel) -> Rssm:
+    return cast(Rssm, model.dynamics)  # by `can_compute`
+
+
 def _convert_for_rollouts(model: WorldModel, dtype: torch.dtype) -> rollouts.Weights:
-    return rollouts.convert_weights(model.dynamics, model.reward_head, model.value_head, model.actor, dtype)
+    return rollouts.convert_weights(_rssm(model), model.reward_head, model.value_head, model.actor, dtype)
 
 
 def _convert_for_frames(model: WorldModel, dtype: torch.dtype) -> FrameFunctions:

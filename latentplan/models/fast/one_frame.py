@@ -8,13 +8,13 @@ tensors, so that `latentplan.agents.export` can trace them into a program.
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import NamedTuple, cast
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from latentplan.models.dynamics import State
+from latentplan.models.dynamics import Rssm, State
 from latentplan.models.encoder import FRAME_SIZE, PATCH
 from latentplan.models.fast import pointwise
 from latentplan.models.heads import NormedLinear, action_distribution
@@ -57,12 +57,13 @@ class FrameWeights(NamedTuple):
 
 @torch.no_grad()
 def convert_weights(model: WorldModel) -> FrameWeights:
-    """The weights of a world model for the functions of this module.
+    """The weights of a world model, whose dynamics are an `Rssm`, for the functions of this module.
 
     On the CPU the weights share the model's memory. For this purpose the model's convolutions are converted to the
     memory format `channels_last`, which changes no value. On other devices the weights of convolutions are copies.
     """
-    encoder, dynamics, latent = model.encoder, model.dynamics, model.dynamics.latent_dim
+    encoder, dynamics = model.encoder, cast(Rssm, model.dynamics)
+    latent = dynamics.latent_dim
     output = dynamics.posterior_output
     return FrameWeights(
         patches=_get_affine(encoder.patches),

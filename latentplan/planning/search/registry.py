@@ -33,7 +33,10 @@ class SupportsPlan(Protocol):
         generator: Generators = None,
         deadline_ms: float | None = None,
     ) -> Plan:
-        """Returns the best plan found from each state; see `CEMPlanner.plan`."""
+        """Returns the best plan found from each state; see `CEMPlanner.plan` for the arguments.
+
+        The `info` of the plan must hold `is_fallback`, `is_policy` and `num_nonfinite`, each (batch,).
+        """
         ...
 
 
