@@ -1,4 +1,4 @@
-"""`latentplan distill`: what its command line asks for, and errors of one line."""
+"""`latentplan distill`: its command line, and errors of one line."""
 
 import dataclasses
 import json

@@ -1,4 +1,4 @@
-"""`latentplan eval` plays an agent, and prints, films and writes what it measured."""
+"""`latentplan eval` plays an agent, and prints, films and writes its results."""
 
 import json
 import os
@@ -48,10 +48,10 @@ def returns(checkpoint, tmp_path_factory):
 
 
 @pytest.mark.parametrize("mode", ["planner", "gated", "background", "actor", "random"])
-def test_eval_prints_and_writes_what_it_promises(tmp_path, checkpoint, mode, capsys):
+def test_eval_prints_and_writes_the_documented_results(tmp_path, checkpoint, mode, capsys):
     result = result_of(tmp_path, checkpoint, "--mode", mode, "--episodes", 2, "--seed", 5)
-    promised = {"domain", "task", "mode", "seed", "returns", "mean_return", "ci95", "decision_ms"}
-    assert {*promised, "env_frames_trained"} <= result.keys() and "surprised" not in result
+    documented = {"domain", "task", "mode", "seed", "returns", "mean_return", "ci95", "decision_ms"}
+    assert {*documented, "env_frames_trained"} <= result.keys() and "surprised" not in result
     printed = capsys.readouterr().out
     for words in ("mean return", "95 % interval", "p50", "p95", "p99", "cartpole-swingup", mode):
         assert words in printed
@@ -77,7 +77,7 @@ def test_returns_depend_on_seed_and_episode_alone(tmp_path, run_folder, returns)
     assert result_of(tmp_path, run_folder, *flags, "--video", film)["returns"] == returns[:1]
     assert result_of(tmp_path, run_folder, *flags, "--seed", 1)["returns"] != returns[:1]
     count, width = count_frames(film)
-    assert count == 11 and width >= 2 * 256  # ten decisions and the last frame, beside what the plan imagines
+    assert count == 11 and width >= 2 * 256  # ten decisions and the last frame, beside the decoded end of the plan
     assert sorted(path.name for path in tmp_path.iterdir()) == ["film.mp4", "result.json"]
 
 

@@ -17,7 +17,7 @@ from latentplan.config.parsing import option
 
 @dataclass(frozen=True)
 class Request:
-    """What the tests ask for.
+    """The request of the tests.
 
     Attributes:
         checkpoint: Folder of something.

@@ -1,4 +1,4 @@
-"""`latentplan goals`: what its command line asks for, and errors of one line."""
+"""`latentplan goals`: its command line, and errors of one line."""
 
 import dataclasses
 
