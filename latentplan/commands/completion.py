@@ -16,7 +16,7 @@ SHELLS = ("bash", "zsh")
 
 
 def completion_script(program: str, commands: Mapping[str, Command], shell: str) -> str:
-    """The script that completes a program and its commands.
+    """The script that makes a shell complete a program, its commands and their flags.
 
     Args:
         program: Name of the program.
