@@ -111,7 +111,7 @@ def run(request: Request) -> int:
     Raises:
         UserError: The checkpoint, an objective, the latency or an output cannot be used.
     """
-    from latentplan.evaluation.latency import MEASURED, read_latency
+    from latentplan.evaluation.clock import MEASURED, read_latency
 
     latency = read_latency(request.latency or MEASURED)
     from latentplan.agents.checkpoint import read_info

@@ -16,9 +16,8 @@ from latentplan.config.quantities import scales
 from latentplan.envs.gl import explain_gl_errors, require_backend
 from latentplan.envs.registry import default_task, describe_unknown_name
 from latentplan.envs.render import FrameRenderer, draw_floor_behind
-from latentplan.envs.reward import ObjectiveReward
 from latentplan.envs.substeps import control_step, split_schedule
-from latentplan.envs.true_quantities import measure, true_values
+from latentplan.envs.true_quantities import ObjectiveReward, measure, true_values
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence

@@ -1,4 +1,4 @@
-"""True values of a body's named quantities, read from the simulator.
+"""True values of a body's named quantities, read from the simulator, and rewards made of them.
 
 `latentplan.config.quantities` defines the names. The rewards of all tasks of a domain are computed from the same
 physics by the suite's own formulas, so that one simulation gives the reward of each task.
@@ -10,10 +10,15 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from latentplan.config.quantities import scales
+from latentplan.objectives.expression import evaluate
+from latentplan.objectives.parser import parse_reward
+
 if TYPE_CHECKING:
     from collections.abc import Callable
 
     from dm_control.mujoco import Physics
+
 
 _WALKER_STAND_HEIGHT = 1.2
 _WALKER_SPEEDS = (1.0, 8.0, -1.0)  # walk, run, backward
@@ -117,3 +122,24 @@ _MEASURES: dict[str, Callable[[Any], tuple[float, ...]]] = {
     "ball_in_cup": _ball_in_cup,
     "pendulum": _pendulum,
 }
+
+
+class ObjectiveReward:
+    """The reward of one control step: the value of an expression over the quantities of a body.
+
+    Args:
+        text: An expression in the language of test-time objectives, without `return`, goal images and later phases.
+        domain: Domain whose quantities the expression names.
+
+    Raises:
+        UserError: The text is no such expression.
+    """
+
+    def __init__(self, text: str, domain: str) -> None:
+        self._expression = parse_reward(text, scales(domain), "env.objective")
+        self._names = tuple(scales(domain))
+
+    def __call__(self, values: np.ndarray) -> float:
+        """The reward for the true values of the domain's quantities, (quantity,)."""
+        lookup = dict(zip(self._names, values, strict=True)).__getitem__
+        return float(sum(weight * evaluate(term, lookup, clause_degree) for weight, term in self._expression.terms))

@@ -6,9 +6,8 @@ The package imports torch and einops, and only the settings from the rest of thi
 from latentplan.config.search import SearchOptions
 from latentplan.planning.adapters import CEMTrajectoryOptimizer
 from latentplan.planning.check import check_model
-from latentplan.planning.compiled import compile_rollout
 from latentplan.planning.controller import ModelPredictiveController
-from latentplan.planning.model import FunctionModel, Model
+from latentplan.planning.model import FunctionModel, Model, compile_rollout
 from latentplan.planning.objectives import (
     Objective,
     Rollout,

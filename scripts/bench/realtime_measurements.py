@@ -56,8 +56,7 @@ class Trial:
             control_hz: Decisions per second of an environment that does not wait; None for one that waits.
             prepare: Changes the agent before it plays.
         """
-        from latentplan.evaluation.clock import VirtualClock
-        from latentplan.evaluation.latency import Latency
+        from latentplan.evaluation.clock import Latency, VirtualClock
         from latentplan.evaluation.timed import iterate_timed_episodes, load_timed_agent, summarize_timed
 
         clock = VirtualClock(control_hz, Latency())

@@ -23,9 +23,8 @@ from latentplan.config import (
 from latentplan.config.files import compose
 from latentplan.config.suites import SUITES, Suite
 from latentplan.envs import default_task, make_env
-from latentplan.evaluation.clock import VirtualClock
+from latentplan.evaluation.clock import Latency, VirtualClock
 from latentplan.evaluation.goals import read_goals, score_env
-from latentplan.evaluation.latency import Latency
 from latentplan.evaluation.timed import iterate_timed_episodes
 from latentplan.training import train
 

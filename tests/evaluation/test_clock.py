@@ -13,9 +13,8 @@ from latentplan.agents.planning import PlanningAgent
 from latentplan.agents.random import RandomAgent
 from latentplan.config import Config, EnvConfig, ModelConfig, PlannerConfig
 from latentplan.envs import make_env
-from latentplan.evaluation.clock import VirtualClock, VirtualExecutor
+from latentplan.evaluation.clock import Latency, VirtualClock, VirtualExecutor
 from latentplan.evaluation.episodes import run_episodes
-from latentplan.evaluation.latency import Latency
 from latentplan.evaluation.timed import iterate_timed_episodes, summarize_timed
 from latentplan.models import WorldModel
 

@@ -5,7 +5,7 @@ import json
 import pytest
 
 from latentplan.config import UserError
-from latentplan.evaluation.latency import Latency, read_latency
+from latentplan.evaluation.clock import Latency, read_latency
 
 
 def read(tmp_path, text):

@@ -6,9 +6,8 @@ import gymnasium
 import numpy as np
 import pytest
 
-from latentplan.evaluation.clock import VirtualClock
+from latentplan.evaluation.clock import Latency, VirtualClock
 from latentplan.evaluation.episodes import run_episodes
-from latentplan.evaluation.latency import Latency
 from latentplan.evaluation.timed import iterate_timed_episodes, summarize_timed
 
 SUBSTEPS = 10
