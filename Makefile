@@ -8,7 +8,7 @@ BIN := .venv/bin
 STAMP := .venv/.installed
 DOCS_STAMP := .venv/.docs-installed
 
-.PHONY: setup train test check doctor bench soak docs clean
+.PHONY: setup train test test-all check doctor bench soak docs clean
 
 setup: $(STAMP)
 
@@ -16,9 +16,12 @@ train: $(STAMP)
 	@$(BIN)/python scripts/train.py --domain walker $(ARGS)
 
 test: $(STAMP)
-	$(BIN)/python -m pytest
+	$(BIN)/python -m pytest -n auto --dist loadfile
 
-check: test
+test-all: $(STAMP)
+	$(BIN)/python -m pytest -n auto --dist loadfile -m "not soak"
+
+check: test-all
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy

@@ -1,6 +1,6 @@
 """Close a corridor with a constraint: the plan of a point mass then takes the detour.
 
-Prints where each path crosses the wall, how deep it gets into it and how far from the goal it ends (`corridor.png`).
+Prints y at the wall, the depth in the wall and the last distance to the goal; draws both paths (`corridor.png`).
 """
 
 import sys
@@ -22,15 +22,15 @@ def dynamics(state: Tensor, action: Tensor) -> Tensor:
 
 
 def depth_in_wall(state: Tensor, *openings: tuple[float, float]) -> Tensor:
-    """How deep a state (rows, 4) lies in the wall, (rows,); 0 outside of it."""
+    """Depth of a state (rows, 4) in the wall, (rows,); 0 outside the wall."""
     beside = [torch.maximum(low - state[:, 1], state[:, 1] - high) for low, high in openings]
     return torch.stack([WALL - state[:, 0].abs(), *beside]).amin(dim=0).clamp_min(0)
 
 
 def travel(*openings: tuple[float, float]) -> Tensor:
-    """States (step, 4) on a way to the goal through these openings."""
+    """Plans and executes a path to the goal; returns its states, (step, 4)."""
     model = FunctionModel(dynamics, reward=lambda state, action: -(state[:, :2] - GOAL).norm(dim=1))
-    planner = CEMPlanner(action_dim=2, horizon=30, num_samples=400, noise_beta=2.0)  # smooth noise explores further
+    planner = CEMPlanner(action_dim=2, horizon=30, num_samples=400, noise_beta=2.0)  # smooth noise moves further
     wall = at_every_state(lambda state: depth_in_wall(state, *openings))
     controller = ModelPredictiveController(planner, model, constraints=[wall])
     states = torch.tensor([[-1.0, 0.0, 0.0, 0.0]])
@@ -40,7 +40,7 @@ def travel(*openings: tuple[float, float]) -> Tensor:
 
 
 def main(out: str = ".") -> None:
-    """Travel with the corridor open and closed, and draw both trajectories."""
+    """Travels with the corridor open and closed, and draws both paths."""
     torch.manual_seed(0)
     axes = Figure(layout="constrained").subplots()
     for name, openings in {"corridor open": (CORRIDOR, DETOUR), "corridor closed": (DETOUR,)}.items():

@@ -1,4 +1,4 @@
-"""Train in a gymnasium environment of your own, from its pictures alone.
+"""Train in a gymnasium environment of your own, from pictures alone.
 
 An action pushes a dot, whose reward is highest in the middle. Prints the mean return of planned and random actions.
 """
@@ -33,7 +33,7 @@ class Dot(gymnasium.Env):
         return self.render(), 1.0 - abs(self.place), False, False, {}
 
     def render(self) -> np.ndarray:
-        """The picture, uint8 (height, width, 3): a white column where the dot is."""
+        """The picture, uint8 (height, width, 3), with a white column at the place of the dot."""
         row = 255 * np.eye(16, dtype=np.uint8)[round(7.5 + 7.0 * self.place)]
         return np.tile(row[:, None], (16, 1, 3))
 
@@ -44,7 +44,7 @@ def make_env() -> gymnasium.Env:
 
 
 def main(out: str = ".") -> None:
-    """Train for a few seconds, which suffices here, and evaluate."""
+    """Trains for a few seconds, which are enough here, and evaluates."""
     model = ModelConfig(deter_dim=32, hidden_dim=32, encoder_channels=(8, 8, 8))
     learning = LearningConfig(batch_size=8, sequence_length=8, model_learning_rate=3e-3, behaviour_learning_rate=1e-3)
     collection = CollectionConfig(prefill_decisions=200, round_decisions=100, updates_per_decision=1.0, overlap=False)
@@ -55,5 +55,5 @@ def main(out: str = ".") -> None:
         print(f"{mode}: mean return {evaluate_agent(agent, env, seed=0, episodes=10)['mean_return']:.1f}")
 
 
-if __name__ == "__main__":  # without overlap=False a second process imports this file and collects
-    main(*sys.argv[1:2])  # where the folder of the run goes
+if __name__ == "__main__":  # needed with overlap=True, where a second process imports this file
+    main(*sys.argv[1:2])  # folder of the run's folder; the current one unless given

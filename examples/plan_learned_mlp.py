@@ -1,6 +1,6 @@
-"""Learn dynamics from random transitions, and plan in what was learned: gymnasium's `Pendulum-v1`.
+"""Learn the dynamics of gymnasium's `Pendulum-v1` from random transitions, and plan in the learned network.
 
-Prints the mean return of random actions and of plans in the learned network (0 would be perfect).
+Prints the mean return of random actions and of plans; the highest possible return is 0.
 """
 
 import gymnasium
@@ -19,7 +19,7 @@ class LearnedModel(nn.Sequential):
         self.scale = scale  # typical size of the change of each observed number, and of the reward, (4,)
 
     def step(self, state: Tensor, action: Tensor) -> tuple[Tensor, Tensor]:
-        """The next observation and the reward: the one method that a planner needs."""
+        """The next observation and the reward; a planner needs no other method."""
         prediction = self.scale * self(torch.cat([state, action], dim=1))
         return state + prediction[:, :3], prediction[:, 3]
 
@@ -37,7 +37,7 @@ def play(seed: int, controller: ModelPredictiveController | None = None) -> Tens
 
 
 def main() -> None:
-    """Collect at random, learn, plan, and print both returns."""
+    """Collects random transitions, learns, plans, and prints both returns."""
     torch.manual_seed(0)
     data = torch.cat([play(seed) for seed in range(25)])
     obs, action, next_obs, reward = data.split([3, 1, 3, 1], dim=1)

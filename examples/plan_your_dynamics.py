@@ -1,4 +1,4 @@
-"""Plan in dynamics of your own: a pendulum whose motor is too weak to lift it in one swing.
+"""Plan in dynamics of your own: a pendulum with a motor that is too weak to lift it in one swing.
 
 Prints the cost per step of planning and of no torque, and draws the height of both pendulums (`own_dynamics.png`).
 """
@@ -40,7 +40,7 @@ def play(act: Callable[[Tensor], Tensor]) -> tuple[float, list[float]]:
 
 
 def main(out: str = ".") -> None:
-    """Play both pendulums, print their costs and draw their heights."""
+    """Plays both pendulums, prints their costs and draws their heights."""
     planner = CEMPlanner(action_dim=1, horizon=25, num_samples=200, num_iterations=3, noise_beta=1.0)
     torch.manual_seed(0)
     controller = ModelPredictiveController(planner, FunctionModel(dynamics, reward))

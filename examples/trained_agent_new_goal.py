@@ -1,4 +1,4 @@
-"""Give a trained agent a goal that it has never been trained for: hang the pole down, to the right of the middle.
+"""Give a trained agent a goal that it was not trained for: the pole hangs down, to the right of the middle.
 
 The shipped agent learned from camera frames to swing the pole up. Prints position and height of the pole over the
 last two seconds with and without the goal, and draws the last camera frames of both (`new_goal.png`).
@@ -23,7 +23,7 @@ def play(objective: str | None) -> tuple[dict[str, float], np.ndarray]:
     env = make_env(EnvConfig(domain="cartpole", task="swingup", action_repeat=8))
     agent = load_agent(CHECKPOINT)
     agent.seed(0)
-    agent.set_objective(objective)  # None is what the agent was trained for
+    agent.set_objective(objective)  # None is the trained task
     (frame, _), over, quantities = env.reset(seed=0), False, []
     while not over:
         frame, _, terminated, truncated, info = env.step(agent.act(frame))
@@ -35,7 +35,7 @@ def play(objective: str | None) -> tuple[dict[str, float], np.ndarray]:
 
 
 def main(out: str = ".") -> None:
-    """Play with and without the goal, print the quantities reached and draw the ends."""
+    """Plays with and without the goal, prints the reached quantities and draws the last frames."""
     figure = Figure(figsize=(7, 4), layout="constrained")
     for column, (name, objective) in enumerate({"trained task": None, "new goal": GOAL}.items(), start=1):
         axes = figure.add_subplot(1, 2, column)

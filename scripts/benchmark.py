@@ -1,4 +1,4 @@
-"""Measure the program: `python scripts/benchmark.py COMMAND [--name value ...]`; --help lists the commands."""
+"""Measures the program: `python scripts/benchmark.py COMMAND [--name value ...]`; --help lists the commands."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from latentplan.commands.registry import Command, dispatch  # noqa: E402
 from latentplan.commands.shell import run_guarded  # noqa: E402
 
 COMMANDS = {
-    "train": Command("bench.train", "time of an update, part by part, beside what the machine can do at best"),
+    "train": Command("bench.train", "time of each part of an update, beside the peak FLOP/s of the machine"),
     "render": Command("bench.render", "milliseconds per frame and change of the picture in each render quality"),
     "decide": Command("bench.decide", "milliseconds per decision of planner and actor"),
     "paths": Command("bench.paths", "milliseconds of every fast path of the world model beside plain torch"),
@@ -21,13 +21,13 @@ COMMANDS = {
     "ablate": Command("bench.ablate", "return of a trained planner without each of its parts, in paired episodes"),
     "zero-shot": Command("bench.zero_shot", "goals that an agent was not trained for: planner, actor, random actions"),
     "realtime": Command("bench.realtime", "return and time by iterations, control rates, prediction and re-planning"),
-    "soak": Command("bench.soak", "deadlines that agents miss on the wall clock, beside those of an idle loop"),
+    "soak": Command("bench.soak", "deadlines that agents and an idle loop miss on the wall clock"),
     "learn": Command("bench.learn", "learning curves over tasks and seeds: frames and minutes to a return"),
 }
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run one benchmark and return the exit code: 0, 2 for bad input, 130 when interrupted."""
+    """Runs one benchmark and returns the exit code: 0, 2 for bad input, 130 when interrupted."""
     words = sys.argv[1:] if argv is None else argv
     return run_guarded(lambda argv: dispatch("benchmark.py", COMMANDS, argv), words)
 

@@ -1,4 +1,4 @@
-"""What several test files share."""
+"""Fixtures and process settings of all tests."""
 
 import os
 import signal

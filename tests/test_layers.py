@@ -1,4 +1,4 @@
-"""Which room may import which, that no import is circular, and what importing must not do."""
+"""The allowed imports of every room, no circular imports, limits on length, and imports without side effects."""
 
 import ast
 import re
@@ -34,7 +34,7 @@ ROOMS = {
     "__init__": (("agents",), set()),
     "__main__": (("commands",), set()),
 }
-EAGER = {"config", "commands", "jsonargparse", "rich"}  # what the command line may import before it is used
+EAGER = {"config", "commands", "jsonargparse", "rich"}  # modules of the command line may import these at the top
 IGNORED = {".git", ".venv", "runs", "build", "dist", "__pycache__"}
 MACHINE_PATHS = re.compile(r"(?<![\w.])/(?:work|opt|root|home|mnt|data|Users)/|\.\./shared")
 
@@ -80,8 +80,8 @@ def imported_rooms(module, names):
     return parts[1:2] or [name if name in ROOMS else "__init__" for name in names or ("",)]
 
 
-def violations(path, source):
-    """What a file imports and may not, as `file:line: reason`."""
+def find_violations(path, source):
+    """The forbidden imports of a file, as `file:line: reason`."""
     room, tree = room_of(path), ast.parse(source)
     where, typing_only = path.relative_to(ROOT), type_checking_lines(tree)
     assert room in ROOMS, f"{where}: {room!r} is no room; add it to the table"
@@ -113,16 +113,16 @@ def import_graph(sources):
     return graph
 
 
-def circles(graph):
-    """Import circles: each as the modules on the way round."""
+def find_circles(graph):
+    """Import circles, each as the list of its modules, the first one repeated at the end."""
     found, done = [], set()
 
-    def visit(module, way):
-        if module in way:
-            found.append([*way[way.index(module) :], module])
+    def visit(module, path):
+        if module in path:
+            found.append([*path[path.index(module) :], module])
         elif module not in done:
             for imported in graph[module]:
-                visit(imported, [*way, module])
+                visit(imported, [*path, module])
             done.add(module)
 
     for module in graph:
@@ -131,21 +131,21 @@ def circles(graph):
 
 
 def test_files_import_only_the_rooms_below_theirs():
-    found = [text for path in files_under(PACKAGE, ".py") for text in violations(path, path.read_text())]
+    found = [text for path in files_under(PACKAGE, ".py") for text in find_violations(path, path.read_text())]
     assert not found, "\n".join(found)
 
 
 def test_no_import_is_circular():
-    found = circles(import_graph({module_of(path): path.read_text() for path in files_under(PACKAGE, ".py")}))
+    found = find_circles(import_graph({module_of(path): path.read_text() for path in files_under(PACKAGE, ".py")}))
     assert not found, "\n".join(" -> ".join(circle) for circle in found)
 
 
-def test_circles_finds_a_circle_through_a_late_import():
+def test_find_circles_finds_a_circle_through_a_late_import():
     sources = {"a": "def late():\n    from b import x", "b": "import c", "c": "from a import y", "d": "import a"}
-    assert circles(import_graph(sources)) == [["a", "b", "c", "a"]]
+    assert find_circles(import_graph(sources)) == [["a", "b", "c", "a"]]
 
 
-def test_nothing_lies_loose_at_the_root_of_the_package():
+def test_root_of_the_package_holds_no_module_of_a_room():
     assert {path.name for path in PACKAGE.iterdir() if path.is_file()} == {"__init__.py", "__main__.py", "py.typed"}
 
 
@@ -163,8 +163,8 @@ def test_nothing_lies_loose_at_the_root_of_the_package():
         ("def late():\n    import lightning", False),
     ],
 )
-def test_violations_sees_every_way_to_import(line, allowed):
-    assert (violations(PACKAGE / "planning" / "search" / "cem.py", line) == []) == allowed
+def test_find_violations_finds_every_form_of_import(line, allowed):
+    assert (find_violations(PACKAGE / "planning" / "search" / "cem.py", line) == []) == allowed
 
 
 def test_the_command_line_imports_libraries_only_when_used():

@@ -1,4 +1,4 @@
-"""What the project promises to installers: pins, ranges, entry points, targets."""
+"""Packaging: pins, version ranges, entry points, make targets and the script of continuous integration."""
 
 import ast
 import re
@@ -44,7 +44,7 @@ def test_versions_known_to_break_lie_outside_the_ranges(name):
     assert works[name] in requirement.specifier
 
 
-def test_new_pythons_get_all_that_dm_control_needs_but_labmaze():
+def test_python_3_13_gets_every_requirement_of_dm_control_but_labmaze():
     environment = {"python_version": "3.13", "extra": ""}
     listed = {
         canonicalize_name(item.name) for item in REQUIREMENTS if not item.marker or item.marker.evaluate(environment)
@@ -61,18 +61,18 @@ def test_every_subpackage_is_packaged():
     assert {"latentplan", "latentplan.configs", *found} == listed
 
 
-def test_the_package_says_that_it_is_typed():
+def test_package_ships_the_marker_of_typed_packages():
     assert (ROOT / "latentplan" / "py.typed").is_file()
 
 
-def test_the_console_script_exists():
+def test_console_script_exists():
     module, function = PROJECT["project"]["scripts"]["latentplan"].split(":")
     tree = ast.parse((ROOT / (module.replace(".", "/") + ".py")).read_text())
     assert function in [node.name for node in tree.body if isinstance(node, ast.FunctionDef)]
 
 
-@pytest.mark.parametrize("target", ["setup", "train", "test", "check", "doctor", "soak"])
-def test_make_knows_its_targets(target):
+@pytest.mark.parametrize("target", ["setup", "train", "test", "test-all", "check", "doctor", "bench", "soak", "docs"])
+def test_make_has_target(target):
     result = subprocess.run(["make", "-n", target], cwd=ROOT, capture_output=True, text=True)
     assert result.returncode == 0, result.stderr
 
@@ -83,16 +83,16 @@ def test_arguments_of_make_follow_the_default_domain():
     assert "scripts/train.py --domain walker --domain cartpole --minutes 5" in output
 
 
-def test_continuous_integration_runs_the_two_commands_and_nothing_else():
+def test_continuous_integration_checks_builds_and_trains_only():
     path = ROOT / ".ci" / "run"
     assert path.stat().st_mode & 0o100
     script = path.read_text().replace("\\\n", " ")
     commands = [line.split()[0:2] for line in script.splitlines() if line and not line.startswith("#")]
     assert commands[:2] == [["set", "-euo"], ["cd", commands[1][1]]]
-    assert commands[2:] == [["make", "test"], ["make", "train"]]
+    assert commands[2:] == [["make", "check"], ["make", "docs"], ["make", "train"]]
 
 
-def test_the_flags_of_continuous_integration_are_valid():
+def test_flags_of_continuous_integration_are_valid():
     from latentplan.commands import train
     from latentplan.commands.flags import read_request
 

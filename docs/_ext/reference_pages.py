@@ -1,4 +1,4 @@
-"""Reference pages that are read from the code: settings from their dataclasses, and one API page per package."""
+"""Reference pages that are read from the code: tables of settings and quantities, and one API page per package."""
 
 from __future__ import annotations
 
@@ -14,13 +14,15 @@ from docutils.parsers.rst import Directive
 from docutils.statemachine import StringList
 from sphinx.application import Sphinx
 
+from latentplan.config.quantities import QUANTITIES
+
 SPECIAL = re.compile(r"(``.*?``|`[^`]*`)|([*|])|(?<=\w)(_)(?!\w)", flags=re.DOTALL)
 SHORT_CODE = 32  # characters
 SECTIONS = {f"{name}:" for name in ("Args", "Attributes", "Returns", "Raises", "Yields", "Note", "Example", "Examples")}
 
 
 def escape_markup(app: Sphinx, what: str, name: str, subject: Any, options: Any, lines: list[str]) -> None:
-    """Docstrings are plain text with single backticks: markup is escaped, and indented blocks become literal ones."""
+    """Escape markup in docstrings, which are plain text with single backticks; indented blocks become literal ones."""
     result: list[str] = []
     block: int | None = None  # indentation of the text that the present literal block belongs to
     for number, line in enumerate(lines):
@@ -51,13 +53,13 @@ def _indent(line: str) -> int:
 
 
 def hide_dataclass_text(app: Sphinx, what: str, name: str, subject: Any, options: Any, lines: list[str]) -> None:
-    """The signature that Python writes for a dataclass without a docstring is no description."""
+    """Drop the signature that Python writes as the docstring of a dataclass without one."""
     if lines and re.match(r"^\w+\(.*\)$", lines[0]) and len(lines) <= 2 and inspect.isclass(subject):
         lines.clear()
 
 
 def keep_property_text(app: Sphinx, what: str, name: str, subject: Any, options: Any, lines: list[str]) -> None:
-    """Napoleon reads "Whether it is so: because" of a property as a type and a description; the text is put back."""
+    """Put back the text of a property, whose first sentence Napoleon takes for a type where it holds a colon."""
     getter = getattr(subject, "fget", getattr(subject, "func", None))
     if what == "property" and getter is not None and any(line.startswith(":type:") for line in lines):
         lines[:] = [_escaped(line) for line in (inspect.getdoc(getter) or "").splitlines()]
@@ -109,6 +111,24 @@ class Settings(Directive):
         for prefix, section in sections.items():
             text += _settings_table(prefix, section)
         return _parse(self, text)
+
+
+class Quantities(Directive):
+    """`.. quantities::` makes a table of the named quantities of every domain."""
+
+    def run(self) -> list[nodes.Node]:
+        """One table with domain, name, unit, scale and meaning."""
+        text = [".. list-table::", "   :header-rows: 1", ""]
+        text += ["   * - domain", "     - name", "     - unit", "     - scale", "     - meaning"]
+        for domain, quantities in QUANTITIES.items():
+            for number, quantity in enumerate(quantities):
+                text += [f"   * - {'' if number else domain}", f"     - ``{quantity.name}``"]
+                text += [
+                    f"     - {quantity.unit}",
+                    f"     - {quantity.scale:g}",
+                    f"     - {_escaped(quantity.meaning)}",
+                ]
+        return _parse(self, [*text, ""])
 
 
 def _settings_table(prefix: str, settings: Any) -> list[str]:
@@ -177,6 +197,7 @@ def setup(app: Sphinx) -> dict[str, Any]:
     """Register the directives."""
     app.add_directive("api", Api)
     app.add_directive("settings", Settings)
+    app.add_directive("quantities", Quantities)
     app.connect("doctree-read", keep_short_code_whole)
     app.connect("autodoc-process-docstring", hide_dataclass_text, priority=100)
     app.connect("autodoc-process-docstring", escape_markup, priority=200)

@@ -14,11 +14,11 @@ from latentplan.models.symmetry import flat, mean_over_turns
 
 
 class ActorAgent(ModelAgent):
-    """Executes the mode of the actor's distribution, or a sample from it for exploration.
+    """Executes the mode of the actor's distribution, or a sample for exploration.
 
     Args:
         model: The world model.
-        config: Settings it was trained with.
+        config: Settings the model was trained with.
         explore: Whether actions are sampled.
         noise_correlation: Correlation of the sampling noise between one decision and the next, in [0, 1).
         seed: Seed of the agent's own random stream.
@@ -42,8 +42,8 @@ class ActorAgent(ModelAgent):
         return super().act(frame)
 
     def _choose(self, state: State) -> Tensor:
-        raw = self.model.backend.act(self.model, flat(state))
+        raw = self._frame_functions.act(flat(state))
         mean, std = (mean_over_turns(part, state) for part in raw)
         if not self.explore:
             return mean
-        return sample_action(mean, std, self.noise.draw(mean, self.generator, self._forget))
+        return sample_action(mean, std, self.noise.draw(mean, self.generator, self._is_reset))

@@ -1,4 +1,4 @@
-"""The agent for real time: it acts at once, and a worker plans beside the control loop."""
+"""The agent for real time: acts without waiting for a search, while a worker searches the next plan."""
 
 from __future__ import annotations
 
@@ -39,21 +39,21 @@ class LatentPlanner:
 class BackgroundAgent(ModelAgent):
     """Takes each action from the newest plan that is due, or from the actor, while a worker searches the next plan.
 
-    A decision costs one update of the belief and a few steps of the model. All environments of a batch share each
-    search, so `reset` drops the plans of all environments, whatever its mask. The agent has to be closed: call `close`
+    A decision costs one update of the belief and a few model steps. All environments of a batch share each
+    search, so `reset` drops the plans of all environments, also with a mask. The agent has to be closed: call `close`
     or use a `with` block.
 
     Attributes:
         last_source: Origin of the most recent action: "plan", "tail" (the rest of a plan whose successor is late) or
             "actor".
-        plan_age: Decisions since the one that the present plan was made for; None where the actor acted.
+        plan_age: Decisions since the first decision of the present plan; None where the actor acted.
         scheduler: Decides when plans are requested and which plan is due; see `PlanScheduler`.
 
     Args:
-        model: The world model; a worker process gets a copy of it, made now.
+        model: The world model; a worker process gets a copy, made by the constructor.
         config: Settings the model was trained with.
         discount: Discount per decision, as learned.
-        planner: Settings of the search; None takes those of `config`.
+        planner: Settings of the search; None takes the settings in `config`.
         seed: Seed of the agent's own random stream.
         worker: Where plans are searched: in a `process`, or in a `thread` (for models on a GPU).
         max_age: See `PlanBuffer`.
@@ -88,7 +88,7 @@ class BackgroundAgent(ModelAgent):
         self.plan_age: int | None = None
 
     def reset(self, mask: np.ndarray | None = None) -> None:
-        """Forgets the past of all environments, or of those where mask (batch,) is true, and all plans."""
+        """Forgets the past of all environments, or only of environments where mask (batch,) is true, and all plans."""
         super().reset(mask)
         self.scheduler.reset()
 
@@ -97,8 +97,8 @@ class BackgroundAgent(ModelAgent):
     ) -> None:
         """Sets the objective and the constraints of all plans requested from now on.
 
-        Plans made before stay in use until the first new plan is due. Where no plan is due the actor acts for the
-        reward that it was trained on.
+        Plans made before stay in use until the first new plan is due. Where no plan is due, the actor acts for its
+        own training reward.
 
         Args:
             objective: See `PlanningAgent.set_objective`.
@@ -108,23 +108,23 @@ class BackgroundAgent(ModelAgent):
             UserError: The text is no expression, or names a quantity that the agent does not predict.
             TypeError: A term cannot be sent to the process that plans.
         """
-        self.scheduler.set_objective(*self._plan_goals(objective, constraints, self.scheduler.planner))
+        self.scheduler.set_objective(*self._build_goals(objective, constraints, self.scheduler.planner))
 
     @torch.no_grad()
     def imagine(self) -> np.ndarray | None:
-        """The decoded end of the first environment's present plan, uint8 (32, 32, 3); None without a plan."""
+        """The decoded last state of the first environment's present plan, uint8 (32, 32, 3); None without a plan."""
         remaining = self.scheduler.buffer.remaining(self.scheduler.tick - 1)
         if remaining is None or self.state is None:
             return None
-        return self._picture(self.state, remaining)
+        return self._decode_last_state(self.state, remaining)
 
     def wait_until_ready(self, seconds: float = 60.0) -> bool:
-        """Waits until the worker is ready (or has failed), at most so many seconds; returns whether it is."""
+        """Waits until the worker is ready or has failed, at most `seconds`; returns whether the worker is ready."""
         executor = self.scheduler.executor
         return not isinstance(executor, BackgroundPlanner) or executor.wait_until_ready(seconds)
 
     def close(self) -> None:
-        """Ends the worker; from then on the agent executes the rest of its plan, then the actor's actions."""
+        """Ends the worker; the agent then executes the rest of its plan, and after the plan the actor's actions."""
         if isinstance(self.scheduler.executor, BackgroundPlanner):
             self.scheduler.executor.close()
 

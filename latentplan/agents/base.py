@@ -1,4 +1,4 @@
-"""What agents have in common: the protocol of every agent, and the belief of agents with a world model."""
+"""Common parts of all agents: the protocol of an agent, and the base class of agents with a world model."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from latentplan.agents.noise import CorrelatedNoise
 from latentplan.config import Config
 from latentplan.models import State, WorldModel
+from latentplan.models.backend import FrameFunctions
 from latentplan.models.symmetry import TurnedModel, first_turn, flat, folded, per_turn, turned
 from latentplan.objectives.expression import Expression
-from latentplan.objectives.objective import plan_goals, read_goal_image
+from latentplan.objectives.objective import build_goals, read_goal_image
 from latentplan.planning import Planner
 from latentplan.planning.objectives import Constraint, Term
 
@@ -23,7 +23,7 @@ class Agent(Protocol):
     """Turns frames into actions.
 
     An agent may have an attribute `last_source` with the origin of the most recent action: "plan", "tail" (the rest of
-    an older plan) or "actor". An agent without the attribute counts as one that does not plan.
+    an older plan) or "actor". The actions of an agent without the attribute are counted as "actor".
     """
 
     def act(self, frame: np.ndarray) -> np.ndarray:
@@ -31,7 +31,7 @@ class Agent(Protocol):
         ...
 
     def reset(self) -> None:
-        """Forgets the past; called before every episode."""
+        """Forgets the past; has to be called before every episode."""
         ...
 
     def seed(self, seed: int) -> None:
@@ -40,30 +40,31 @@ class Agent(Protocol):
 
 
 class ModelAgent:
-    """An agent with a world model: keeps a belief about each environment; subclasses choose actions from it.
+    """An agent with a world model: keeps a belief about each environment, from which subclasses choose the action.
 
-    The agent turns one frame (64, 64, 3) into one action (action,), or a batch of frames (batch, 64, 64, 3), one of
-    each environment, into (batch, action). The belief is a state of the world model at the posterior's mean. Where
-    `config.model.turns` is 4 the agent keeps one belief for each of the frame's four quarter turns.
+    The agent turns one frame (64, 64, 3) into one action (action,), or a batch with one frame of each environment
+    (batch, 64, 64, 3) into actions (batch, action). The belief is a state of the world model at the posterior's mean.
+    Where `config.model.turns` is 4, the agent keeps one belief for each of the frame's four quarter turns.
 
     Attributes:
         state: The belief, `deter` (batch, deter) and `stoch` (batch, latent), or (batch, 4, ...) with four turns; None
             before the first frame.
-        imagined: The world model as planners use it; its states are beliefs of this agent.
+        imagined: The world model for planners; its states have the shape of the agent's belief.
         last_source: Origin of the most recent action: "plan", "tail" (the rest of an older plan) or "actor"; a list
             where the environments of a batch can differ.
-        steps_ahead: Model steps from the belief to the picture that `imagine` returned last.
+        steps_ahead: Model steps from the belief to the picture of the latest `imagine`.
 
     Args:
-        model: The world model; put into evaluation mode and never changed.
+        model: The world model; the agent puts it into evaluation mode and does not change its weights.
         config: Settings the model was trained with.
         noise_std: Standard deviation of Gaussian noise added to each action, for exploration.
-        noise_correlation: Correlation of that noise between one decision and the next, in [0, 1).
+        noise_correlation: Correlation of this noise between one decision and the next, in [0, 1).
         seed: Seed of the agent's own random stream.
     """
 
     last_source: str | list[str] = "actor"
     steps_ahead: int = 0
+    _frame_functions: FrameFunctions  # with the weights of the present decision
 
     def __init__(
         self,
@@ -80,7 +81,7 @@ class ModelAgent:
         self.generator = torch.Generator(model.device)
         self.state: State | None = None
         self._action: Tensor | None = None
-        self._forget: Tensor | None = None
+        self._is_reset: Tensor | None = None
         self._turns = model.config.turns
         self.imagined: WorldModel | TurnedModel = model if self._turns == 1 else TurnedModel(model)
         self.seed(seed)
@@ -90,19 +91,19 @@ class ModelAgent:
         self.generator.manual_seed(seed)
 
     def reset(self, mask: np.ndarray | None = None) -> None:
-        """Forgets the past of all environments, or of those where mask (batch,) is true.
+        """Forgets the past of all environments, or only of environments where mask (batch,) is true.
 
         Raises:
             ValueError: The mask has another length than the batch.
         """
         if mask is None or self.state is None:
-            self.state = self._action = self._forget = None
+            self.state = self._action = self._is_reset = None
             self.noise.reset()
         else:
             forget = torch.tensor(mask, dtype=torch.bool, device=self.model.device)
             if len(forget) != len(self.state.deter):
                 raise ValueError(f"got a mask of {len(forget)} for {len(self.state.deter)} environments")
-            self._forget = forget if self._forget is None else self._forget | forget
+            self._is_reset = forget if self._is_reset is None else self._is_reset | forget
 
     @torch.no_grad()
     def act(self, frame: np.ndarray) -> np.ndarray:
@@ -118,41 +119,49 @@ class ModelAgent:
             ValueError: The frame has another shape or dtype, or the batch changed without a reset.
         """
         single = frame.ndim == 3
-        frames = self._check(frame[None] if single else frame)
-        state = self._believe(frames)
+        frames = self._check_frames(frame[None] if single else frame)
+        self._frame_functions = self.model.backend.frame_functions(self.model)
+        state = self._update_belief(frames)
         action = self._choose(state)
         if self.noise_std > 0.0:
-            noise = self.noise.draw(action, self.generator, self._forget)
+            noise = self.noise.draw(action, self.generator, self._is_reset)
             action = (action + self.noise_std * noise).clamp(-1.0, 1.0)
-        self.state, self._action, self._forget = state, action, None
+        self.state, self._action, self._is_reset = state, action, None
         result = action.float().cpu().numpy()
         return result[0] if single else result
 
     @torch.no_grad()
     def encode(self, frame: np.ndarray) -> np.ndarray:
-        """The latent of a frame without its past, float32 (32,), or (batch, 32) for several frames."""
+        """The latent of a frame at the first moment of an episode, float32 (32,), or (batch, 32) for several frames."""
         single = frame.ndim == 3
-        latent = self._glance(self._check(frame[None] if single else frame)).cpu().numpy()
+        latent = self._encode_frames(self._check_frames(frame[None] if single else frame)).cpu().numpy()
         return latent[0] if single else latent
 
     def imagine(self) -> np.ndarray | None:
-        """The decoded end of the first environment's plan, uint8 (32, 32, 3); None without a plan."""
+        """The decoded last state of the first environment's plan, uint8 (32, 32, 3); None without a plan."""
         return None
 
     def _choose(self, state: State) -> Tensor:
+        """The action for a belief, in [-1, 1], (batch, action)."""
         raise AssertionError("a subclass of ModelAgent defines _choose")
 
-    def _picture(self, state: State, actions: Tensor) -> np.ndarray:
-        """The decoded end of a plan (batch, horizon, action), uint8 (32, 32, 3), of the first environment."""
+    def _decode_last_state(self, state: State, actions: Tensor) -> np.ndarray:
+        """The decoded state after the first environment's plan, uint8 (32, 32, 3); also sets `steps_ahead`.
+
+        Args:
+            state: The belief about each environment.
+            actions: The plan of each environment, (batch, horizon, action).
+        """
         first = State(*(part[:1] for part in first_turn(state)))
         self.steps_ahead = actions.shape[1]
         _, last = self.model.rollout(first, actions[:1].to(first.deter.dtype))
         return self.model.decoder.picture(last.features.float())[0].cpu().numpy()
 
-    def _plan_goals(
+    def _build_goals(
         self, objective: str | Expression | Term | None, constraints: str | Sequence[Constraint], planner: Planner
     ) -> tuple[Term | None, Sequence[Constraint]]:
-        return plan_goals(
+        """The planner's objective and constraints, see `build_goals`."""
+        return build_goals(
             objective,
             constraints,
             model=self.model,
@@ -162,28 +171,77 @@ class ModelAgent:
         )
 
     def _encode_goal(self, path: str) -> Tensor:
-        """The latents of a picture's turns, (turn, latent)."""
-        return self._glance(turned(self._check(read_goal_image(path)[None]), self._turns))
+        """The latents of an image file, one for each quarter turn of the image, (turn, latent)."""
+        return self._encode_frames(turned(self._check_frames(read_goal_image(path)[None]), self._turns))
 
-    def _glance(self, frames: Tensor) -> Tensor:
-        """Latents (batch, latent) of frames without their past."""
+    def _encode_frames(self, frames: Tensor) -> Tensor:
+        """Latents of frames (batch, 64, 64, 3) at the first moment of an episode, (batch, latent)."""
         return self.model.see(self.model.dynamics.initial(len(frames)).deter, frames).stoch
 
-    def _believe(self, frames: Tensor) -> State:
+    def _update_belief(self, frames: Tensor) -> State:
+        """The belief after new frames (batch, 64, 64, 3), from the last belief and the action executed since.
+
+        Raises:
+            ValueError: The batch changed without a reset.
+        """
         if self.state is not None and len(self.state.deter) != len(frames):
             raise ValueError(f"got {len(frames)} frames after {len(self.state.deter)}: call reset() between batches")
         frames, turns = turned(frames, self._turns), self._turns
         if self.state is None or self._action is None:
-            return folded(self._see(self.model.dynamics.initial(len(frames)).deter, frames), turns)
-        deter = self.model.backend.advance(self.model, flat(self.state), per_turn(self._action, turns))
-        if self._forget is not None:
-            deter = torch.where(per_turn(self._forget, turns)[:, None], 0.0, deter)
-        return folded(self._see(deter, frames), turns)
+            return folded(self._posterior(self.model.dynamics.initial(len(frames)).deter, frames), turns)
+        deter = self._frame_functions.advance(flat(self.state), per_turn(self._action, turns))
+        if self._is_reset is not None:
+            deter = torch.where(per_turn(self._is_reset, turns)[:, None], 0.0, deter)
+        return folded(self._posterior(deter, frames), turns)
 
-    def _see(self, deter: Tensor, frames: Tensor) -> State:
-        return self.model.backend.see(self.model, deter, frames)
+    def _posterior(self, deter: Tensor, frames: Tensor) -> State:
+        """The state at the posterior's mean, for the GRU's state (rows, deter) and frames (rows, 64, 64, 3)."""
+        return self._frame_functions.see(deter, frames)
 
-    def _check(self, frames: np.ndarray) -> Tensor:
+    def _check_frames(self, frames: np.ndarray) -> Tensor:
+        """The frames (batch, 64, 64, 3) on the model's device.
+
+        Raises:
+            ValueError: The frames have another shape or dtype.
+        """
         if frames.dtype != np.uint8 or frames.shape[1:] != (64, 64, 3):
             raise ValueError(f"frames must be uint8 (64, 64, 3), got {frames.dtype} {frames.shape[1:]}")
         return torch.as_tensor(np.ascontiguousarray(frames), device=self.model.device)
+
+
+class CorrelatedNoise:
+    """Standard normal noise, correlated with the noise of the previous decision (an AR(1) process).
+
+    White noise hardly moves a heavy body, because pushes of successive decisions cancel each other.
+
+    Attributes:
+        last: The latest noise, (batch, action); None before the first.
+
+    Args:
+        correlation: Correlation between one decision and the next, in [0, 1).
+    """
+
+    def __init__(self, correlation: float) -> None:
+        self.correlation = correlation
+        self.last: Tensor | None = None
+
+    def draw(self, like: Tensor, generator: torch.Generator, is_new: Tensor | None = None) -> Tensor:
+        """The next noise, of the shape of an action (batch, action).
+
+        Args:
+            like: An action, (batch, action), for shape and device.
+            generator: Random stream of the noise.
+            is_new: Environments whose episode begins, (batch,) bool: their noise is independent of the past. None
+                stands for no environment.
+        """
+        white = torch.randn(like.shape, generator=generator, device=like.device)
+        noise = white
+        if self.last is not None and self.correlation > 0.0:
+            noise = self.correlation * self.last + (1.0 - self.correlation**2) ** 0.5 * white
+            noise = noise if is_new is None else torch.where(is_new[:, None], white, noise)
+        self.last = noise
+        return noise
+
+    def reset(self) -> None:
+        """Forgets the latest noise of all environments."""
+        self.last = None

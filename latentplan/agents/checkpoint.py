@@ -21,7 +21,7 @@ from latentplan.models.fast import accelerate
 
 WEIGHTS = "weights.safetensors"
 INFO = "info.json"
-KINDS = {
+VALUE_TYPES = {
     "env_frames": int,
     "action_dim": int,
     "discount": int | float,
@@ -29,25 +29,25 @@ KINDS = {
     "labels": dict | None,
     "goal_dim": int | None,
 }
-REQUIRED = ("domain", "task", "env_frames", "discount", "action_dim", "config", "sha256")
+REQUIRED_KEYS = ("domain", "task", "env_frames", "discount", "action_dim", "config", "sha256")
 
 
 def save_checkpoint(folder: Path, model: WorldModel, config: Config, info: dict[str, Any]) -> None:
     """Writes a checkpoint: float16 weights and a description; each file is replaced whole.
 
     Args:
-        folder: Folder of the checkpoint, made where it is missing.
+        folder: Folder of the checkpoint; a missing folder is made.
         model: The world model.
         config: Settings of the run.
         info: Further facts for the description: domain, task, discount, env_frames, metrics and the like.
 
     Raises:
-        FloatingPointError: A weight is not finite in float16; the folder is left as it was.
+        FloatingPointError: A weight is not finite in float16; the folder is not changed.
     """
     folder.mkdir(parents=True, exist_ok=True)
     part = folder / f"{WEIGHTS}.part"
     state = {name: value.detach().cpu().half().contiguous() for name, value in model.state_dict().items()}
-    if broken := _not_finite(state):
+    if broken := _first_not_finite(state):
         raise FloatingPointError(f"{broken} is not finite in float16: {folder} is left as it was")
     content = save(state)
     part.write_bytes(content)
@@ -73,10 +73,10 @@ def read_info(path: str | Path) -> dict[str, Any]:
         info = json.loads((folder / INFO).read_text())
     except (OSError, ValueError) as error:
         raise UserError(f"{folder / INFO} cannot be read: {error}") from None
-    missing = [key for key in REQUIRED if not isinstance(info, dict) or key not in info]
+    missing = [key for key in REQUIRED_KEYS if not isinstance(info, dict) or key not in info]
     if missing:
         raise UserError(f"{folder} is not a latentplan checkpoint: {INFO} lacks {', '.join(missing)}")
-    for key, kinds in KINDS.items():
+    for key, kinds in VALUE_TYPES.items():
         if not isinstance(info.get(key), kinds):
             raise UserError(f"{folder / INFO} cannot be used: {key} is {info.get(key)!r}")
     return info
@@ -99,7 +99,7 @@ def load_model(path: str | Path, device: str = "cpu") -> tuple[WorldModel, Confi
     except OSError as error:
         raise UserError(f"{weights} cannot be read: {error.strerror}") from None
     if hashlib.sha256(content).hexdigest() != info["sha256"]:
-        raise UserError(f"{weights} is damaged: its checksum is not the one in {INFO}")
+        raise UserError(f"{weights} is damaged: its checksum differs from the checksum in {INFO}")
     try:
         config = from_dict(info["config"])
     except (AttributeError, TypeError, ValueError) as error:
@@ -109,8 +109,8 @@ def load_model(path: str | Path, device: str = "cpu") -> tuple[WorldModel, Confi
         state = {name: value.float() for name, value in load_file(weights).items()}
         model.load_state_dict(state)
     except (RuntimeError, SafetensorError, TypeError, ValueError) as error:
-        raise UserError(f"{weights} does not fit its own settings: {str(error).splitlines()[0]}") from None
-    if broken := _not_finite(state):
+        raise UserError(f"{weights} does not fit its own settings: {str(error).splitlines()[-1].strip()}") from None
+    if broken := _first_not_finite(state):
         raise UserError(f"{weights} cannot be used: {broken} is not finite")
     try:
         return accelerate(model.to(device)), config, info
@@ -124,12 +124,12 @@ def load_agent(path: str | Path, mode: str = "planner", device: str = "cpu", **s
     Args:
         path: A checkpoint, or a run folder (its best checkpoint, else its last).
         mode: `planner` (plans at every decision), `actor` (the learned policy alone), `gated` (the actor, and the
-            planner at doubtful decisions; see `GatedAgent`), `background` (acts at once and plans beside the control
-            loop; see `BackgroundAgent`, and close it in the end) or `random`; see `latentplan.agents.modes`.
+            planner at doubtful decisions; see `GatedAgent`), `background` (acts without waiting for the planner, and
+            has to be closed; see `BackgroundAgent`) or `random`; see `latentplan.agents.modes`.
         device: `cpu` or `cuda`.
-        **settings: For modes that plan, planner settings that replace the trained ones, such as `horizon=10`. Also the
-            mode's own options: `planning_budget` and `signal` of `gated`; `worker`, `max_age`, `fresh_ticks` and
-            `make_executor` of `background`.
+        **settings: For modes that plan, planner settings in place of the settings of the training, such as
+            `horizon=10`. Also the mode's own options: `planning_budget` and `signal` of `gated`; `worker`, `max_age`,
+            `fresh_ticks` and `make_executor` of `background`.
 
     Returns:
         An `Agent`: `act(frame)` takes uint8 frames (64, 64, 3) or (batch, 64, 64, 3) and returns float32 actions in
@@ -157,7 +157,7 @@ def load_agent(path: str | Path, mode: str = "planner", device: str = "cpu", **s
         raise UserError(f"planner settings: {error}") from None
     wait_until_ready = getattr(agent, "wait_until_ready", None)
     if wait_until_ready is not None:
-        wait_until_ready()  # else the actor alone would decide in the first episode
+        wait_until_ready()  # without a ready worker, the actor alone would decide in the first episode
     return agent
 
 
@@ -168,22 +168,23 @@ def resolve_checkpoint(path: str | Path) -> Path:
         UserError: There is no checkpoint at the path.
     """
     root = Path(path)
-    folder = _find(root)
+    folder = _find_checkpoint(root)
     if folder is not None:
         return folder
     reason = f"expected {WEIGHTS} and {INFO}" if root.exists() else "the folder does not exist"
     parents = [parent for parent in (Path("checkpoints"), root.parent) if parent.is_dir()]
-    known = {path.name: str(path) for parent in parents for path in sorted(parent.iterdir()) if _find(path)}
+    siblings = [sibling for parent in parents for sibling in sorted(parent.iterdir())]
+    known = {sibling.name: str(sibling) for sibling in siblings if _find_checkpoint(sibling)}
     raise UserError(f"no checkpoint at {root}: {reason}{_suggestion(root.name, known)}")
 
 
-def _not_finite(state: dict[str, torch.Tensor]) -> str | None:
+def _first_not_finite(state: dict[str, torch.Tensor]) -> str | None:
     """The name of the first tensor that holds NaN or infinity; None where all are finite."""
     return next((name for name, value in state.items() if not bool(torch.isfinite(value).all())), None)
 
 
-def _find(root: Path) -> Path | None:
-    """The root where it is a checkpoint, else the best or last checkpoint of the run in it; None without either."""
+def _find_checkpoint(root: Path) -> Path | None:
+    """The root if it is a checkpoint, or else the best or last checkpoint of a run in the root; None without one."""
     for folder in (root, root / "checkpoints" / "best", root / "checkpoints" / "last"):
         if (folder / INFO).is_file() and (folder / WEIGHTS).is_file():
             return folder

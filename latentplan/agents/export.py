@@ -1,14 +1,14 @@
-"""The actor as a program of its own: a file that runs with torch alone, without this package.
+"""Export of the actor as a program: a file that runs with torch alone, without this package.
 
-One call is one decision. Inputs and outputs are plain tensors, and the belief passes through them:
+One call is one decision. Inputs and outputs are plain tensors, also the belief:
 
     action, deter, stoch = program(frame, deter, stoch, action, is_first)
 
 `frame` is uint8 (batch, 64, 64, 3). `deter`, float32 (batch, deter), and `stoch`, float32 (batch, latent), are the
-belief that the last call returned; agents that see four quarter turns have the beliefs of all turns side by side.
-`action`, float32 (batch, action) in [-1, 1], is the action executed since. `is_first`, bool (batch,), is true at the
-first frame of an episode, where `deter`, `stoch` and `action` are not read and may be zeros. The batch may have any
-size, and the rows do not influence each other.
+belief that the last call returned; an agent with four quarter turns has the beliefs of all turns side by side.
+`action`, float32 (batch, action) in [-1, 1], is the action executed after the last call. `is_first`, bool (batch,), is
+true at the first frame of an episode, where `deter`, `stoch` and `action` are not read and may be zeros. The batch may
+have any size, and the rows do not influence each other.
 """
 
 from __future__ import annotations
@@ -32,10 +32,10 @@ from latentplan.models.fast import one_frame
 from latentplan.models.symmetry import turned
 
 FORMATS = ("pt2", "onnx")
-SIZES = "actor.json"  # the part of a .pt2 file that names the sizes of its inputs
+SIZES = "actor.json"  # the part of a .pt2 file that holds the sizes of the inputs
 INPUTS = ("frame", "deter", "stoch", "action", "is_first")
 OUTPUTS = ("new_action", "new_deter", "new_stoch")  # ONNX needs names that differ from the inputs'
-EXAMPLE_ROWS = 2  # a batch of one would be built into the program
+EXAMPLE_ROWS = 2  # with a batch of 1, torch.export would fix the batch size at 1
 
 
 class _Decision(nn.Module):
@@ -66,7 +66,7 @@ class _Decision(nn.Module):
 
 
 def export_actor(agent_or_checkpoint: ModelAgent | str | Path, path: str | Path, format: str = "pt2") -> Path:
-    """Writes the actor as a program that needs neither this package nor memory beyond its inputs.
+    """Writes the actor as a program without this package and without a state of its own.
 
     Args:
         agent_or_checkpoint: An agent with a model, or the folder of a checkpoint or run.
@@ -93,13 +93,13 @@ def export_actor(agent_or_checkpoint: ModelAgent | str | Path, path: str | Path,
         model = agent_or_checkpoint.model
     else:
         model, _, _ = load_model(agent_or_checkpoint)
-    if not isinstance(model.dynamics, Rssm):
+    if type(model.dynamics) is not Rssm:
         raise UserError(
             f"only agents with dynamics of the class Rssm can be exported, got {type(model.dynamics).__name__}"
         )
     part = target.with_name(f".{target.name}.part")
     try:
-        _write(_trace(model), model, part, format)
+        _write_program(_trace_actor(model), model, part, format)
         part.replace(target)
     except OSError as error:
         raise UserError(f"cannot write {target}: {error.strerror}") from None
@@ -108,8 +108,8 @@ def export_actor(agent_or_checkpoint: ModelAgent | str | Path, path: str | Path,
     return target
 
 
-def sizes(model: WorldModel) -> dict[str, int]:
-    """Sizes of a program's vectors: `deter`, `stoch` and `action`."""
+def input_sizes(model: WorldModel) -> dict[str, int]:
+    """Sizes of a program's vector inputs: `deter`, `stoch` and `action`."""
     turns = model.config.turns
     return {
         "deter": turns * model.config.deter_dim,
@@ -118,25 +118,25 @@ def sizes(model: WorldModel) -> dict[str, int]:
     }
 
 
-def _trace(model: WorldModel) -> ExportedProgram:
+def _trace_actor(model: WorldModel) -> ExportedProgram:
     decision = _Decision(one_frame.convert_weights(model), model.config.turns).eval()
     batch = Dim("batch", min=1)
     dynamic = {name: {0: batch} for name in INPUTS}
     with torch.no_grad():
-        return torch.export.export(decision, _example(model), dynamic_shapes=dynamic)
+        return torch.export.export(decision, _example_inputs(model), dynamic_shapes=dynamic)
 
 
-def _example(model: WorldModel) -> tuple[Tensor, ...]:
-    vectors = [torch.zeros(EXAMPLE_ROWS, size) for size in sizes(model).values()]
+def _example_inputs(model: WorldModel) -> tuple[Tensor, ...]:
+    vectors = [torch.zeros(EXAMPLE_ROWS, size) for size in input_sizes(model).values()]
     frame = torch.zeros(EXAMPLE_ROWS, 64, 64, 3, dtype=torch.uint8)
     return frame, *vectors, torch.ones(EXAMPLE_ROWS, dtype=torch.bool)
 
 
-def _write(program: ExportedProgram, model: WorldModel, path: Path, format: str) -> None:
+def _write_program(program: ExportedProgram, model: WorldModel, path: Path, format: str) -> None:
     if format == "pt2":
-        whole = io.BytesIO()  # a disk that is full ends the interpreter while torch writes to it
-        torch.export.save(program, whole, extra_files={SIZES: json.dumps(sizes(model))})
-        path.write_bytes(whole.getvalue())
+        buffer = io.BytesIO()  # torch would end the interpreter if it wrote to a full disk itself
+        torch.export.save(program, buffer, extra_files={SIZES: json.dumps(input_sizes(model))})
+        path.write_bytes(buffer.getvalue())
         return
     options: dict[str, Any] = {"dynamo": True, "external_data": False, "verbose": False}
     torch.onnx.export(program, (), str(path), input_names=INPUTS, output_names=OUTPUTS, **options)

@@ -1,6 +1,6 @@
-"""The modes in which a trained agent can act: one table from the name of a mode to its class.
+"""The modes in which a trained agent can act: a table from the name of a mode to the agent's class.
 
-The table needs the standard library only, so that a command line can check a mode before anything slow is imported.
+The table needs the standard library only, so that commands can check a mode without importing torch.
 A new mode is a file with its class and one line in `MODES`.
 """
 
@@ -22,9 +22,9 @@ class AgentMode:
 
     Attributes:
         maker: The class (or function) that makes the agent, as "module:name"; the module is imported at the first use.
-            With `plans` it is called as `maker(model, config, discount, planner=..., **options)`, else as
-            `maker(model, config)`.
-        plans: Whether the agent searches with the planner: then it takes planner settings, and it has
+            The maker is called as `maker(model, config, discount, planner=..., **options)` if `plans` is true, else as
+            `maker(model, config, **options)`.
+        plans: Whether the agent searches with the planner. A planning agent takes planner settings, and has the method
             `set_objective(objective, constraints)`.
         options: Keyword arguments of the maker that `load_agent` passes on beside the planner settings.
         one_thread: Whether a decision is so small that more than one CPU thread slows it down.
@@ -36,7 +36,7 @@ class AgentMode:
     one_thread: bool = False
 
     def load(self) -> Any:
-        """The maker itself, imported now."""
+        """Imports and returns the maker."""
         module, name = self.maker.split(":")
         return getattr(importlib.import_module(module), name)
 
@@ -75,7 +75,7 @@ def make_agent(
         model: The world model.
         config: Settings the model was trained with.
         discount: Discount per decision, as learned; read by modes that plan.
-        planner: Settings of the search; None takes those of `config`. Read by modes that plan.
+        planner: Settings of the search, read by modes that plan; None takes the settings in `config`.
         **options: The mode's own options, see `AgentMode.options`.
 
     Raises:

@@ -1,4 +1,4 @@
-"""The agent that plans in the latent at every decision."""
+"""The agent that searches a plan in the world model at every decision."""
 
 from __future__ import annotations
 
@@ -23,13 +23,14 @@ class PlanningAgent(ModelAgent):
     by more than the limit: rollouts from such a state are less reliable than the actor.
 
     Attributes:
-        was_surprised: Whether the actor replaced the first environment's latest plan for that reason.
+        was_surprised: Whether the latest action of the first environment is the actor's because the frame exceeded the
+            limit.
 
     Args:
         model: The world model.
         config: Settings the model was trained with.
         discount: Discount per decision, as learned.
-        planner: Settings of the search; None takes those of `config`.
+        planner: Settings of the search; None takes the settings in `config`.
         noise_std: Standard deviation of exploration noise.
         noise_correlation: Correlation of exploration noise between one decision and the next, in [0, 1).
         seed: Seed of the agent's own random stream.
@@ -53,9 +54,9 @@ class PlanningAgent(ModelAgent):
         self.controller = ModelPredictiveController(search, self.imagined, generator=self.generator)
 
     def reset(self, mask: np.ndarray | None = None) -> None:
-        """Forgets the past and the last plan of all environments, or of those where mask (batch,) is true."""
+        """Forgets past and last plan of all environments, or only of environments where mask (batch,) is true."""
         super().reset(mask)
-        self.controller.reset(None if self.state is None else self._forget)
+        self.controller.reset(None if self.state is None else self._is_reset)
 
     def set_objective(
         self, objective: str | Expression | Term | None = None, constraints: str | Sequence[Constraint] = ()
@@ -66,20 +67,20 @@ class PlanningAgent(ModelAgent):
 
         Args:
             objective: An expression such as `"speed -> 2.0 and height > 1.1"`, or a term of
-                `latentplan.planning.objectives`; None is the reward that the agent was trained on.
+                `latentplan.planning.objectives`; None stands for the reward that the agent was trained on.
             constraints: Inequalities such as `"cart < 0.5"`, separated by `;`, or functions of imagined rollouts.
 
         Raises:
             UserError: The text is no expression, or names a quantity that the agent does not predict.
         """
-        self.controller.set_objective(*self._plan_goals(objective, constraints, self.controller.planner))
+        self.controller.set_objective(*self._build_goals(objective, constraints, self.controller.planner))
 
     @torch.no_grad()
     def imagine(self) -> np.ndarray | None:
-        """The decoded end of the first environment's plan, uint8 (32, 32, 3); None where the actor acted."""
+        """The decoded last state of the first environment's plan, uint8 (32, 32, 3); None where the actor acted."""
         if self.controller.plan is None or self.state is None or self.was_surprised:
             return None
-        return self._picture(self.state, self.controller.plan.actions)
+        return self._decode_last_state(self.state, self.controller.plan.actions)
 
     def _choose(self, state: State) -> Tensor:
         with self.model.trunk_precision():

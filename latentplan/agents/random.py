@@ -26,14 +26,14 @@ class RandomAgent:
         self.seed(seed)
 
     def seed(self, seed: int) -> None:
-        """Restart the agent's random stream."""
+        """Restarts the agent's random stream."""
         self._rng = np.random.default_rng(seed)
 
     def reset(self, mask: np.ndarray | None = None) -> None:
         """Does nothing: the agent has no memory."""
 
     def imagine(self) -> None:
-        """None: there is no plan to picture."""
+        """Returns None, because the agent has no plan."""
 
     def act(self, frame: np.ndarray) -> np.ndarray:
         """A random action, float32 (action,), or (batch, action) for several frames."""
@@ -42,5 +42,5 @@ class RandomAgent:
 
 
 def random_agent(model: WorldModel, config: Config) -> RandomAgent:
-    """A random agent for the bodies that a world model was trained on; see `AgentMode.maker`."""
+    """A random agent with the action size of a world model; see `AgentMode.maker`."""
     return RandomAgent(model.action_dim)

@@ -10,14 +10,13 @@ from typing import Any
 
 from latentplan.commands.flags import list_flags
 from latentplan.commands.registry import Command
-from latentplan.config import UserError
 from latentplan.config.parsing import alternatives, raise_unknown
 
 SHELLS = ("bash", "zsh")
 
 
 def completion_script(program: str, commands: Mapping[str, Command], shell: str) -> str:
-    """The script that completes a program and its commands.
+    """The script that makes a shell complete a program, its commands and their flags.
 
     Args:
         program: Name of the program.
@@ -25,14 +24,12 @@ def completion_script(program: str, commands: Mapping[str, Command], shell: str)
         shell: `bash` or `zsh`.
 
     Raises:
-        UserError: The shell is another one, or shtab is not installed.
+        UserError: The shell is another one.
     """
     if shell not in SHELLS:
         raise_unknown("shell", shell, SHELLS)
-    try:
-        import shtab
-    except ImportError:
-        raise UserError("completion needs shtab: pip install shtab") from None
+    import shtab
+
     parser = argparse.ArgumentParser(prog=program)
     parser.add_argument("--version", action="store_true", help="print the version")
     parser.add_argument("--print-completion", choices=SHELLS, help="print the script that completes this program")

@@ -14,7 +14,7 @@ from latentplan.config import DistillConfig, PlannerConfig
 
 @dataclass(frozen=True, kw_only=True)
 class Request(LearningRequest):
-    """What the command line of a distillation asks for.
+    """The command line of a distillation.
 
     Attributes:
         settings: Settings of the distillation that were given.
@@ -33,7 +33,7 @@ class Request(LearningRequest):
 
 
 def resolve(request: Request) -> dict[str, Any]:
-    """The request, with every setting of the distillation and of the search that labels."""
+    """The fields of the request, with every setting of the distillation and of the search that labels."""
     asked = {**vars(request), "settings": DistillConfig(**request.settings)}
     return asked if request.checkpoint is None else {**asked, "planner": _search_settings(request, request.checkpoint)}
 

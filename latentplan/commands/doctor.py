@@ -54,10 +54,10 @@ class Finding:
     """One line of the report.
 
     Attributes:
-        name: What was looked at.
-        value: What was found.
-        problem: What to do about it; None where nothing is wrong.
-        fatal: Whether training cannot work with the problem.
+        name: Part of the machine that was checked.
+        value: State of that part.
+        problem: Remedy of the problem; None where nothing is wrong.
+        fatal: Whether the problem prevents training.
     """
 
     name: str
@@ -93,7 +93,7 @@ def _guarded(check: Callable[[], Iterator[Finding]]) -> Iterator[Finding]:
         yield Finding(_title(check), f"cannot import {error.name}", "pip install -e . in the project's folder")
     except UserError as error:
         yield Finding(_title(check), "does not work", str(error))
-    except Exception as error:  # whatever a driver or library raises belongs in the report
+    except Exception as error:  # drivers and libraries raise errors of any type
         yield Finding(_title(check), "failed", f"{type(error).__name__}: {error}")
 
 
@@ -146,7 +146,7 @@ def _processor_name() -> str:
             if line.startswith("model name"):
                 return line.partition(":")[2].strip()
     except OSError:
-        pass  # not Linux
+        pass  # only Linux has this file
     return platform.processor() or platform.machine()
 
 
@@ -202,7 +202,7 @@ def _video() -> Iterator[Finding]:
     import cv2
     import numpy as np
 
-    # VideoWriter never raises, so only reading the film back tells.
+    # VideoWriter never raises: only reading the film back shows whether it was written.
     with tempfile.TemporaryDirectory() as folder:
         path = str(Path(folder) / "film.mp4")
         writer = cv2.VideoWriter(path, cv2.VideoWriter.fourcc(*"vp09"), 25.0, (64, 64))

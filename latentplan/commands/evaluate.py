@@ -1,4 +1,4 @@
-"""`latentplan eval`: play a trained agent in closed loop: its return, its decision latency, a film.
+"""`latentplan eval`: play a trained agent in closed loop; report return and decision latency, and film an episode.
 
 Torch and the simulator are imported when the first episode needs them, so that `--help` and bad input answer at once.
 """
@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, kw_only=True)
 class Request(ComputeRequest):
-    """What the command line of an evaluation asks for.
+    """The command line of an evaluation.
 
     Attributes:
         checkpoint: Folder of a trained agent, or of a run (its best checkpoint).
@@ -98,7 +98,7 @@ def planning_modes() -> tuple[str, ...]:
 
 
 def resolve(request: Request) -> dict[str, Any]:
-    """The request, with every setting of the search that the agent would use."""
+    """The fields of the request, with every setting of the search that the agent would use."""
     from latentplan.agents.checkpoint import read_info
 
     saved = saved_config(request.checkpoint, read_info(request.checkpoint))
@@ -106,12 +106,12 @@ def resolve(request: Request) -> dict[str, Any]:
 
 
 def run(request: Request) -> int:
-    """Play the episodes, print and write what they gave, and return the exit code.
+    """Play the episodes, print and write their results, and return the exit code.
 
     Raises:
         UserError: The checkpoint, an objective, the latency or an output cannot be used.
     """
-    from latentplan.evaluation.latency import MEASURED, read_latency
+    from latentplan.evaluation.clock import MEASURED, read_latency
 
     latency = read_latency(request.latency or MEASURED)
     from latentplan.agents.checkpoint import read_info
@@ -209,7 +209,7 @@ def _describe(
         return described
     is_own = goals is None or (any(phase.objective.is_return for phase in goals.phases) and not goals.constraints)
     if request.mode != "planner" or not is_own:
-        planner = dataclasses.replace(planner, surprise_limit=None)  # the agent ignores it here
+        planner = dataclasses.replace(planner, surprise_limit=None)  # `PlanningAgent` ignores the limit here
     return {**described, "planner": to_dict(planner)}
 
 
@@ -222,14 +222,14 @@ def _report(request: Request, result: dict[str, Any]) -> None:
         print(f"objective return {result['objective_return']:.1f}  ({result['objective']})")
     if "violation_rate" in result:
         print(f"violation rate {result['violation_rate']:.4f}  ({result['constraint']})")
-    if result.get("quantities"):  # some domains have none
+    if result.get("quantities"):  # domains without named quantities have none
         means = "   ".join(f"{name} {value:.2f}" for name, value in result["quantities"].items())
         print(f"on average   {means}")
     print(f"decision ms  {latency}", flush=True)
     surprised = result.get("surprised", 0)
     if surprised:
         decisions = sum(result["action_source"].values())
-        print(f"surprised    {surprised} of {decisions} decisions are its actor's", flush=True)
+        print(f"surprised    {surprised} of {decisions} decisions are the actor's", flush=True)
     failed = result["action_source"]["tail"] + result["action_source"]["actor"] - surprised
     if failed and request.mode == "planner":
         why = "the search found nothing finite"

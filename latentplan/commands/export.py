@@ -1,4 +1,4 @@
-"""`latentplan export`: write the actor as a program: frame, belief and last action in, action and belief out."""
+"""`latentplan export`: write the actor as a program that maps frame, belief and last action to action and belief."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ from latentplan.config.parsing import option
 
 @dataclass(frozen=True)
 class Request:
-    """What the command line of an export asks for.
+    """The command line of an export.
 
     Attributes:
         checkpoint: Folder of a trained agent, or of a run (its best checkpoint).
         out: File to write.
-        format: Program of `torch.export`, or ONNX where onnx and onnxscript are installed.
+        format: `pt2` is a program of `torch.export`; `onnx` needs the packages onnx and onnxscript.
     """
 
     checkpoint: Path = option(metavar="DIR")

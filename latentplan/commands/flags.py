@@ -1,4 +1,4 @@
-"""Flags, help and errors of a command, made from the dataclass of its request.
+"""Flags, help and errors of a command, derived from the dataclass of its request.
 
 A field `control_hz` becomes the flag `--control-hz`; a field made by `overrides` stands for the settings of another
 dataclass, as `--planner.horizon`. Types, defaults and meanings are those of the dataclass; its `__post_init__` checks
@@ -133,7 +133,7 @@ def format_flags(request: type, program: str, summary: str, every_flag: bool) ->
     """The text of `--help`, or of `--help-all`.
 
     Args:
-        request: Dataclass of what the command can be asked for; its `NOTES` end the text.
+        request: Dataclass of the command's request; its `NOTES` end the text.
         program: How the command is called, such as `latentplan eval`.
         summary: One sentence on what the command does.
         every_flag: Whether the flags that are rarely used are shown too.

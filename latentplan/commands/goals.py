@@ -12,7 +12,7 @@ from latentplan.config import GoalsConfig
 
 @dataclass(frozen=True, kw_only=True)
 class Request(LearningRequest):
-    """What the command line of learning goals asks for.
+    """The command line of goal-conditioned learning.
 
     Attributes:
         settings: Settings of the learning that were given.
@@ -20,8 +20,8 @@ class Request(LearningRequest):
 
     RESUMABLE = ("--updates", "--minutes", "--device", "--threads")
     NOTES = (
-        "Nothing else about the agent changes. The agent learns from the replay of its run where --checkpoint names a "
-        "run; a lone checkpoint first plays --play-decisions decisions."
+        "All other weights of the agent stay as they are. The agent learns from the replay of its run where "
+        "--checkpoint names a run; a checkpoint without a run first plays --play-decisions decisions."
     )
 
     settings: dict[str, Any] = overrides(GoalsConfig)
@@ -32,12 +32,12 @@ class Request(LearningRequest):
 
 
 def resolve(request: Request) -> dict[str, Any]:
-    """The request, with every setting of the learning."""
+    """The fields of the request, with every setting of the learning."""
     return {**vars(request), "settings": GoalsConfig(**request.settings)}
 
 
 def run(request: Request) -> int:
-    """Learn goals, or continue to, and return the exit code."""
+    """Learn goals, or continue to learn them, and return the exit code."""
     from latentplan.agents.checkpoint import read_info
 
     info = {} if request.checkpoint is None else read_info(request.checkpoint)

@@ -1,4 +1,4 @@
-"""What the commands that teach a trained agent have in common."""
+"""The flags that `latentplan distill` and `latentplan goals` share."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from latentplan.config.parsing import option
 
 @dataclass(frozen=True, kw_only=True)
 class LearningRequest(ComputeRequest):
-    """What the command line of teaching a trained agent asks for.
+    """The command line of teaching a trained agent: the agent, the output folder, or a folder to resume.
 
     Attributes:
         checkpoint: Folder of a trained agent, or of a run (its best checkpoint).
@@ -34,5 +34,10 @@ class LearningRequest(ComputeRequest):
 
 
 def name_folder(kind: str, info: Mapping[str, Any]) -> Path:
-    """The folder of an agent that learns, unless another one is given: `runs/<kind>-<domain>-<task>-<date>`."""
+    """The default folder of an agent that is taught: `runs/<kind>-<domain>-<task>-<date>`.
+
+    Args:
+        kind: First word of the name, such as `distilled`.
+        info: Content of the `info.json` of the agent.
+    """
     return Path("runs") / f"{kind}-{info['domain']}-{info['task']}-{datetime.now():%Y%m%d-%H%M%S}"

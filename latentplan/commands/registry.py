@@ -1,4 +1,4 @@
-"""A table of commands, and how a command is called by its name.
+"""Commands by name: how a table of commands is called.
 
 A command is a module with a dataclass `Request`, whose fields are the flags, and a function `run`, which takes a
 request and returns the exit code. A module may have a function `resolve`, which takes a request and returns the

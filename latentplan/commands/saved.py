@@ -16,7 +16,7 @@ def saved_config(checkpoint: Path, info: Mapping[str, Any]) -> Config:
 
     Args:
         checkpoint: Folder of the checkpoint, which an error names.
-        info: What the checkpoint says about itself.
+        info: Content of its `info.json`.
 
     Raises:
         UserError: The settings are those of an incompatible version.

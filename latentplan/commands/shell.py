@@ -1,4 +1,4 @@
-"""How every command runs: its mistakes as one line and an exit code, its device and its threads."""
+"""Running a command: errors as one line and an exit code, and the choice of device and threads."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from latentplan.config.parsing import option
 def run_guarded(command: Callable[[Sequence[str]], int], argv: Sequence[str]) -> int:
     """The exit code of a command: 2 after a mistake of the user, which becomes one line on stderr.
 
-    An interrupt gives 130, and output that nobody reads to its end, as in `train.py --help | head`, gives 141.
+    An interrupt gives 130. A reader that closes the output early, as in `train.py --help | head`, gives 141.
     """
     try:
         try:
@@ -44,10 +44,10 @@ def _refuse(message: str) -> int:
 
 @dataclass(frozen=True, kw_only=True)
 class ComputeRequest:
-    """Where a command computes.
+    """Device and CPU threads of a command.
 
     Attributes:
-        device: Where to compute; `auto` takes CUDA where it is usable.
+        device: Device to compute on; `auto` takes CUDA where it is usable.
         threads: CPU threads, in [1, 1024]; None takes torch's own number, or 1 where more threads gain nothing.
     """
 
@@ -59,7 +59,7 @@ class ComputeRequest:
             within(self, threads=(1, MAX_THREADS))
 
     def use_device(self, threads: int | None = None) -> str:
-        """`cpu` or `cuda`; sets torch's number of CPU threads, where one is given, on the way.
+        """The device, `cpu` or `cuda`; also sets torch's number of CPU threads where one is given.
 
         Args:
             threads: CPU threads where the user gave no number; None leaves the number to torch.

@@ -24,7 +24,7 @@ SHORT_FLAGS = {
 
 @dataclass(frozen=True)
 class Request:
-    """What the command line of a training run asks for.
+    """The command line of a training run.
 
     Attributes:
         preset: Machine class; `auto` takes `gpu` where CUDA is usable.

@@ -1,4 +1,4 @@
-"""Settings of distillation: how an actor learns to act as its planner does."""
+"""Settings of distillation, in which an actor learns to act as its planner does."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from latentplan.config.parsing import option
 
 @dataclass(frozen=True)
 class DistillConfig:
-    """How an actor is taught to act as its planner does.
+    """Distillation: an actor learns to act as its planner does.
 
     Attributes:
         rounds: Rounds; each plays episodes, has the planner label their beliefs, and trains the actor on the labels.

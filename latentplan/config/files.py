@@ -175,9 +175,7 @@ def _overlay(*layers: Layer) -> Layer:
     for layer in layers:
         run = layer.get("run", {})
         for given, other in (("frames", "minutes"), ("minutes", "frames")):
-            if (
-                given in run and other not in run
-            ):  # a budget of frames replaces an earlier budget of minutes, and conversely
+            if given in run and other not in run:  # a budget of one kind replaces an earlier budget of the other
                 merged.get("run", {}).pop(other, None)
         for section, fields in layer.items():
             merged[section] = {**merged.get(section, {}), **fields}

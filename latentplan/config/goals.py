@@ -1,4 +1,4 @@
-"""Settings of goal-conditioned learning: how an agent learns to pursue goals that are named later."""
+"""Settings of goal-conditioned learning, after which an agent pursues goals that are named later."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from latentplan.config.parsing import option
 
 @dataclass(frozen=True)
 class GoalsConfig:
-    """How a trained agent is taught to pursue goals that are named later.
+    """Goal-conditioned learning: a trained agent learns to pursue goals that are named later.
 
     Attributes:
         updates: Updates in total.

@@ -1,4 +1,4 @@
-"""Settings of learning, and of collecting the experience to learn from."""
+"""Settings of learning, and of collecting the experience that a run learns from."""
 
 from __future__ import annotations
 
@@ -93,7 +93,7 @@ class LearningConfig:
 
 @dataclass(frozen=True)
 class CollectionConfig:
-    """How experience is collected, and how many updates it is used for.
+    """Collection of experience, and the number of updates per collected decision.
 
     Attributes:
         behaviour: Agent that acts while collecting: the planner, the actor, or both in alternate rounds.

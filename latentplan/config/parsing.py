@@ -1,4 +1,4 @@
-"""The settings that a dataclass declares, and how jsonargparse reads a typed value for each from text.
+"""The settings that a dataclass declares, and the reading of their typed values from text by jsonargparse.
 
 Names, types, defaults and meanings come from the dataclass alone, so that flags, YAML files and `--help` agree.
 jsonargparse is imported when the first value is read, because `--help` does not need it.
@@ -29,7 +29,7 @@ _TYPE_WORDS = {
     Path: "a path",
     type(None): "null",
 }
-_LARGEST = 10**18  # beyond, whole numbers are typing errors, and do not fit the 64 bits of numpy and torch
+_LARGEST = 10**18  # larger whole numbers are typing errors, and need more than the 64 bits of numpy and torch
 _SHOWN = 60  # characters of a wrong value that an error repeats
 
 

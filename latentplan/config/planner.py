@@ -12,7 +12,7 @@ from latentplan.config.search import SearchOptions
 
 @dataclass(frozen=True, kw_only=True)
 class PlannerConfig(SearchOptions):
-    """The planner of an agent, and the options of its search; see `SearchOptions` for these.
+    """The planner of an agent, with the options of its search (`SearchOptions`).
 
     Attributes:
         method: Name of the planner in the registry of `latentplan.planning`: `cem`, `icem` or `mppi`. The options that
@@ -31,6 +31,11 @@ class PlannerConfig(SearchOptions):
 
 
 def override_planner(trained: Mapping[str, Any], given: Mapping[str, Any]) -> dict[str, Any]:
-    """Returns an agent's planner settings with `given` ones in their place; a given horizon holds for goals too."""
+    """An agent's planner settings with the given ones in their place; a given `horizon` holds for goals too.
+
+    Args:
+        trained: Planner settings of the agent, by name.
+        given: Settings that replace them, by name.
+    """
     goal_horizon = {"goal_horizon": None} if "horizon" in given else {}
     return {**trained, **goal_horizon, **given}

@@ -20,7 +20,7 @@ NUM_POLICY_SAMPLES = 24
 
 @dataclass(frozen=True, kw_only=True)
 class SearchOptions:
-    """How action sequences are searched. `None` means that the search derives the value.
+    """Options of a search over action sequences. `None` means that the search derives the value.
 
     Attributes:
         horizon: Model steps that a plan looks ahead.

@@ -29,19 +29,18 @@ class EnvConfig:
     """The environment: the body, its task and its camera.
 
     Attributes:
-        suite: Suite that the domain belongs to, see `latentplan/config/suites.py`.
-        domain: Domain of `dm_control.suite`.
+        domain: Domain of the suite.
         task: Task of the domain; None takes the usual task of the domain.
         action_repeat: Simulator control steps per decision.
         camera: Camera id of the MuJoCo model.
         render_quality: `exact` is dm_control's default; `fast` has a small shadow map; `fastest` has no shadows,
-            reflections or anti-aliasing, and pictures that are visibly easier to learn from.
+            reflections or anti-aliasing, which makes learning easier.
         floor: `suite` draws the floor as the suite does, which ends two metres behind a walker's start; `endless` draws
             the floor there as well, for goals that lead backwards. Physics and the picture ahead are the same.
         num_envs: Environments that collect at the same time; if there are several, each runs in its own process.
         objective: Expression over the body's quantities that replaces the task's reward at every control step, such as
             `speed -> 2.0 and height > 1.1`; None keeps the task's reward.
-        suite: Suite that the domain belongs to, see `latentplan/config/suites.py`.
+        suite: Suite of the domain, a name in `latentplan/config/suites.py`.
     """
 
     domain: str = "walker"
@@ -139,7 +138,7 @@ class RunConfig:
         device: Device to learn on; `auto` takes CUDA where it is usable.
         threads: CPU threads for each half of an update (model and behaviour learn in parallel), in [1, 1024]; None
             divides all cores but one between the halves and leaves one to collection.
-        run_dir: Folder of the run; None makes `runs/<domain>-<task>-<date>`.
+        run_dir: Folder of the run; None makes `runs/<domain>-<task>-seed<seed>-<date>`.
     """
 
     frames: int | None = None

@@ -1,4 +1,4 @@
-"""The environment suites: one table from the name of a suite to its factory and its domains.
+"""The environment suites by name: the factory and the domains of each.
 
 The table needs the standard library only, so that the domain of a run is checked before a simulator is imported.
 A new suite is a file with its factory and one entry in `SUITES`; `latentplan.envs.registry` describes the factory.

@@ -1,4 +1,4 @@
-"""Environments of camera frames: from a registered suite, several at once, or the user's own."""
+"""Environments with camera frames as observations: registered suites, vector environments, the user's own."""
 
 from __future__ import annotations
 
@@ -20,4 +20,4 @@ __all__ = [
     "wrap_user_env",
 ]
 
-choose_backend()  # before anything imports MuJoCo
+choose_backend()  # has to happen before MuJoCo is imported

@@ -1,7 +1,7 @@
-"""The OpenGL backend that renders: chosen before MuJoCo is imported, and known by name once a context exists.
+"""Choice of the OpenGL backend before MuJoCo is imported, and facts about the renderer.
 
 MuJoCo and dm_control read `MUJOCO_GL` when they are imported. Without the variable they choose a windowed backend,
-which fails at the first frame on a machine without a display. So this module does not import either at the top.
+which fails at the first frame on a machine without a display. This module therefore imports both inside functions.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 REMEDY = "install software rendering (apt-get install -y libosmesa6 libegl1 libgl1) or set MUJOCO_GL=egl|osmesa|glfw"
 _SOFTWARE_RENDERERS = ("llvmpipe", "softpipe", "swrast", "software")
 _PROBE_TIMEOUT_S = 30.0
-_PROBE = (
+_PROBE_PROGRAM = (
     "import mujoco; from OpenGL import GL; context = mujoco.GLContext(64, 64); context.make_current(); "
     "print(GL.glGetString(GL.GL_RENDERER).decode())"
 )
@@ -38,9 +38,9 @@ def choose_backend() -> str | None:
     Returns:
         The backend that MuJoCo will use, or None where no OpenGL library was found.
     """
-    # dm_control's rendering thread prints errors at exit, and one environment gains nothing from it.
+    # dm_control's rendering thread prints errors at exit, and does not make one environment faster.
     os.environ.setdefault("DISABLE_RENDER_THREAD_OFFLOADING", "1")
-    # Small frames gain nothing from Mesa's worker threads, and learning needs the cores.
+    # Mesa's worker threads do not make small frames faster, and learning needs the cores.
     os.environ.setdefault("LP_NUM_THREADS", "0")
     backend = os.environ.get("MUJOCO_GL") or _find_backend()
     if backend:
@@ -71,7 +71,7 @@ def explain_gl_errors() -> Iterator[None]:
         yield
     except UserError:
         raise
-    except Exception as error:  # each backend raises types of its own
+    except Exception as error:  # each backend raises other types
         backend = os.environ.get("MUJOCO_GL")
         reason = str(error).strip().splitlines()[0] if str(error).strip() else type(error).__name__
         raise UserError(f"cannot render with MUJOCO_GL={backend}: {reason}; {REMEDY}") from error
@@ -127,11 +127,11 @@ def _has_graphics_device() -> bool:
 
 
 def _probe_egl() -> str:
-    """The name of EGL's renderer, empty where EGL fails; asked in a child process, which a bad driver may crash."""
+    """The name of EGL's renderer, empty where EGL fails; read in a child process, because a bad driver may crash it."""
     environment = {**os.environ, "MUJOCO_GL": "egl", "PYOPENGL_PLATFORM": "egl"}
     try:
         probe = subprocess.run(
-            [sys.executable, "-c", _PROBE],
+            [sys.executable, "-c", _PROBE_PROGRAM],
             env=environment,
             capture_output=True,
             text=True,

@@ -1,16 +1,16 @@
-"""Environments by the names in the settings: looks up the suite in `latentplan.config.suites` and calls its factory.
+"""Environments by name: looks up the suite in `latentplan.config.suites` and calls the suite's factory.
 
 A suite's factory is called as `factory(config, seed)`, with an `EnvConfig` and the seed of the first reset (None draws
 one), and returns a `gymnasium.Env` with these spaces and values:
 
-    observation_space       Box, uint8 (64, 64, 3); every observation is an array of its own
+    observation_space       Box, uint8 (64, 64, 3); every observation is a new array
     action_space            Box in [-1, 1], float32 (action,)
     reset                   depends on `seed` alone where one is given, else continues the random stream
-    step                    holds the action for `config.action_repeat` control steps and sums their rewards
+    step                    holds the action for `config.action_repeat` control steps and sums the rewards
     info["env_frames"]      control steps that this step took; 0 from `reset`
 
-`latentplan.envs.wrap_user_env` makes such an environment of any other with image observations. Further attributes are
-optional, and each serves one feature:
+`latentplan.envs.wrap_user_env` adapts any gymnasium environment with image observations. Further attributes are
+optional; each of them enables one feature:
 
     decisions_per_episode   decisions until the time limit (the discount is derived from it)
     labels                  scale of each named quantity; `info["labels"]` then holds the values, float32 (label,)
@@ -35,10 +35,10 @@ def make_env(config: EnvConfig, seed: int | None = None) -> Any:
 
     Args:
         config: Suite, domain, task, action repeat, camera and render quality.
-        seed: Start of its random stream; None draws one from the system.
+        seed: Seed of the environment's random stream; None draws a seed from the system.
 
     Raises:
-        UserError: Suite, domain, task or camera do not exist, or no OpenGL library can render.
+        UserError: The suite, domain, task or camera does not exist, or no OpenGL library can render.
     """
     if config.domain == USER_DOMAIN:
         raise UserError(
@@ -57,12 +57,12 @@ def default_task(domain: str, suite: str = DEFAULT_SUITE) -> str:
     """
     tasks = find_suite(suite).tasks
     if domain not in tasks:
-        raise UserError(unknown_name("domain", domain, tasks))
+        raise UserError(describe_unknown_name("domain", domain, tasks))
     return tasks[domain]
 
 
-def unknown_name(kind: str, name: str, available: Iterable[str]) -> str:
-    """An error message for a name that does not exist: all names that do, and the nearest of them."""
+def describe_unknown_name(kind: str, name: str, available: Iterable[str]) -> str:
+    """An error message for an unknown name, with all available names and the nearest name."""
     choices = sorted(available)
     nearest = difflib.get_close_matches(name, choices, n=1, cutoff=0.0)[0]
     return f"unknown {kind} {name!r}; available: {', '.join(choices)}. Did you mean {nearest!r}?"

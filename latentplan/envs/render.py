@@ -11,7 +11,7 @@ from latentplan.envs.gl import explain_gl_errors, require_backend
 if TYPE_CHECKING:
     from dm_control.mujoco import Physics
 
-# What each quality changes in the model's `visual/quality`. Software renderers pay per triangle and sample.
+# Values of the model's `visual/quality` by quality. Software renderers take longer for more triangles and samples.
 _QUALITY_SETTINGS: dict[str, dict[str, int]] = {
     "exact": {},
     "fast": {"shadowsize": 256},
@@ -20,10 +20,10 @@ _QUALITY_SETTINGS: dict[str, dict[str, int]] = {
 
 
 class FrameRenderer:
-    """Renders the present state of a body as `Physics.render` does, without its preparations for every frame.
+    """Renders the present state of a body as `Physics.render` does, without repeating the preparations at every frame.
 
-    Shadow map, anti-aliasing and buffer size are fixed when the context is made. The buffer is as small as the frame:
-    the picture is the same, and no larger buffer has to be cleared.
+    Shadow map, anti-aliasing and buffer size are fixed when the context is made. The buffer has the size of the frame,
+    so that no larger buffer has to be cleared; the picture does not depend on the size of the buffer.
     """
 
     def __init__(self, physics: Physics, size: int, camera: int, quality: str) -> None:
@@ -94,8 +94,8 @@ class FrameRenderer:
 def draw_floor_behind(physics: Physics) -> None:
     """Moves every floor that begins just behind the start back by half its length.
 
-    The size of a plane is for drawing only: bodies touch it everywhere. After a move by half its length the pattern and
-    the light of the floor fall on the same places as before. Half of the floor ahead stays drawn, 48 m and more.
+    The size of a plane affects drawing only: bodies touch an endless plane. After a move by half the length of the
+    floor, its pattern and light fall on the same places as before. At least 48 m of floor ahead stay drawn.
     """
     import mujoco
 

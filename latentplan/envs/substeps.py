@@ -29,8 +29,8 @@ def split_schedule(schedule: Sequence[tuple[np.ndarray, int]], num_substeps: int
 def control_step(task_env: Any, schedule: Schedule) -> Any:
     """One control step of a `dm_control` environment during which several controls act in turn.
 
-    The task sees a single control step with the last control: after that it gives one reward, and may end the episode.
-    A schedule of one entry gives exactly the result of `task_env.step`.
+    The task computes one reward, and may end the episode, after the last control. A schedule of one entry gives exactly
+    the result of `task_env.step`.
 
     Args:
         task_env: A `dm_control.rl.control.Environment`.

@@ -14,11 +14,10 @@ from gymnasium.error import ResetNeeded
 from latentplan.config import EnvConfig, UserError
 from latentplan.config.quantities import scales
 from latentplan.envs.gl import explain_gl_errors, require_backend
-from latentplan.envs.registry import default_task, unknown_name
+from latentplan.envs.registry import default_task, describe_unknown_name
 from latentplan.envs.render import FrameRenderer, draw_floor_behind
-from latentplan.envs.reward import ObjectiveReward
 from latentplan.envs.substeps import control_step, split_schedule
-from latentplan.envs.true_quantities import measure, true_values
+from latentplan.envs.true_quantities import ObjectiveReward, measure, true_values
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
@@ -34,8 +33,8 @@ class SuiteEnv(gymnasium.Env[np.ndarray, np.ndarray]):
 
     An observation is a uint8 frame (64, 64, 3), always a new array. An action is float32 (action,) in [-1, 1], scaled
     to the actuators' range. `reset(seed=s)` depends on s alone; `reset()` continues the random stream. The time limit
-    truncates an episode; only the task terminates it. `info["env_frames"]` is the number of control steps that a step
-    took, which is smaller than the action repeat where an episode ends early. `info["labels"]` holds the true
+    truncates an episode; only the task terminates an episode. `info["env_frames"]` is the number of control steps that
+    a step took, which is smaller than the action repeat where an episode ends early. `info["labels"]` holds the true
     quantities at the frame, float32 (label,).
 
     Attributes:
@@ -57,15 +56,16 @@ class SuiteEnv(gymnasium.Env[np.ndarray, np.ndarray]):
 
         Args:
             config: Domain, task, action repeat, camera and render quality.
-            seed: Start of the random stream; None draws one from the system.
+            seed: Seed of the random stream; None draws a seed from the system.
 
         Raises:
-            UserError: Domain, task or camera do not exist, nothing can render, or the objective is no expression.
+            UserError: The domain, task or camera does not exist, no OpenGL library can render, or the objective is no
+                expression.
         """
         self._objective = None if config.objective is None else ObjectiveReward(config.objective, config.domain)
         task = default_task(config.domain) if config.task is None else config.task
-        self._task_env = _load(config.domain, task)
-        self._camera = _checked_camera(self.physics, config)
+        self._task_env = _load_task(config.domain, task)
+        self._camera = _check_camera(self.physics, config)
         if config.floor == "endless":
             draw_floor_behind(self.physics)
         self.domain, self._quality = config.domain, config.render_quality
@@ -158,11 +158,11 @@ class SuiteEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         counts = [count for _, count in schedule]
         if min(counts, default=0) < 1 or sum(counts) != self.substeps_per_decision:
             raise ValueError(f"substeps must be positive and add up to {self.substeps_per_decision}, got {counts}")
-        controls = [(self._scaled(action), count) for action, count in schedule]
+        controls = [(self._scale_action(action), count) for action, count in schedule]
         reward, env_frames, terminated = 0.0, 0, False
         for control in split_schedule(controls, self._task_env._n_sub_steps):
             outcome = control_step(self._task_env, control)
-            reward += self._rewarded(float(outcome.reward))
+            reward += self._control_step_reward(float(outcome.reward))
             env_frames += 1
             self._steps_left -= 1
             # dm_control marks the end by the task with discount 0, and the time limit with discount 1.
@@ -173,7 +173,7 @@ class SuiteEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         return self.render(), reward, terminated, self._needs_reset and not terminated, self._info(env_frames)
 
     def render(self) -> np.ndarray:  # type: ignore[override]
-        """The frame of the present state as the agent sees it, a new uint8 array (64, 64, 3)."""
+        """The agent's frame of the present state, a new uint8 array (64, 64, 3)."""
         return self.render_large(FRAME_SIZE)
 
     def render_large(self, size: int) -> np.ndarray:
@@ -198,8 +198,12 @@ class SuiteEnv(gymnasium.Env[np.ndarray, np.ndarray]):
             self._recorded.clear()
         return info
 
-    def _rewarded(self, reward: float) -> float:
-        """The reward of this control step, given the task's own; records it where `record_quantities` is set."""
+    def _control_step_reward(self, reward: float) -> float:
+        """The reward of the latest control step; also recorded, with the quantities, if `record_quantities` is set.
+
+        Args:
+            reward: The task's own reward, which an objective replaces.
+        """
         if self._objective is None and not self.record_quantities:
             return reward
         values = true_values(self.domain, self.physics)
@@ -212,7 +216,12 @@ class SuiteEnv(gymnasium.Env[np.ndarray, np.ndarray]):
     def _seed_task(self, seed: int | None) -> None:
         self._task_env.task.random.seed(seed)
 
-    def _scaled(self, action: np.ndarray) -> np.ndarray:
+    def _scale_action(self, action: np.ndarray) -> np.ndarray:
+        """The action (action,), clipped to [-1, 1] and scaled to the actuators' range, float64.
+
+        Raises:
+            ValueError: The action has another shape or is not finite.
+        """
         action = np.asarray(action, dtype=np.float64)
         if action.shape != self.action_space.shape:
             raise ValueError(f"action has shape {action.shape}, the environment takes {self.action_space.shape}")
@@ -221,14 +230,14 @@ class SuiteEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         return self._action_low + (np.clip(action, -1.0, 1.0) + 1.0) * 0.5 * (self._action_high - self._action_low)
 
 
-def _load(domain: str, task: str) -> Any:
+def _load_task(domain: str, task: str) -> Any:
     require_backend()
     with explain_gl_errors():
         from dm_control import suite
     if domain not in suite.TASKS_BY_DOMAIN:
-        raise UserError(unknown_name("domain", domain, suite.TASKS_BY_DOMAIN))
+        raise UserError(describe_unknown_name("domain", domain, suite.TASKS_BY_DOMAIN))
     if task not in suite.TASKS_BY_DOMAIN[domain]:
-        raise UserError(unknown_name(f"task of {domain}", task, suite.TASKS_BY_DOMAIN[domain]))
+        raise UserError(describe_unknown_name(f"task of {domain}", task, suite.TASKS_BY_DOMAIN[domain]))
     with _quiet_model_compiler():
         # A few tasks draw their body at random when they are built: a fixed seed gives the same body every time.
         return suite.load(domain, task, task_kwargs={"random": 0})
@@ -246,7 +255,7 @@ def _quiet_model_compiler() -> Iterator[None]:
         logger.setLevel(before)
 
 
-def _checked_camera(physics: Physics, config: EnvConfig) -> int:
+def _check_camera(physics: Physics, config: EnvConfig) -> int:
     if config.camera >= physics.model.ncam:
         raise UserError(f"camera {config.camera} does not exist; {config.domain} has {physics.model.ncam} cameras")
     return config.camera

@@ -1,4 +1,4 @@
-"""True values of a body's named quantities, read from the simulator.
+"""True values of a body's named quantities, read from the simulator, and rewards made of them.
 
 `latentplan.config.quantities` defines the names. The rewards of all tasks of a domain are computed from the same
 physics by the suite's own formulas, so that one simulation gives the reward of each task.
@@ -10,10 +10,15 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from latentplan.config.quantities import scales
+from latentplan.objectives.expression import evaluate
+from latentplan.objectives.parser import parse_reward
+
 if TYPE_CHECKING:
     from collections.abc import Callable
 
     from dm_control.mujoco import Physics
+
 
 _WALKER_STAND_HEIGHT = 1.2
 _WALKER_SPEEDS = (1.0, 8.0, -1.0)  # walk, run, backward
@@ -56,11 +61,11 @@ def _walker(physics: Any) -> tuple[float, ...]:
     height, speed, upright = physics.torso_height(), physics.horizontal_velocity(), physics.torso_upright()
     standing = _tolerance(height, (_WALKER_STAND_HEIGHT, np.inf), margin=_WALKER_STAND_HEIGHT / 2)
     stand = (3 * standing + (1 + upright) / 2) / 4
-    moving = [stand * (5 * _reached(speed, goal, abs(goal) / 2, 0.5) + 1) / 6 for goal in _WALKER_SPEEDS]
+    moving = [stand * (5 * _speed_reward(speed, goal, abs(goal) / 2, 0.5) + 1) / 6 for goal in _WALKER_SPEEDS]
     return (height, speed, upright, stand, *moving)
 
 
-def _reached(speed: float, goal: float, margin: float, value_at_margin: float) -> float:
+def _speed_reward(speed: float, goal: float, margin: float, value_at_margin: float) -> float:
     """The suite's reward for a speed of at least `goal`, in the direction of the goal's sign."""
     bounds = (abs(goal), np.inf)
     along = float(np.sign(goal) * speed)
@@ -80,7 +85,9 @@ def _cartpole(physics: Any) -> tuple[float, ...]:
 
 def _cheetah(physics: Any) -> tuple[float, ...]:
     speed, torso = physics.speed(), physics.named.data.xmat["torso", "zz"]
-    rewards = [_reached(speed, goal, _CHEETAH_RUN_SPEED, 0.0) for goal in (_CHEETAH_RUN_SPEED, -_CHEETAH_RUN_SPEED)]
+    rewards = [
+        _speed_reward(speed, goal, _CHEETAH_RUN_SPEED, 0.0) for goal in (_CHEETAH_RUN_SPEED, -_CHEETAH_RUN_SPEED)
+    ]
     return (speed, physics.named.data.xpos["torso", "z"], torso, *rewards)
 
 
@@ -115,3 +122,24 @@ _MEASURES: dict[str, Callable[[Any], tuple[float, ...]]] = {
     "ball_in_cup": _ball_in_cup,
     "pendulum": _pendulum,
 }
+
+
+class ObjectiveReward:
+    """The reward of one control step: the value of an expression over the quantities of a body.
+
+    Args:
+        text: An expression in the language of test-time objectives, without `return`, goal images and later phases.
+        domain: Domain whose quantities the expression names.
+
+    Raises:
+        UserError: The text is no such expression.
+    """
+
+    def __init__(self, text: str, domain: str) -> None:
+        self._expression = parse_reward(text, scales(domain), "env.objective")
+        self._names = tuple(scales(domain))
+
+    def __call__(self, values: np.ndarray) -> float:
+        """The reward for the true values of the domain's quantities, (quantity,)."""
+        lookup = dict(zip(self._names, values, strict=True)).__getitem__
+        return float(sum(weight * evaluate(term, lookup, clause_degree) for weight, term in self._expression.terms))

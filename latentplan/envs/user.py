@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
 
-LONGEST = 1000  # decisions of an episode without a time limit, as in the longest episodes of dm_control
+MAX_DECISIONS = 1000  # decisions of an episode without a time limit, as in the longest episodes of dm_control
 
 
 def make_from(
@@ -42,14 +42,14 @@ def make_from(
 
 
 def wrap_user_env(env: gymnasium.Env[Any, Any], action_repeat: int = 1, seed: int | None = None) -> PixelEnv:
-    """A user's environment as an agent sees it: frames of 64 x 64, actions in [-1, 1], action repeat.
+    """A user's environment with the interface for agents: frames of 64 x 64, actions in [-1, 1], action repeat.
 
     Args:
         env: A gymnasium environment. `env.observation_space` is a Box of uint8 images (height, width, 3), RGB, of any
             size; larger images are averaged down, smaller images are interpolated. `env.action_space` is a bounded Box
             of floats (action,).
-        action_repeat: Steps of `env` per decision, at least 1; a step of the result holds the action for so many steps
-            of `env`, or until the episode ends, and sums their rewards.
+        action_repeat: Steps of `env` per decision, at least 1; a step of the result repeats the action for this number
+            of steps of `env`, or until the episode ends, and sums the rewards.
         seed: Seed of the first reset that is called without one; None draws a seed from the system.
 
     Returns:
@@ -64,7 +64,8 @@ def wrap_user_env(env: gymnasium.Env[Any, Any], action_repeat: int = 1, seed: in
           with numbers that are not finite.
 
     Raises:
-        UserError: `action_repeat` is below 1, or a space is not as described; the message says which and why.
+        UserError: `action_repeat` is below 1, or a space is not as described; the message names the space and the
+            reason.
     """
     return PixelEnv(env, action_repeat, seed)
 
@@ -75,7 +76,7 @@ class PixelEnv(gymnasium.Env[np.ndarray, np.ndarray]):
     Attributes:
         action_repeat: Steps of the inner environment per decision; rewards are summed over them.
         decisions_per_episode: Decisions until the time limit of the environment's spec or of a `TimeLimit` wrapper.
-            None without a time limit; then an episode is truncated after `LONGEST` decisions.
+            None without a time limit; then an episode is truncated after `MAX_DECISIONS` decisions.
     """
 
     metadata = {"render_modes": ["rgb_array"]}
@@ -86,7 +87,7 @@ class PixelEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         if action_repeat < 1:
             raise UserError(f"action_repeat must be at least 1, got {action_repeat}")
         _check_observations(env.observation_space)
-        self._inner_actions = _checked_actions(env.action_space)
+        self._inner_actions = _check_actions(env.action_space)
         self._env = env
         self._first_seed = seed
         self._picture = np.zeros((FRAME_SIZE, FRAME_SIZE, 3), dtype=np.uint8)
@@ -94,7 +95,7 @@ class PixelEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         self._decisions = 0
         self.action_repeat = action_repeat
         limit = env.spec.max_episode_steps if env.spec is not None else None
-        if limit is None and env.has_wrapper_attr("_max_episode_steps"):  # a `TimeLimit`, but no spec
+        if limit is None and env.has_wrapper_attr("_max_episode_steps"):  # a `TimeLimit` without a spec
             limit = env.get_wrapper_attr("_max_episode_steps")
         if rate := env.metadata.get("render_fps"):
             self.metadata = {**PixelEnv.metadata, "render_fps": rate / action_repeat}
@@ -110,7 +111,7 @@ class PixelEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         super().reset(seed=seed)
         picture, info = self._env.reset(seed=seed, options=options)
         self._needs_reset, self._decisions = False, 0
-        return self._frame(picture), {**info, "env_frames": 0}
+        return self._to_frame(picture), {**info, "env_frames": 0}
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
         """Holds an action (action,) in [-1, 1] for `action_repeat` steps of the inner environment.
@@ -135,26 +136,26 @@ class PixelEnv(gymnasium.Env[np.ndarray, np.ndarray]):
             total += float(reward)
             env_frames += 1
         self._decisions += 1
-        truncated = truncated or (self.decisions_per_episode is None and self._decisions == LONGEST)
+        truncated = truncated or (self.decisions_per_episode is None and self._decisions == MAX_DECISIONS)
         self._needs_reset = bool(terminated or truncated)
-        return self._frame(picture), total, bool(terminated), bool(truncated), {**info, "env_frames": env_frames}
+        return self._to_frame(picture), total, bool(terminated), bool(truncated), {**info, "env_frames": env_frames}
 
     def render(self) -> np.ndarray:  # type: ignore[override]
         """The last frame, a new uint8 array (64, 64, 3)."""
-        return _resized(self._picture, FRAME_SIZE)
+        return _resize(self._picture, FRAME_SIZE)
 
     def render_large(self, size: int) -> np.ndarray:
         """The inner environment's rendering where it has one, else its last observation, uint8 (size, size, 3)."""
         rendered = self._env.render() if self._env.render_mode == "rgb_array" else None
-        return _resized(self._picture if rendered is None else np.asarray(rendered), size)
+        return _resize(self._picture if rendered is None else np.asarray(rendered), size)
 
     def close(self) -> None:
         """Closes the inner environment."""
         self._env.close()
 
-    def _frame(self, picture: np.ndarray) -> np.ndarray:
+    def _to_frame(self, picture: np.ndarray) -> np.ndarray:
         self._picture = np.array(picture, dtype=np.uint8)
-        return _resized(self._picture, FRAME_SIZE)
+        return _resize(self._picture, FRAME_SIZE)
 
 
 def _check_observations(space: gymnasium.Space[Any]) -> None:
@@ -167,7 +168,7 @@ def _check_observations(space: gymnasium.Space[Any]) -> None:
         raise UserError(f"{wanted}, got shape {space.shape}")
 
 
-def _checked_actions(space: gymnasium.Space[Any]) -> gymnasium.spaces.Box:
+def _check_actions(space: gymnasium.Space[Any]) -> gymnasium.spaces.Box:
     wanted = "actions must be a bounded Box of floats with shape (action,)"
     if not isinstance(space, gymnasium.spaces.Box):
         raise UserError(f"{wanted}, got {type(space).__name__}")
@@ -182,7 +183,7 @@ def _checked_actions(space: gymnasium.Space[Any]) -> gymnasium.spaces.Box:
     return space
 
 
-def _resized(picture: np.ndarray, size: int) -> np.ndarray:
+def _resize(picture: np.ndarray, size: int) -> np.ndarray:
     """The picture at another size, a new uint8 array (size, size, 3)."""
     if picture.shape[:2] == (size, size):
         return picture.copy()

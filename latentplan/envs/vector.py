@@ -1,4 +1,4 @@
-"""Several environments behind one `step`, all from the same settings."""
+"""Vector environments: several environments with the same settings behind one `step`."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def make_vector_env(
     make_env: Callable[[], gymnasium.Env[Any, Any]] | None = None,
     episode_decisions: int | None = None,
 ) -> VectorEnv[np.ndarray, np.ndarray, Any]:
-    """Several environments behind one `step`, each in a process of its own if there is more than one.
+    """Several environments behind one `step`; two or more environments run in separate processes.
 
     Finished episodes do not restart by themselves, so `step` always returns the result of its own action. Restart
     finished environments with `vector_env.reset(options={"reset_mask": ended})`, where `ended` is a bool array
@@ -41,7 +41,8 @@ def make_vector_env(
     Args:
         config: Settings of every environment.
         num_envs: Number of environments.
-        seed: Each environment's random stream is derived from this seed and its index; None draws from the system.
+        seed: The seed of each environment is derived from this seed and the environment's index; None draws seeds from
+            the system.
         make_env: A user's factory, called in each process instead of the suite's; it must be picklable.
         episode_decisions: Decisions after which an episode is truncated; None leaves the length to the task.
 
@@ -51,15 +52,17 @@ def make_vector_env(
     Raises:
         UserError: The environment cannot be built.
     """
-    builders = [_Builder(config, _derived_seed(seed, index), make_env, episode_decisions) for index in range(num_envs)]
+    factories = [
+        _EnvFactory(config, _derive_env_seed(seed, index), make_env, episode_decisions) for index in range(num_envs)
+    ]
     if num_envs == 1:
-        return SyncVectorEnv(builders, autoreset_mode=AutoresetMode.DISABLED)
+        return SyncVectorEnv(factories, autoreset_mode=AutoresetMode.DISABLED)
     with single_threaded_children():
-        return AsyncVectorEnv(builders, shared_memory=True, context="spawn", autoreset_mode=AutoresetMode.DISABLED)
+        return AsyncVectorEnv(factories, shared_memory=True, context="spawn", autoreset_mode=AutoresetMode.DISABLED)
 
 
 @dataclass(frozen=True)
-class _Builder:
+class _EnvFactory:
     """Builds one environment in the process that calls it; picklable where the user's factory is."""
 
     config: EnvConfig
@@ -69,7 +72,7 @@ class _Builder:
 
     def __call__(self) -> gymnasium.Env[np.ndarray, np.ndarray]:
         if multiprocessing.parent_process() is not None:
-            signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches the whole group; the parent decides
+            signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches all processes; the parent handles it
         build = make_env if self.factory is None else make_from(self.factory)
         env: gymnasium.Env[np.ndarray, np.ndarray] = build(self.config, self.seed)
         env = env if self.factory is None else _WithoutInfo(env)
@@ -77,7 +80,7 @@ class _Builder:
 
 
 class _WithoutInfo(gymnasium.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarray]):
-    """A user's environment with `env_frames` as its only info: other entries may not fit into one array for all."""
+    """A user's environment with `env_frames` as its only info, because other entries may not fit into one array."""
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         frame, info = self.env.reset(seed=seed, options=options)
@@ -88,13 +91,13 @@ class _WithoutInfo(gymnasium.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.ndar
         return frame, reward, terminated, truncated, {"env_frames": info["env_frames"]}
 
 
-def _derived_seed(seed: int | None, index: int) -> int | None:
+def _derive_env_seed(seed: int | None, index: int) -> int | None:
     return None if seed is None else int(np.random.SeedSequence([seed, index]).generate_state(1)[0])
 
 
 @contextmanager
 def single_threaded_children() -> Iterator[None]:
-    """Sets thread limits as environment variables while processes start: numerical libraries read them at import."""
+    """Limits processes that start inside the `with` block to one thread, by environment variables."""
     before = {name: os.environ.get(name) for name in _THREAD_SETTINGS}
     os.environ.update(dict.fromkeys(_THREAD_SETTINGS, "1"))
     try:

@@ -1,9 +1,12 @@
-"""A virtual clock: charges decisions and plans for their milliseconds without sleeping."""
+"""A virtual clock, which counts the milliseconds of decisions and plans without sleeping, and their latencies."""
 
 from __future__ import annotations
 
+import json
 import time
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
@@ -11,22 +14,24 @@ import torch
 from numpy.typing import NDArray
 
 from latentplan.agents.base import Agent
-from latentplan.config import derive_seed
-from latentplan.evaluation.latency import Charge, Latency
+from latentplan.config import UserError, derive_seed
 from latentplan.planning.model import State, state_device
 from latentplan.planning.objectives import Constraint, Term
 from latentplan.planning.plan import Plan
 
 Result = TypeVar("Result")
-ROUNDING_MS = 1e-6  # a plan that takes whole periods is ready at their end
+ROUNDING_MS = 1e-6  # tolerance, so that a plan that takes whole periods is ready at the end of a period
+MEASURED = "measured"
+_FORMATS = 'a JSON list of milliseconds, {"decision_ms": [...]}, or one number per line'
+_MAX_MS = 1e9  # eleven days
 
 
 class VirtualClock:
-    """Counts the milliseconds of an episode, and charges decisions and plans for the time they take.
+    """Counts the milliseconds of an episode, and charges decisions and plans for their durations.
 
     Args:
         control_hz: Decisions per second, above 0, of a world that goes on while the agent decides; None for a world
-            that waits, where the clock stands still and every plan is ready at once.
+            that waits, in which the clock stands still and every plan is ready at once.
         latency: The durations that are charged.
 
     Attributes:
@@ -40,48 +45,48 @@ class VirtualClock:
         self.control_hz, self.latency = control_hz, latency
         self.episode = -1
         self._decision_began = time.perf_counter()
-        self._beside_ms = 0.0  # time spent on plans during the decision
+        self._plan_ms = 0.0  # time spent on plans during the present decision
         self.restart(0)
 
     def restart(self, seed: int) -> None:
-        """Begins an episode at 0 ms; the durations drawn in it depend on the seed alone."""
+        """Begins an episode at 0 ms; the durations of the episode depend on the seed alone."""
         self.now_ms, self.episode = 0.0, self.episode + 1
         charges = self.latency.charges(derive_seed(seed, "latency"))
         self._charge_decision: Charge = charges[0]
         self._charge_plan: Charge = charges[1]
 
     def advance(self, periods: int) -> None:
-        """Moves the clock to so many periods of 1000 / `control_hz` milliseconds after the start of the episode."""
+        """Sets the clock to a number of periods of 1000 / `control_hz` milliseconds after the start of the episode."""
         self.now_ms = 0.0 if self.control_hz is None else 1000.0 * periods / self.control_hz
 
-    def periods(self, duration_ms: float) -> float:
-        """The number of periods that pass in the world during so many milliseconds; 0 in a world that waits."""
+    def to_periods(self, duration_ms: float) -> float:
+        """A duration as a number of periods of the world; 0 in a world that waits."""
         return 0.0 if self.control_hz is None else duration_ms * self.control_hz / 1000.0
 
     def decide(self, agent: Agent, frame: NDArray[np.uint8]) -> tuple[NDArray[np.float32], float]:
-        """The agent's action, (action,), for a frame seen now, and the milliseconds charged for the decision."""
-        self._decision_began, self._beside_ms = time.perf_counter(), 0.0
+        """The agent's action, (action,), for the present frame, and the milliseconds charged for the decision."""
+        self._decision_began, self._plan_ms = time.perf_counter(), 0.0
         action = agent.act(frame)
-        return action, self._charge_decision(_milliseconds_since(self._decision_began) - self._beside_ms)
+        return action, self._charge_decision(_elapsed_ms(self._decision_began) - self._plan_ms)
 
     def charge_plan(self, compute: Callable[[], Result]) -> tuple[Result, float]:
-        """The result of a computation beside the present decision, and the time in ms at which it is ready."""
-        asked_ms = self.now_ms
-        if not self.latency.is_replayed:  # the decision has taken time before it asked for the plan
-            asked_ms += _milliseconds_since(self._decision_began) - self._beside_ms
+        """The result of a computation beside the present decision, and the time in ms at which the result is ready."""
+        requested_ms = self.now_ms
+        if not self.latency.is_replayed:  # the decision took time before its request for the plan
+            requested_ms += _elapsed_ms(self._decision_began) - self._plan_ms
         started = time.perf_counter()
         result = compute()
-        elapsed_ms = _milliseconds_since(started)
-        self._beside_ms += elapsed_ms
+        elapsed_ms = _elapsed_ms(started)
+        self._plan_ms += elapsed_ms
         waits = self.control_hz is None
-        return result, self.now_ms if waits else asked_ms + self._charge_plan(elapsed_ms)
+        return result, self.now_ms if waits else requested_ms + self._charge_plan(elapsed_ms)
 
 
 class VirtualExecutor:
-    """Computes each plan at once, and hands it over when its duration has passed on the virtual clock.
+    """Computes each plan at once, and returns it when its duration has passed on the virtual clock.
 
-    The executor replaces the worker of a background agent. Its plans take no time from the decisions, as if they were
-    computed on a processor of their own. A plan requested in one episode is dropped when the next begins.
+    The executor replaces the worker of a background agent. Plans take no time from the decisions, as if plans were
+    computed on another processor. A pending plan is dropped when the next episode begins.
 
     Args:
         planner: The planner, such as a `CEMPlanner`.
@@ -89,12 +94,12 @@ class VirtualExecutor:
         clock: The clock that charges the plans.
 
     Attributes:
-        asked_ms: Time in ms at which each plan of this episode was requested, by the tick of its first action.
+        requested_ms: Time in ms at which each plan of this episode was requested, by the tick of its first action.
     """
 
     def __init__(self, planner: Any, model: Any, clock: VirtualClock) -> None:
         self.planner, self.model, self.clock = planner, model, clock
-        self.asked_ms: dict[int, float] = {}
+        self.requested_ms: dict[int, float] = {}
         self._objective: Term | None = None
         self._constraints: Sequence[Constraint] = ()
         self._episode = clock.episode
@@ -111,7 +116,7 @@ class VirtualExecutor:
         self._objective, self._constraints = objective, constraints
 
     def request(self, state: State, tick: int, previous: Plan | None = None, seed: int | None = None) -> bool:
-        """Computes the plan whose first action is due at `tick`; False, and no effect, while another plan is pending.
+        """Computes a plan, unless another plan is pending; returns whether the request was accepted.
 
         Args:
             state: State that the plan starts from, with rows (batch,).
@@ -126,7 +131,7 @@ class VirtualExecutor:
         plan, ready_ms = self.clock.charge_plan(
             lambda: self.planner.plan(self.model, state, previous, generator=generator, **goals)
         )
-        self.asked_ms[tick] = self.clock.now_ms
+        self.requested_ms[tick] = self.clock.now_ms
         self._pending = (tick, plan, ready_ms)
         return True
 
@@ -141,8 +146,90 @@ class VirtualExecutor:
     def _drop_earlier_episode(self) -> None:
         if self._episode != self.clock.episode:
             self._episode, self._pending = self.clock.episode, None
-            self.asked_ms.clear()
+            self.requested_ms.clear()
 
 
-def _milliseconds_since(started: float) -> float:
+def _elapsed_ms(started: float) -> float:
     return 1000.0 * (time.perf_counter() - started)
+
+
+Milliseconds = NDArray[np.float64]
+Charge = Callable[[float], float]  # from measured milliseconds to charged milliseconds
+
+
+@dataclass(frozen=True)
+class Latency:
+    """The durations that the virtual clock charges.
+
+    Attributes:
+        name: `measured`, or the file that the durations came from.
+        decision_ms: Durations of decisions, (duration,); None charges the measured durations.
+        plan_ms: Durations of plans that are computed beside the decisions, (duration,). Given durations count from the
+            frame that the plan begins with, measured durations from the request of the plan. None charges the measured
+            durations.
+    """
+
+    name: str = MEASURED
+    decision_ms: Milliseconds | None = None
+    plan_ms: Milliseconds | None = None
+
+    @property
+    def is_replayed(self) -> bool:
+        """Whether durations are drawn from a distribution, so that results repeat exactly."""
+        return self.decision_ms is not None
+
+    def charges(self, seed: int) -> tuple[Charge, Charge]:
+        """The charges of decisions and of plans in an episode: two random streams that depend on the seed alone."""
+        decision = _make_charge(self.decision_ms, derive_seed(seed, "decision_ms"))
+        return decision, _make_charge(self.plan_ms, derive_seed(seed, "plan_ms"))
+
+
+def read_latency(text: str) -> Latency:
+    """The latency that `--latency` names: `measured`, or a file of milliseconds.
+
+    The `decision_ms` of a file without `plan_ms` hold for plans too.
+
+    Raises:
+        UserError: The file cannot be read, or does not hold durations.
+    """
+    if text == MEASURED:
+        return Latency()
+    try:
+        content = _parse(Path(text).read_text())
+    except OSError as error:
+        raise UserError(f"--latency {text}: {error.strerror}; give {MEASURED!r} or a file of milliseconds") from None
+    except (ValueError, RecursionError):
+        raise UserError(f"--latency {text}: not a file of milliseconds; write {_FORMATS}") from None
+    durations = content if isinstance(content, dict) else {"decision_ms": content}
+    unknown = [name for name in durations if name not in ("decision_ms", "plan_ms")]
+    if unknown or "decision_ms" not in durations:
+        raise UserError(f"--latency {text}: the keys are decision_ms and, if plans differ, plan_ms; got {unknown}")
+    decision_ms = _check_durations(text, "decision_ms", durations["decision_ms"])
+    plan_ms = _check_durations(text, "plan_ms", durations["plan_ms"]) if "plan_ms" in durations else decision_ms
+    return Latency(text, decision_ms, plan_ms)
+
+
+def _make_charge(durations: Milliseconds | None, seed: int) -> Charge:
+    if durations is None:
+        return lambda measured_ms: measured_ms
+    rng, known = np.random.default_rng(seed), durations
+    return lambda measured_ms: float(rng.choice(known))
+
+
+def _parse(text: str) -> Any:
+    """The content of a file of durations, as JSON or as one number per line."""
+    try:
+        content = json.loads(text)
+    except json.JSONDecodeError:
+        return [float(line) for line in text.splitlines() if line.strip()]
+    return content if isinstance(content, list | dict) else [content]
+
+
+def _check_durations(text: str, name: str, values: Any) -> Milliseconds:
+    if not isinstance(values, list) or not values:
+        raise UserError(f"--latency {text}: {name} must be a list of at least one number; write {_FORMATS}")
+    for value in values:
+        is_number = isinstance(value, int | float) and not isinstance(value, bool)
+        if not is_number or not 0 <= value <= _MAX_MS:  # NaN is in no interval
+            raise UserError(f"--latency {text}: {name} must lie in 0 to {_MAX_MS:g}, got {value!r}")
+    return np.asarray(values, dtype=np.float64)

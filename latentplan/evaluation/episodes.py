@@ -1,4 +1,4 @@
-"""Closed-loop episodes of an agent; the start of each depends only on a seed and the index of the episode."""
+"""Closed-loop episodes of an agent, whose starts depend only on a seed and the index of the episode."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 Frame = NDArray[np.uint8]
 Action = NDArray[np.float32]
-Outcome = tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]  # what `step` of a gymnasium environment returns
+Outcome = tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]  # result of `step` of a gymnasium environment
 
 
 @dataclass(frozen=True)
@@ -46,7 +46,7 @@ OnStep = Callable[[Step], None]
 
 
 def episode_seed(seed: int, index: int) -> int:
-    """The seed of episode `index`, in [0, 2**32): it depends on nothing else, so that all agents meet the same starts.
+    """The seed of an episode, in [0, 2**32), which is the same for every agent.
 
     Args:
         seed: Seed of the evaluation, at least 0.
@@ -60,25 +60,25 @@ def evaluate_agent(
 ) -> dict[str, Any]:
     """Returns and decision times of an agent over whole episodes, as plain values for JSON.
 
-    Episode i starts from a state that depends only on `seed` and i, so that two agents meet the same starts. The agent
+    Episode i starts from a state that depends only on `seed` and i, so that all agents have the same starts. The agent
     is reset, and its random stream restarted, before every episode.
 
     Args:
         agent: Any object with `act(frame)`, `reset()` and `seed(seed)`, such as the result of `latentplan.load_agent`.
-        env: One environment with the gymnasium API whose observations are the agent's frames and whose actions are the
-            agent's: for a trained agent, uint8 (64, 64, 3) and (action,) in [-1, 1], as `latentplan.envs.make_env` and
-            `latentplan.envs.wrap_user_env` give. The environment stays open.
+        env: One gymnasium environment with the agent's observations and actions: for a trained agent, frames uint8
+            (64, 64, 3) and actions (action,) in [-1, 1], as from `latentplan.envs.make_env` and
+            `latentplan.envs.wrap_user_env`. The environment stays open.
         seed: Seed of the evaluation, at least 0.
         episodes: Number of episodes, at least 1. An episode lasts until the environment terminates or truncates it.
-        on_step: Called with a `Step` at every decision, and once more when an episode has ended; the time that the
-            call takes does not count as the agent's.
+        on_step: Called with a `Step` at every decision, and once more when an episode has ended; the time of the call
+            is not counted as decision time.
 
     Returns:
         A dictionary with:
             `seed`: As given.
             `episodes`: Number of episodes.
             `returns`: Sum of the rewards of each episode, in order.
-            `mean_return`: Their mean.
+            `mean_return`: Mean of the returns.
             `ci95`: Lower and upper end of the 95 % interval of the mean (Student's t); two None for one episode.
             `decision_ms`: Milliseconds per decision: `p50`, `p95` and `p99`.
             `action_source`: Number of decisions whose action came from a `plan`, the `tail` of an older plan, or the
@@ -96,13 +96,13 @@ def evaluate_agent(
 def run_episodes(
     env: gymnasium.Env[Any, Any], agent: Agent, seeds: Sequence[int], *, on_step: OnStep | None = None
 ) -> list[Episode]:
-    """One episode per seed, in order, the agent in closed loop with the environment.
+    """Plays one episode per seed, in order, with the agent in closed loop.
 
     Args:
         env: Environment of uint8 frames (height, width, channel); it stays open.
         agent: Reset, and its random stream restarted, before every episode.
         seeds: Seed of each episode's start, see `episode_seed`.
-        on_step: Called at every decision, and once more when an episode has ended; its time is not the agent's.
+        on_step: See `evaluate_agent`.
 
     Returns:
         The episodes in the order of the seeds.
@@ -122,10 +122,10 @@ def iterate_episodes(
 
 
 class World(Protocol):
-    """How an environment and an agent take turns during one episode.
+    """The order in which an environment and an agent act during one episode.
 
     Attributes:
-        record: Counts what happens in the episode.
+        record: Counts the rewards, frames and decisions of the episode.
     """
 
     record: EpisodeRecord
@@ -135,7 +135,7 @@ class World(Protocol):
         ...
 
     def decide(self, agent: Agent, frame: Frame) -> Action:
-        """The agent's latest action, (action,), after it had the chance to decide on a frame."""
+        """The agent's latest action, (action,): for this frame, or for an earlier frame while the agent is busy."""
         ...
 
     def step(self) -> Outcome:
@@ -169,14 +169,14 @@ class WaitingWorld:
 
 
 def play_episode(env: Any, agent: Agent, index: int, seed: int, world: World, on_step: OnStep | None) -> Episode:
-    """One episode, from the reset of environment and agent to its end.
+    """Plays one episode, from the reset of environment and agent to the end.
 
     Args:
         env: Environment of uint8 frames (height, width, channel).
         agent: The agent.
         index: Index of the episode, for `on_step`.
         seed: Seed of the episode's start, see `episode_seed`.
-        world: How environment and agent take turns; made for this episode.
+        world: The world of this episode; a new one for every episode.
         on_step: See `run_episodes`.
 
     Raises:
@@ -184,24 +184,24 @@ def play_episode(env: Any, agent: Agent, index: int, seed: int, world: World, on
     """
     frame, _ = env.reset(seed=seed)
     agent.reset()
-    agent.seed(derive_seed(seed, "agent"))  # a stream of its own: actions must not correlate with the start
+    agent.seed(derive_seed(seed, "agent"))  # independent of the stream of the start
     world.begin(seed)
-    record, decision, over = world.record, 0, False
-    while not over:
+    record, decision, is_over = world.record, 0, False
+    while not is_over:
         action = world.decide(agent, frame)
         if on_step is not None:
             on_step(Step(index, decision, record.total_return, frame, action))
         frame, reward, terminated, truncated, info = world.step()
-        record.add_step(_finite(reward), int(info.get("env_frames", 1)))
+        record.add_step(_check_reward(reward), int(info.get("env_frames", 1)))
         decision += 1
-        over = terminated or truncated
+        is_over = terminated or truncated
     if on_step is not None:
         on_step(Step(index, decision, record.total_return, frame, None))
     return record.episode()
 
 
-def _finite(reward: SupportsFloat) -> float:
-    """The reward as a finite number: else a mean over episodes would hide where the NaN came from."""
+def _check_reward(reward: SupportsFloat) -> float:
+    """The reward as a number; refused if it is not finite, because a mean over episodes would hide the episode."""
     value = float(reward)
     if not math.isfinite(value):
         raise UserError(f"the environment gave a reward that is not finite: {value}")

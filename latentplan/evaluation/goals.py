@@ -1,4 +1,4 @@
-"""Scores of episodes on goals named after training, computed from the true state of the simulator.
+"""Scores of episodes for objectives and constraints, computed from the true state of the simulator.
 
 A score uses no prediction of a model: it is computed from the quantities that the environment reports after every
 control step, and for a goal image from the camera's frames. The score therefore does not depend on the agent.
@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from latentplan.envs import SuiteEnv
 
 Floats = NDArray[np.float64]
-MET = 0.9  # degree from which a clause counts as met in films
+MET_DEGREE = 0.9  # degree from which a clause counts as met in films
 PIXEL_MARGIN = 0.1  # root mean square difference to a goal image that counts as one margin; 1 is black to white
 
 
@@ -42,7 +42,7 @@ class Goals:
     """Objectives and constraints of an evaluation.
 
     Attributes:
-        phases: Objectives in the order of their start; without any the objective is that of the training.
+        phases: Objectives in the order of their start; empty for the objective of the training.
         constraints: Clauses that must hold at every control step.
         objective_text: The objectives as text, or None.
         constraint_text: The constraints as text, or None.
@@ -72,14 +72,13 @@ class Score:
 def goal_env(config: EnvConfig) -> EnvConfig:
     """The settings of the training's environment, with the floor drawn behind the start as well.
 
-    Without a floor behind the start a body that moves backwards would not see the floor pass by, and could not tell its
-    own speed.
+    Without a floor behind the start, frames of a body that moves backwards would not show its speed.
     """
     return replace(config, floor="endless")
 
 
 def read_goals(objective: str | None, constraint: str | None, domain: str) -> Goals | None:
-    """The goals that the texts of `--objective` and `--constraint` describe; None where both are None.
+    """Parses the texts of `--objective` and `--constraint`; None if both are None.
 
     Raises:
         UserError: A text is no expression over the domain's quantities, or a goal image cannot be read.
@@ -89,7 +88,7 @@ def read_goals(objective: str | None, constraint: str | None, domain: str) -> Go
     known = scales(domain)
     phases = () if objective is None else parse_schedule(objective, known)
     constraints = () if constraint is None else parse_constraints(constraint, known)
-    for path in {path for phase in phases for path in _goal_paths(phase.objective)}:
+    for path in {path for phase in phases for path in _goal_image_paths(phase.objective)}:
         read_goal_image(path)
     return Goals(phases, constraints, objective, constraint)
 
@@ -99,7 +98,7 @@ class ScoredEnv(gymnasium.Wrapper[Any, Any, Any, Any]):
 
     Attributes:
         scores: Scores of the finished episodes, in order.
-        worth: Value of the objective at each env frame of the present episode.
+        objective_scores: Score of the objective at each env frame of the present episode.
         substeps_per_decision: Steps of the simulator per decision.
         clauses: Pairs of a text and a bool: each clause of the present objective, then each constraint, and whether it
             was met at the last env frame. Empty before the first env frame.
@@ -109,7 +108,7 @@ class ScoredEnv(gymnasium.Wrapper[Any, Any, Any, Any]):
         """Wraps an environment.
 
         Args:
-            env: The environment; it has to report true quantities.
+            env: The environment, which has to report true quantities.
             goals: The goals to score.
             on_objective: Called with the present objective when an episode begins and when the objective changes.
 
@@ -122,14 +121,14 @@ class ScoredEnv(gymnasium.Wrapper[Any, Any, Any, Any]):
         self._suite_env, self.substeps_per_decision = env, env.substeps_per_decision
         env.record_quantities = True
         self.goals, self.scores = goals, list[Score]()
-        self.worth: list[float] = []
+        self.objective_scores: list[float] = []
         self.clauses: list[tuple[str, bool]] = []
         self._on_objective = on_objective
         self._names = tuple(scales(env.domain))
         self._pictures = {
-            path: read_goal_image(path) for phase in goals.phases for path in _goal_paths(phase.objective)
+            path: read_goal_image(path) for phase in goals.phases for path in _goal_image_paths(phase.objective)
         }
-        self._present: Phase | None = None
+        self._reported_phase: Phase | None = None
         self._num_frames = self._num_violated = 0
         self._totals = np.zeros(len(self._names))
 
@@ -137,8 +136,8 @@ class ScoredEnv(gymnasium.Wrapper[Any, Any, Any, Any]):
         """Begins an episode, and its score."""
         self._num_frames = self._num_violated = 0
         self._totals = np.zeros(len(self._names))
-        self.worth, self.clauses, self._present = [], [], None
-        self._announce()
+        self.objective_scores, self.clauses, self._reported_phase = [], [], None
+        self._report_objective()
         return self.env.reset(seed=seed, options=options)
 
     def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
@@ -150,11 +149,11 @@ class ScoredEnv(gymnasium.Wrapper[Any, Any, Any, Any]):
         frame, reward, terminated, truncated, info = self._suite_env.step_schedule(schedule)
         for quantities, frame_reward in zip(info["quantities"], info["rewards"], strict=True):
             self._totals += quantities
-            self._score(dict(zip(self._names, quantities, strict=True)), frame_reward, frame)
+            self._score_control_step(dict(zip(self._names, quantities, strict=True)), frame_reward, frame)
         if terminated or truncated:
-            self.scores.append(self._finished())
+            self.scores.append(self._episode_score())
         else:
-            self._announce()
+            self._report_objective()
         return frame, reward, terminated, truncated, info
 
     def summarize(self, episodes: int) -> dict[str, Any]:
@@ -167,34 +166,35 @@ class ScoredEnv(gymnasium.Wrapper[Any, Any, Any, Any]):
         """
         scores = self.scores[:episodes]
         means = {name: float(np.mean([score.quantities[name] for score in scores])) for name in self._names}
-        found: dict[str, Any] = {"quantities": means}
+        summary: dict[str, Any] = {"quantities": means}
         if self.goals.phases:
             returns = [score.objective_return for score in scores]
-            found |= {"objective": self.goals.objective_text, "objective_return": float(np.mean(returns))}
-            found["objective_returns"] = returns
+            summary |= {"objective": self.goals.objective_text, "objective_return": float(np.mean(returns))}
+            summary["objective_returns"] = returns
         if self.goals.constraints:
             rates = [score.violation_rate for score in scores]
-            found |= {"constraint": self.goals.constraint_text, "violation_rate": float(np.mean(rates))}
-            found["violation_rates"] = rates
-        return found
+            summary |= {"constraint": self.goals.constraint_text, "violation_rate": float(np.mean(rates))}
+            summary["violation_rates"] = rates
+        return summary
 
-    def _score(self, values: dict[str, np.float64], reward: float, picture: NDArray[np.uint8]) -> None:
-        phase = self._phase()
+    def _score_control_step(self, values: dict[str, np.float64], reward: float, picture: NDArray[np.uint8]) -> None:
+        phase = self._current_phase()
         broken = [not shortfall(clause, values.__getitem__) < 0.0 for clause in self.goals.constraints]
         self._num_violated += any(broken)
         self._num_frames += 1
         shown = [(clause.text, not is_broken) for clause, is_broken in zip(self.goals.constraints, broken, strict=True)]
         if phase is not None:
             terms = phase.objective.terms
-            self.worth.append(float(sum(weight * self._worth(term, values, reward, picture) for weight, term in terms)))
+            score = sum(weight * self._score_term(term, values, reward, picture) for weight, term in terms)
+            self.objective_scores.append(float(score))
             degrees = [
                 (clause.text, float(clause_degree(shortfall(clause, values.__getitem__))))
                 for clause in phase.objective.clauses
             ]
-            shown = [(text, degree >= MET) for text, degree in degrees] + shown
+            shown = [(text, degree >= MET_DEGREE) for text, degree in degrees] + shown
         self.clauses = shown
 
-    def _worth(self, term: Any, values: dict[str, np.float64], reward: float, picture: NDArray[np.uint8]) -> float:
+    def _score_term(self, term: Any, values: dict[str, np.float64], reward: float, picture: NDArray[np.uint8]) -> float:
         if isinstance(term, LearnedReturn):
             return reward
         if isinstance(term, GoalImage):
@@ -202,31 +202,31 @@ class ScoredEnv(gymnasium.Wrapper[Any, Any, Any, Any]):
             return float(clause_degree(np.sqrt(np.mean(difference**2)) / PIXEL_MARGIN))
         return float(evaluate(term, values.__getitem__, clause_degree))
 
-    def _phase(self) -> Phase | None:
-        """The objective of the next env frame; None where the objective is that of the training."""
+    def _current_phase(self) -> Phase | None:
+        """The objective at the next env frame; None for the objective of the training."""
         return next((phase for phase in reversed(self.goals.phases) if phase.start <= self._num_frames), None)
 
-    def _announce(self) -> None:
-        phase = self._phase()
-        if phase is not self._present and phase is not None and self._on_objective is not None:
+    def _report_objective(self) -> None:
+        phase = self._current_phase()
+        if phase is not self._reported_phase and phase is not None and self._on_objective is not None:
             self._on_objective(phase.objective)
-        self._present = phase
+        self._reported_phase = phase
 
-    def _finished(self) -> Score:
+    def _episode_score(self) -> Score:
         means = dict(zip(self._names, (self._totals / self._num_frames).tolist(), strict=True))
-        return Score(float(np.sum(self.worth)), self._num_violated / self._num_frames, means)
+        return Score(float(np.sum(self.objective_scores)), self._num_violated / self._num_frames, means)
 
 
 def score_env(env: SuiteEnv, goals: Goals, planner: Any | None) -> ScoredEnv:
-    """The environment with scores; also passes the goals to the agent that plans in it.
+    """The environment with scores; also passes the goals to the planning agent.
 
     Args:
-        env: The environment; it has to report true quantities.
+        env: The environment, which has to report true quantities.
         goals: The goals to score.
         planner: A planning agent, which then pursues the goals; None for an agent that does not plan.
 
     Raises:
-        UserError: The environment does not report true quantities, or the agent does not predict one that a goal names.
+        UserError: The environment does not report true quantities, or the agent does not predict a quantity of a goal.
     """
     if planner is None:
         return ScoredEnv(env, goals)
@@ -236,9 +236,9 @@ def score_env(env: SuiteEnv, goals: Goals, planner: Any | None) -> ScoredEnv:
         planner.set_objective(objective, constraints)
 
     for objective in [None, *(phase.objective for phase in goals.phases)]:
-        change(objective)  # an objective that cannot be planned for is refused before anything is played
+        change(objective)  # raises, before an episode is played, if the agent cannot plan for an objective
     return ScoredEnv(env, goals, change)
 
 
-def _goal_paths(objective: Expression) -> list[str]:
+def _goal_image_paths(objective: Expression) -> list[str]:
     return [term.path for _, term in objective.terms if isinstance(term, GoalImage)]

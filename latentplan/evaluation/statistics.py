@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from scipy.special import stdtrit
 
 Floats = NDArray[np.float64]
-SOURCES = ("plan", "tail", "actor")  # where an action can come from
+SOURCES = ("plan", "tail", "actor")  # possible origins of an action
 
 
 @dataclass(frozen=True)
@@ -26,7 +26,7 @@ class Episode:
         decision_ms: Milliseconds from a frame in memory to an action, (decision,); on a virtual clock the milliseconds
             that the clock charged.
         action_source: Number of decisions by the origin of their action: "plan", "tail" or "actor".
-        surprised: Number of decisions at which the actor replaced a plan because the frame surprised the model.
+        surprised: Number of decisions at which the actor replaced a plan because of the surprise limit.
         deadline_misses: On a virtual clock, the boundaries between periods at which the agent was still deciding.
         plan_age_ms: On a virtual clock, for each action from a plan the milliseconds from the frame that the plan began
             with until the action takes effect, (action,).
@@ -43,7 +43,7 @@ class Episode:
 
 
 class EpisodeRecord:
-    """Counts what happens in an episode while it is played.
+    """Counts the rewards, frames and decisions of an episode.
 
     Attributes:
         total_return: Sum of the rewards so far.

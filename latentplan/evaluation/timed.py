@@ -1,15 +1,15 @@
-"""Episodes in a world that does not wait: time passes in the simulator while the agent decides.
+"""Episodes in a world that does not wait while the agent decides.
 
 Time is counted on a virtual clock, without sleeping. One decision of the environment lasts one period of
 1000 / `control_hz` milliseconds. A decision that takes d milliseconds has these effects:
 
-- It begins at a boundary between two periods, with the frame of that moment.
-- Its action takes effect d milliseconds later, from the simulator's nearest substep on. Until then the previous action
-  holds; at the start of an episode the action is zeros, clamped into the bounds.
-- At each boundary during the decision the agent misses a deadline: it does not see that frame, and the previous action
-  goes on. The next decision begins at the first boundary after the end of the present one.
-- A plan computed beside the decisions is ready when its own duration has passed since its request. It takes no time
-  from the decisions, as if it were computed on a processor of its own.
+- The decision begins at a boundary between two periods, with the frame at this boundary.
+- The action takes effect d milliseconds later, from the simulator's nearest substep on. Before that the previous action
+  is executed; at the start of an episode the action is zeros, clamped into the bounds.
+- At each boundary during the decision the agent misses a deadline: the agent does not get this frame, and the previous
+  action goes on. The next decision begins at the first boundary after the end of the present decision.
+- A plan computed beside the decisions is ready when its duration has passed since its request. The plan takes no time
+  from the decisions, as if plans were computed on another processor.
 - Rendering and simulation take no time.
 """
 
@@ -59,45 +59,45 @@ class ScheduledEnv(Protocol):
         ...
 
 
-class Motors:
-    """The actions that the body executes while the agent decides.
+class DelayedActions:
+    """The actions that are executed in each period, where the action of a decision takes effect with a delay.
 
     Args:
-        rest: Action that holds until the first decision takes effect, (action,).
+        rest: Action that is executed until the first decision takes effect, (action,).
         substeps: Substeps of the simulator in one period.
     """
 
     def __init__(self, rest: Action, substeps: int) -> None:
         self.substeps = substeps
-        self._held = self._coming = rest
-        self._wait = 0  # substeps until the coming action takes effect
-        self._remaining = 0.0  # periods until the decision ends
+        self._before = self._latest = rest
+        self._delay_substeps = 0  # substeps until the latest action takes effect
+        self._busy_periods = 0.0  # periods until the decision ends
 
     @property
     def is_waiting(self) -> bool:
         """Whether the agent is still deciding."""
-        return self._remaining > _ROUNDING
+        return self._busy_periods > _ROUNDING
 
     @property
     def latest(self) -> Action:
-        """The action of the latest decision, (action,), whether or not it has taken effect yet."""
-        return self._coming
+        """The action of the latest decision, (action,), also before it takes effect."""
+        return self._latest
 
-    def order(self, action: Action, late_periods: float) -> None:
-        """Replaces the present action by `action`, (action,), after so many periods."""
-        self._held, self._coming = self._coming, action
-        self._wait, self._remaining = math.floor(late_periods * self.substeps + 0.5), late_periods
+    def replace(self, action: Action, delay_periods: float) -> None:
+        """Replaces the present action by `action`, (action,), after a delay in periods."""
+        self._before, self._latest = self._latest, action
+        self._delay_substeps, self._busy_periods = math.floor(delay_periods * self.substeps + 0.5), delay_periods
 
     def next_period(self) -> list[tuple[Action, int]]:
         """The actions of the coming period, each with its number of substeps, in order."""
-        before = min(self._wait, self.substeps)
-        self._wait, self._remaining = self._wait - before, self._remaining - 1.0
-        parts = [(self._held, before), (self._coming, self.substeps - before)]
+        delay = min(self._delay_substeps, self.substeps)
+        self._delay_substeps, self._busy_periods = self._delay_substeps - delay, self._busy_periods - 1.0
+        parts = [(self._before, delay), (self._latest, self.substeps - delay)]
         return [(action, count) for action, count in parts if count > 0]
 
 
 def load_timed_agent(path: str | Path, mode: str, clock: VirtualClock, device: str = "cpu", **settings: Any) -> Agent:
-    """A trained agent as from `load_agent`; plans computed beside its decisions are charged by the clock.
+    """A trained agent as from `load_agent`, where the clock charges plans that are computed beside the decisions.
 
     Raises:
         UserError: The checkpoint, the mode or a setting cannot be used.
@@ -110,13 +110,13 @@ def load_timed_agent(path: str | Path, mode: str, clock: VirtualClock, device: s
 def iterate_timed_episodes(
     env: ScheduledEnv, agent: Agent, seeds: Sequence[int], clock: VirtualClock, *, on_step: OnStep | None = None
 ) -> Iterator[Episode]:
-    """One episode per seed, played while the clock runs; each comes as soon as it has ended.
+    """Plays one episode per seed while the clock runs, and yields each episode as soon as it has ended.
 
     Args:
         env: Environment of uint8 frames (height, width, channel); it stays open.
         agent: Reset, and its random stream restarted, before every episode.
         seeds: Seed of each episode's start, see `episode_seed`.
-        clock: Charges the agent's decisions; also the clock of `load_timed_agent`, where the agent came from there.
+        clock: Charges the agent's decisions; the same clock as in `load_timed_agent`.
         on_step: Called at every boundary between periods, missed or not, and once more when an episode has ended.
 
     Raises:
@@ -150,42 +150,42 @@ def summarize_timed(episodes: Sequence[Episode], clock: VirtualClock) -> dict[st
 
 
 class RunningWorld:
-    """A world whose time is told by a virtual clock while the agent decides; see the top of this module.
+    """A world that goes on while the agent decides, timed by a virtual clock; see the top of this module.
 
     Args:
-        env: The environment. Where the clock stands still `step` alone is called, not `step_schedule`.
+        env: The environment; `step_schedule` is called only if the clock runs.
         clock: Charges the agent's decisions and plans.
     """
 
     def __init__(self, env: ScheduledEnv, clock: VirtualClock) -> None:
         self.env, self.clock, self.record = env, clock, EpisodeRecord()
         self._is_running = clock.control_hz is not None
-        self._motors = Motors(_rest(env), env.substeps_per_decision if self._is_running else 1)
+        self._actions = DelayedActions(_zero_action(env), env.substeps_per_decision if self._is_running else 1)
         self._periods = 0
-        self._plan_began_ms = 0.0  # time at which the present plan's first frame was seen
+        self._plan_began_ms = 0.0  # time of the frame that the present plan began with
 
     def begin(self, seed: int) -> None:
         """Restarts the clock."""
         self.clock.restart(seed)
 
     def decide(self, agent: Agent, frame: Frame) -> Action:
-        """The agent's latest action, (action,); a new one unless the agent is still deciding on an earlier frame."""
+        """The agent's latest action, (action,): a new action unless the agent is still deciding on an earlier frame."""
         self.clock.advance(self._periods)
-        if self._motors.is_waiting:
+        if self._actions.is_waiting:
             self.record.deadline_misses += 1
         else:
             action, decision_ms = self.clock.decide(agent, frame)
-            self._motors.order(action, self.clock.periods(decision_ms))
+            self._actions.replace(action, self.clock.to_periods(decision_ms))
             self.record.add_decision(agent, decision_ms)
             self._record_plan_age(agent, decision_ms)
-        return self._motors.latest
+        return self._actions.latest
 
     def step(self) -> Outcome:
         """Lets one period pass."""
         self._periods += 1
         if not self._is_running:
-            return self.env.step(self._motors.latest)
-        return self.env.step_schedule(self._motors.next_period())
+            return self.env.step(self._actions.latest)
+        return self.env.step_schedule(self._actions.next_period())
 
     def _record_plan_age(self, agent: Any, decision_ms: float) -> None:
         source = getattr(agent, "last_source", "actor")
@@ -193,13 +193,13 @@ class RunningWorld:
             return
         executor = agent.scheduler.executor if hasattr(agent, "scheduler") else None
         if isinstance(executor, VirtualExecutor):
-            self._plan_began_ms = executor.asked_ms[agent.scheduler.tick - 1 - agent.plan_age]
+            self._plan_began_ms = executor.requested_ms[agent.scheduler.tick - 1 - agent.plan_age]
         elif source == "plan":
             self._plan_began_ms = self.clock.now_ms
         self.record.plan_age_ms.append(self.clock.now_ms + decision_ms - self._plan_began_ms)
 
 
-def _rest(env: ScheduledEnv) -> Action:
+def _zero_action(env: ScheduledEnv) -> Action:
     """An action of zeros, clamped into the bounds."""
     space = env.action_space
     rest: Action = np.zeros(space.shape, np.float32).clip(space.low, space.high)
@@ -207,7 +207,7 @@ def _rest(env: ScheduledEnv) -> Action:
 
 
 def _warm_up(env: ScheduledEnv, agent: Agent, seed: int) -> None:
-    """Makes a few decisions that are not counted, because libraries prepare themselves at a first call."""
+    """Makes a few decisions that are not counted, because the first calls of libraries are slow."""
     frame, _ = env.reset(seed=seed)
     agent.reset()
     for _ in range(WARM_UP_DECISIONS):

@@ -1,14 +1,15 @@
 """The computations of a world model that can be made faster, and their reference in plain torch.
 
-A `WorldModel` asks its backend for everything that planners, agents and learners need often. `Backend` is the
+A `WorldModel` leaves to its backend every computation that planners, agents and learners need often. `Backend` is the
 reference: it works on every device, with every kind of dynamics. The backends in `latentplan.models.fast` return the
-same results up to rounding; `latentplan.models.fast.accelerate` chooses one for a model.
+same results up to rounding; `latentplan.models.fast.accelerate` chooses the backend of a model.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, Any
+from functools import partial
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import torch
 from einops import rearrange
@@ -18,6 +19,23 @@ from latentplan.models.dynamics import Gaussian, State
 
 if TYPE_CHECKING:
     from latentplan.models.world_model import WorldModel
+
+
+class FrameFunctions(NamedTuple):
+    """Belief update and actor of a model for one frame per row, with the weights that the model had when asked.
+
+    The results are float32 and carry no gradients.
+
+    Attributes:
+        advance: `advance(state, action)` returns the deterministic state (rows, deter) after action (rows, action).
+        see: `see(deter, frames)` returns the belief, with the posterior's mean, for deter (rows, deter) and uint8
+            frames (rows, 64, 64, 3).
+        act: `act(state)` returns mean in [-1, 1] and std of the actor's action, (rows, action) each.
+    """
+
+    advance: Callable[[State, Tensor], Tensor]
+    see: Callable[[Tensor, Tensor], State]
+    act: Callable[[State], tuple[Tensor, Tensor]]
 
 
 class Backend:
@@ -36,7 +54,7 @@ class Backend:
     # For planners.
 
     def step(self, model: WorldModel, state: State, action: Tensor) -> tuple[State, Tensor]:
-        """The state after action (rows, action) by the mean of the prior, and the reward (rows,); passes gradients."""
+        """The state after action (rows, action), by the mean of the prior, and the reward (rows,); passes gradients."""
         with model.trunk_precision():
             following = _advance_by_mean(model, state, action)
             return following, model.reward_head.mean(model.reward_head(following.features))
@@ -46,7 +64,7 @@ class Backend:
         return self.step(model, state, action)
 
     def rollout(self, model: WorldModel, state: State, actions: Tensor) -> tuple[Tensor, State]:
-        """Repeated steps along actions (rows, horizon, action).
+        """Rewards and last state of repeated steps along actions (rows, horizon, action).
 
         Gradients reach the state and the actions. A faster backend need not pass gradients to the weights.
 
@@ -80,20 +98,11 @@ class Backend:
         with model.trunk_precision():
             return model.value_head.mean(model.value_head(state.features))
 
-    # For agents, which get one frame at a time: float32 and without gradients.
+    # For agents, which get one frame at a time.
 
-    def advance(self, model: WorldModel, state: State, action: Tensor) -> Tensor:
-        """The deterministic state (rows, deter) after action (rows, action)."""
-        return model.dynamics.advance(state, action)
-
-    def see(self, model: WorldModel, deter: Tensor, frames: Tensor) -> State:
-        """The belief with the posterior's mean for deter (rows, deter) and uint8 frames (rows, 64, 64, 3)."""
-        return model.see(deter, frames)
-
-    def act(self, model: WorldModel, state: State) -> tuple[Tensor, Tensor]:
-        """Mean in [-1, 1] and std of the actor's action, (rows, action) each."""
-        mean, std = model.actor(state.features)
-        return mean, std
+    def frame_functions(self, model: WorldModel) -> FrameFunctions:
+        """Belief update and actor with the model's present weights; an agent asks again at every decision."""
+        return FrameFunctions(model.dynamics.advance, model.see, partial(_act, model))
 
     # For learners, with gradients where weights take part.
 
@@ -151,9 +160,20 @@ class Backend:
 
     @torch.no_grad()
     def move_towards(self, slow: Sequence[Tensor], fast: Sequence[Tensor], rate: float | Tensor) -> None:
-        """Move each of the slow tensors by a share in [0, 1] of its distance to the fast one, in place."""
-        for one, other in zip(slow, fast, strict=True):
-            one.lerp_(other, rate)
+        """Moves each slow tensor towards the fast tensor at its place, by the share `rate` of their distance, in place.
+
+        Args:
+            slow: Tensors that are changed, such as averaged weights.
+            fast: Tensors of the same shapes.
+            rate: Share of the distance, in [0, 1].
+        """
+        for slow_tensor, fast_tensor in zip(slow, fast, strict=True):
+            slow_tensor.lerp_(fast_tensor, rate)
+
+
+def _act(model: WorldModel, state: State) -> tuple[Tensor, Tensor]:
+    mean, std = model.actor(state.features)
+    return mean, std
 
 
 def _shifted_places(size: int, offset: Tensor, pixels: int) -> Tensor:

@@ -7,7 +7,8 @@ from einops import rearrange
 from torch import Tensor, nn
 from torch.nn import functional
 
-FRAME_SIZE = 64
+from latentplan.models.encoder import FRAME_SIZE
+
 SIZE = 32  # side of the decoded picture: each pixel is the mean of SHRINK x SHRINK pixels of the frame
 SHRINK = FRAME_SIZE // SIZE
 GRID = 8
@@ -17,8 +18,8 @@ PATCH = SIZE // GRID
 class Decoder(nn.Module):
     """A grid of 8 x 8 tokens, one 3 x 3 convolution over it, and a patch of 4 x 4 pixels from each token.
 
-    The picture has half the frame's resolution, which still shows a body and costs a quarter. Patches are used instead
-    of transposed convolutions because the bfloat16 gradient of those is five times as slow on a CPU.
+    The picture has half the frame's resolution, which still shows a body and costs a quarter. Patches replace
+    transposed convolutions, whose bfloat16 gradient is five times as slow on a CPU.
     """
 
     pool: Tensor
@@ -49,7 +50,7 @@ class Decoder(nn.Module):
         pixels = rearrange(
             frames, "rows (height y) (width x) channel -> rows height width (y x channel)", y=side, x=side
         )
-        target = pixels.to(patches.dtype) @ self.pool.to(patches.dtype)  # means as a matrix product, the fastest way
+        target = pixels.to(patches.dtype) @ self.pool.to(patches.dtype)  # a matrix product computes these means fastest
         error = patches.float() - target.float().mul_(1.0 / 255.0).sub_(0.5)
         return error.square().sum((1, 2, 3))
 

@@ -16,14 +16,14 @@ UPDATE_SHIFT = 1.0  # subtracted before the update gate's sigmoid, so that untra
 
 
 class State(NamedTuple):
-    """A latent state: `deter` (rows, deter), which remembers the past, and `stoch` (rows, latent)."""
+    """A latent state: the GRU's deterministic state `deter` (rows, deter), and the latent `stoch` (rows, latent)."""
 
     deter: Tensor
     stoch: Tensor
 
     @property
     def features(self) -> Tensor:
-        """Both parts side by side, (..., deter + latent): what every head reads."""
+        """Both parts side by side, the input of every head, (..., deter + latent)."""
         return torch.cat(self, -1)
 
 
@@ -35,9 +35,11 @@ class Gaussian(NamedTuple):
 
 
 class Dynamics(nn.Module):
-    """How latent states change: subclasses define single steps, this class the sequences made of them.
+    """Transitions of latent states. A subclass defines single steps; this class computes sequences of steps.
 
-    A subclass sets `latent_dim` and `deter_dim`, and defines `advance`, `prior` and `posterior`.
+    A subclass sets `latent_dim` and `deter_dim`, and defines `advance`, `prior` and `posterior`. Everything that it
+    remembers is in `deter`: one vector of `ModelConfig.deter_dim` numbers per row, zeros at the start of an episode,
+    which the replay stores in float16.
     """
 
     latent_dim: int
@@ -61,7 +63,7 @@ class Dynamics(nn.Module):
         raise NotImplementedError
 
     def observe(self, embeddings: Tensor, actions: Tensor, deter: Tensor, noise: Tensor) -> tuple[State, Gaussian]:
-        """Filter a sequence of frames into beliefs.
+        """Beliefs about each frame of a sequence, given the frames and actions so far.
 
         Args:
             embeddings: Embeddings of the frames, (batch, time + 1, embedding).
@@ -75,7 +77,7 @@ class Dynamics(nn.Module):
         deters: list[Tensor] = []
         stochs: list[Tensor] = []
         posteriors: list[Gaussian] = []
-        # Unbound once: the gradient of a single slice would be a whole tensor of zeros, for every step.
+        # `unbind` has one gradient for all steps; a slice per step would have a whole tensor of zeros each.
         for time, (embedding, draws) in enumerate(zip(embeddings.unbind(1), noise.unbind(1), strict=True)):
             if time > 0:
                 deter = self.advance(State(deter, stochs[-1]), actions[:, time - 1])
@@ -87,7 +89,7 @@ class Dynamics(nn.Module):
         return State(torch.stack(deters, 1), torch.stack(stochs, 1)), Gaussian(means, stds)
 
     def predict(self, start: State, actions: Tensor) -> tuple[Tensor, Gaussian]:
-        """Predict open loop, without frames: each step continues from the mean of the prior.
+        """Open-loop predictions without frames: each step continues from the mean of the prior.
 
         Args:
             start: States, (rows, ...) each.
@@ -112,14 +114,14 @@ class Dynamics(nn.Module):
         noise: Tensor,
         decay: float = 1.0,
     ) -> tuple[Tensor, Tensor]:
-        """Imagine with samples of a policy and of the prior; gradients flow through the dynamics.
+        """Rollouts with samples of a policy and of the prior; gradients pass through the dynamics.
 
-        The policy reads each state without a gradient, so that an action is credited through the dynamics alone
-        (Hafner et al. 2020, section 3).
+        The policy reads each state without a gradient, so that the gradient of an action passes through the dynamics
+        alone (Hafner et al. 2020, section 3).
 
         Args:
             policy: Mean and std of the action, (rows, action) each, for features (rows, feature).
-            start: Rows of states.
+            start: Start of every rollout, (rows, ...) each.
             action_noise: Standard normal draws for the actions, (horizon, rows, action).
             noise: Standard normal draws for the latents, (horizon, rows, latent).
             decay: Share of a state's gradient that a step passes back to the state before, in [0, 1]. Gradients through

@@ -30,7 +30,7 @@ class Encoder(nn.Module):
         self.linear = nn.Linear(channels[-1] * side * side, embedding_dim)
 
     def forward(self, frames: Tensor) -> Tensor:
-        """Embed uint8 frames (rows, 64, 64, 3) as float32 (rows, embedding)."""
+        """Embeddings, float32 (rows, embedding), of uint8 frames (rows, 64, 64, 3)."""
         patches = rearrange(
             frames, "rows (height y) (width x) channel -> rows height width (y x channel)", y=PATCH, x=PATCH
         )

@@ -7,8 +7,7 @@ from torch import Tensor, nn
 
 from latentplan.models.heads import Actor, ScalarHead, action_distribution
 
-ENDS = 2  # of an interval; two numbers each: whether the end exists, and its position
-CODE_SIZE = 2 * ENDS  # numbers per quantity
+CODE_SIZE = 4  # numbers per quantity: for each end of its interval, whether the end exists and its position
 
 
 class GoalHeads(nn.Module):
@@ -32,11 +31,11 @@ class GoalHeads(nn.Module):
 
     def encode(self, low: Tensor, high: Tensor) -> Tensor:
         """The code of boxes, (..., 4 quantity), for their lower and upper ends (..., quantity), infinite where open."""
-        there = [torch.isfinite(end).float() for end in (low, high)]
-        where = [torch.where(torch.isfinite(end), end / self.scales, 0.0) for end in (low, high)]
-        return torch.cat([there[0], where[0], there[1], where[1]], -1)
+        exists = [torch.isfinite(end).float() for end in (low, high)]
+        position = [torch.where(torch.isfinite(end), end / self.scales, 0.0) for end in (low, high)]
+        return torch.cat([exists[0], position[0], exists[1], position[1]], -1)
 
-    def act(self, features: Tensor, code: Tensor, own: Tensor) -> tuple[Tensor, Tensor]:
+    def act(self, features: Tensor, code: Tensor, task_output: Tensor) -> tuple[Tensor, Tensor]:
         """Mean in [-1, 1] and std of the action.
 
         The goal's actor adds to the output of the task's actor (residual policy learning, Silver et al. 2018), so that
@@ -45,19 +44,19 @@ class GoalHeads(nn.Module):
         Args:
             features: Features of states, (..., feature).
             code: Codes of goals from `encode`, broadcast to the states.
-            own: Raw output of the task's actor at these states, (..., 2 action).
+            task_output: Raw output of the task's actor at these states, (..., 2 action).
         """
-        return action_distribution(own + self.actor.mlp(self._beside(features, code)))
+        return action_distribution(task_output + self.actor.mlp(self._append_code(features, code)))
 
     def value_logits(self, features: Tensor, code: Tensor) -> Tensor:
-        """Logits of the expected discounted worth from a state on, (..., bin)."""
-        logits: Tensor = self.value_head(self._beside(features, code))
+        """Logits of the expected discounted reward for the goal from a state on, (..., bin)."""
+        logits: Tensor = self.value_head(self._append_code(features, code))
         return logits
 
     def value(self, features: Tensor, code: Tensor) -> Tensor:
-        """The expected discounted worth from a state on, (...)."""
+        """The expected discounted reward for the goal from a state on, (...)."""
         return self.value_head.mean(self.value_logits(features, code))
 
     @staticmethod
-    def _beside(features: Tensor, code: Tensor) -> Tensor:
+    def _append_code(features: Tensor, code: Tensor) -> Tensor:
         return torch.cat([features, code.expand(*features.shape[:-1], code.shape[-1])], -1)

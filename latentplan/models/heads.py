@@ -19,7 +19,7 @@ LARGEST_SCALAR = math.exp(SYMLOG_LIMIT) - 1.0  # about 8,100; larger targets sat
 
 
 class NormedLinear(nn.Module):
-    """Linear layer, layer norm, SiLU."""
+    """A linear layer, a layer norm and a SiLU."""
 
     def __init__(self, in_features: int, out_features: int) -> None:
         super().__init__()
@@ -27,7 +27,7 @@ class NormedLinear(nn.Module):
         self.norm = nn.LayerNorm(out_features)
 
     def forward(self, features: Tensor) -> Tensor:
-        """Map (..., in) to (..., out)."""
+        """Outputs (..., out) for features (..., in)."""
         return functional.silu(self.norm(self.linear(features)))
 
 
@@ -43,7 +43,7 @@ class Mlp(nn.Module):
             self.output.bias.zero_()
 
     def forward(self, features: Tensor) -> Tensor:
-        """Map (..., in) to float32 (..., out)."""
+        """Outputs, float32 (..., out), for features (..., in)."""
         hidden = self.trunk(features)
         with torch.autocast(hidden.device.type, enabled=False):
             return self.output(hidden.float())
@@ -106,5 +106,5 @@ def sample_action(mean: Tensor, std: Tensor, noise: Tensor) -> Tensor:
 
 
 def symexp(values: Tensor) -> Tensor:
-    """Inverse of symlog: sign(x) (exp|x| - 1)."""
+    """The inverse of symlog, sign(x) (exp(abs(x)) - 1), of each value."""
     return torch.sign(values) * torch.expm1(values.abs())

@@ -1,11 +1,11 @@
-"""Beliefs of a frame and its three quarter turns, for bodies that are the same from every side.
+"""Beliefs about a frame and its three quarter turns, for tasks that are the same when the picture is rotated.
 
 The network's errors differ between a picture and its quarter turns. An agent that keeps one belief per turn and acts on
-their mean is misled only by errors that most turns share (averaging a network over symmetries: Silver et al. 2017,
-"Mastering the game of Go without human knowledge", methods).
+the mean of the turns is misled only by errors that most turns share (averaging a network over symmetries: Silver et al.
+2017, "Mastering the game of Go without human knowledge", methods).
 
-Such a belief has leaves (batch, turn, size), with the unrotated frame first. An ordinary belief has leaves
-(batch, size). The functions here take both kinds.
+A turned belief has leaves (batch, turn, size), with the unrotated frame first. An ordinary belief has leaves
+(batch, size). The functions of this module take both kinds.
 """
 
 from __future__ import annotations
@@ -55,10 +55,10 @@ def mean_over_turns(values: Tensor, state: State) -> Tensor:
 
 
 class TurnedModel:
-    """The planner's view of a world model whose states are beliefs of all four turns.
+    """A model for planners whose states are beliefs about all four turns, around a world model of one turn.
 
-    A planner scores every candidate in each turn, as it does with particles. Ordinary states (rows, size) and all other
-    attributes are passed on to the model.
+    A planner scores every candidate in each turn, because the turns are particles. Calls with ordinary states
+    (rows, size) and accesses to all other attributes go to the world model.
 
     Args:
         model: The world model of a single turn.
@@ -73,7 +73,7 @@ class TurnedModel:
         self.model = model
 
     def __getattr__(self, name: str) -> Any:
-        if name == "model":  # unpickling asks for attributes before `model` is set
+        if name == "model":  # unpickling reads attributes before `model` is set
             raise AttributeError(name)
         return getattr(self.model, name)
 

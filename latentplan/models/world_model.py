@@ -1,4 +1,4 @@
-"""The world model: encoder, latent dynamics and heads, and the planner's view of them."""
+"""The world model: encoder, latent dynamics, decoder and heads, with the methods that a planner calls."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from latentplan.config import ModelConfig
 from latentplan.config.quantities import TASK_PREFIX
 from latentplan.models.backend import Backend
 from latentplan.models.decoder import Decoder
-from latentplan.models.dynamics import Rssm, State
+from latentplan.models.dynamics import Dynamics, Rssm, State
 from latentplan.models.encoder import Encoder
 from latentplan.models.goal_heads import GoalHeads
 from latentplan.models.heads import Actor, Mlp, ScalarHead, sample_action
 
-PROBE_SHARE = 3  # the probe has a third of the other heads' width: quantities are easy to predict from the latent
+PROBE_SHARE = 3  # the probe has a third of the width of other heads, because quantities are easy to predict
 
 
 class WorldModel(nn.Module):
@@ -45,7 +45,9 @@ class WorldModel(nn.Module):
         self.config, self.action_dim, self.labels = config, action_dim, dict(labels or {})
         embedding_dim, features = config.hidden_dim, config.deter_dim + config.latent_dim
         self.encoder = Encoder(config.encoder_channels, embedding_dim)
-        self.dynamics = Rssm(config.latent_dim, config.deter_dim, config.hidden_dim, action_dim, embedding_dim)
+        self.dynamics: Dynamics = Rssm(
+            config.latent_dim, config.deter_dim, config.hidden_dim, action_dim, embedding_dim
+        )
         self.decoder = Decoder(features, config.decoder_channels)
         self.reward_head = ScalarHead(features, config.hidden_dim, config.num_bins)
         self.continue_head = Mlp(features, config.hidden_dim, 1)
@@ -60,24 +62,24 @@ class WorldModel(nn.Module):
             self.add_goal_heads(goal_dim)
 
     def trunk_precision(self, *, cache: bool = True) -> AbstractContextManager[None]:
-        """A context in which matrix products use `trunk_dtype`; the last layers of heads stay in float32.
+        """A context in which matrix products use `trunk_dtype`; the last layers of heads use float32.
 
         Args:
-            cache: Whether autocast keeps converted weights until the context ends. All threads share this cache and
-                empty it on exit, so two learning threads must not use it: rounding would depend on timing.
+            cache: Whether autocast keeps converted weights until the context ends. All threads share one cache, and
+                each thread empties it on exit. Two threads that learn must not use it, or rounding depends on timing.
         """
         dtype = self.trunk_dtype
         return torch.autocast(self.device.type, dtype, enabled=dtype != torch.float32, cache_enabled=cache)
 
     @property
     def trunk_dtype(self) -> torch.dtype:
-        """Precision of the matrix products outside the last layers of heads, as the backend asks for it."""
+        """Precision of the matrix products outside the last layers of heads; the backend sets it."""
         return self.backend.trunk_dtype
 
     @property
     def device(self) -> torch.device:
         """The device of the parameters."""
-        return self.dynamics.prior_output.weight.device
+        return self.label_scales.device
 
     @property
     def label_names(self) -> tuple[str, ...]:
@@ -95,7 +97,10 @@ class WorldModel(nn.Module):
         return self.label_scales[: len(self.goal_names)]
 
     def add_goal_heads(self, goal_dim: int) -> None:
-        """Add untrained heads for goals to the model.
+        """Adds untrained heads for goals to the model.
+
+        Args:
+            goal_dim: Width of their hidden layers.
 
         Raises:
             ValueError: The model was trained without labels.
@@ -126,7 +131,7 @@ class WorldModel(nn.Module):
         return self.probe_head(features) * self.label_scales
 
     def infer(self, state: State, action: Tensor, frames: Tensor) -> State:
-        """The belief with the posterior's mean, after `action` and the `frames` that followed.
+        """The belief, with the posterior's mean, after actions and the frames that resulted.
 
         Args:
             state: The belief before the action.
@@ -140,7 +145,7 @@ class WorldModel(nn.Module):
         return State(deter, self.dynamics.posterior(deter, self.encoder(frames)).mean)
 
     def step(self, state: State, action: Tensor) -> tuple[State, Tensor]:
-        """The state after action (rows, action), by the mean of the prior, and the reward (rows,) it brings."""
+        """The state after action (rows, action), by the mean of the prior, and the reward (rows,) of the step."""
         return self.backend.step(self, state, action)
 
     def fast_step(self, state: State, action: Tensor) -> tuple[State, Tensor]:
@@ -187,9 +192,10 @@ class WorldModel(nn.Module):
             return torch.sigmoid(self.continue_head(state.features)).squeeze(-1)
 
     def surprise(self, state: State) -> Tensor:
-        """How far the latents of beliefs lie from the prior, in nats, (rows,).
+        """The surprise of beliefs in nats, (rows,): the distance of the latent from the prior.
 
-        Half the squared distance between the latent and the prior's mean, in standard deviations of the prior.
+        Surprise is half the squared distance between the latent and the prior's mean, in standard deviations of the
+        prior.
         """
         prior = self.dynamics.prior(state.deter)
         return 0.5 * ((state.stoch - prior.mean) / prior.std).square().sum(-1)

@@ -1,1 +1,1 @@
-"""Objectives and constraints chosen after training: the language, its parser, and what a planner maximises for them."""
+"""Objectives and constraints chosen after training: the language, the parser, and the objectives of the planner."""

@@ -1,4 +1,4 @@
-"""Boxes: goals that ask quantities to lie within intervals, and the world model as it looks for one such goal.
+"""Boxes: goals that ask quantities to lie within intervals, and a view of the world model for one box.
 
 Most objectives are boxes: `speed -> -1.0 and height > 1.1` asks for `speed` in [-1, -1] and `height` in [1.1, inf). A
 goal-conditioned agent learns a value and an actor for boxes drawn at random (universal value functions, Schaul et al.
@@ -15,14 +15,14 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from latentplan.objectives.expression import Absolute, Both, Clause, Expression, Name, Node, Number
+from latentplan.objectives.expression import Absolute, And, Clause, Expression, Name, Node, Number
 from latentplan.planning.model import repeat_rows, take_step
 
 Interval = tuple[float, float]
 
 
 def scoring_degree(shortfalls: Tensor) -> Tensor:
-    """Degree to which a clause is met, in [0, 1], as the simulator scores it: 1 if met, 0.1 at a shortfall of 1 margin.
+    """Degree to which a clause is met, in [0, 1], as in scores: 1 if met, 0.1 at a shortfall of 1 margin.
 
     Args:
         shortfalls: Shortfalls in margins, any shape; a clause is met at 0 and below.
@@ -31,10 +31,10 @@ def scoring_degree(shortfalls: Tensor) -> Tensor:
 
 
 def planning_degree(shortfalls: Tensor) -> Tensor:
-    """Degree to which a clause is met, in (0, 1], with a slope wherever the clause is not met.
+    """Degree to which a clause is met, in (0, 1], with a gradient wherever the clause is not met.
 
     The degree is the mean of `scoring_degree` and of 1 / (1 + shortfall), which falls slowly, so that a search far from
-    the goal still finds the direction.
+    the goal still makes progress.
 
     Args:
         shortfalls: Shortfalls in margins, any shape; a clause is met at 0 and below.
@@ -58,10 +58,10 @@ def box_degree(low: Tensor, high: Tensor, values: Tensor, scales: Tensor) -> Ten
 
 
 def box_of(expression: Expression, quantities: Sequence[str]) -> dict[str, Interval] | None:
-    """The box that an expression asks for, as intervals by quantity; None if the expression is not a box.
+    """The box of an expression, as intervals by quantity; None if the expression is not a box.
 
-    An expression is a box if it is one term of clauses joined by `and`, each between a quantity, or its absolute value,
-    and a number. A positive weight of the only term does not change the best plan and is ignored.
+    An expression is a box if it has one term, and the term consists of clauses joined by `and`, each between a quantity
+    (or its absolute value) and a number. A positive weight of the term does not change the best plan and is ignored.
 
     Args:
         expression: The objective.
@@ -78,7 +78,7 @@ def box_of(expression: Expression, quantities: Sequence[str]) -> dict[str, Inter
         earlier_low, earlier_high = box.get(name, (-math.inf, math.inf))
         low, high = max(low, earlier_low), min(high, earlier_high)
         if low > high:
-            return None  # the two intervals of this quantity do not meet
+            return None  # the two intervals of this quantity do not overlap
         box[name] = low, high
     return box
 
@@ -139,7 +139,7 @@ class BoxModel:
         for action in actions.unbind(1):
             state, _ = take_step(self.model, state, action)
             features.append(state.features)
-        return self._reward(torch.stack(features, 1)), state  # one call of the goal heads for all steps
+        return self._reward(torch.stack(features, 1)), state  # one call for all steps is faster
 
     def value(self, state: Any) -> Tensor:
         """Expected discounted reward of the box from a state on under the actor for the box, (rows,)."""
@@ -163,9 +163,8 @@ class BoxModel:
         noise[:, 0] = 0.0
         rows, actions = repeat_rows(state, num), []
         for draw in noise.flatten(0, 1).unbind(1):
-            with torch.autocast(
-                draw.device.type, enabled=False
-            ):  # float32: for few rows, casting costs more than bfloat16 saves
+            # In float32, because casting costs more time than bfloat16 saves for few rows.
+            with torch.autocast(draw.device.type, enabled=False):
                 mean, std = self.model.goal_action(rows.features.float(), self._code)
             actions.append((mean + std * draw).clamp(-1.0, 1.0))
             rows, _ = self.model.fast_step(rows, actions[-1])
@@ -183,13 +182,13 @@ class BoxModel:
 
 def _clauses(node: Node) -> list[Clause | None]:
     """The clauses that a node joins by `and`, with None for every part that is not a clause."""
-    if isinstance(node, Both):
+    if isinstance(node, And):
         return _clauses(node.left) + _clauses(node.right)
     return [node if isinstance(node, Clause) else None]
 
 
 def _interval(clause: Clause, quantities: Sequence[str]) -> tuple[str, Interval] | None:
-    """The quantity and the interval that a clause asks for; None if the clause is not an interval of one quantity."""
+    """The quantity and the interval of a clause; None if the clause is not an interval of one quantity."""
     left, right, relation = clause.left, clause.right, clause.relation
     if isinstance(left, Number):
         left, right, relation = right, left, {"<": ">", ">": "<"}.get(relation, relation)

@@ -1,9 +1,9 @@
-"""Expressions over named quantities, and their values from true quantities (simulator) or predicted ones (model).
+"""Expressions over named quantities, and their values from true (simulator) or predicted (model) quantities.
 
 A clause compares two quantities. The shortfall of a clause is the distance by which it does not hold, in units of its
 margin; a degree function turns the shortfall into a number in [0, 1]. `and` multiplies degrees. The margin of a clause
-is the scale of its two sides together: scales add in sums and differences and multiply in products, where a number
-counts as its size.
+is the sum of the scales of its two sides: scales add in sums and differences and multiply in products, where the scale
+of a number is its absolute value.
 """
 
 from __future__ import annotations
@@ -68,7 +68,7 @@ class Clause:
 
 
 @dataclass(frozen=True)
-class Both:
+class And:
     """Two clauses joined by `and`."""
 
     left: Node
@@ -77,7 +77,7 @@ class Both:
 
 @dataclass(frozen=True)
 class LearnedReturn:
-    """The return that the agent was trained for: predicted reward plus the value of the last state."""
+    """The return that the agent was trained on: predicted rewards plus the value of the last state."""
 
 
 @dataclass(frozen=True)
@@ -87,7 +87,7 @@ class GoalImage:
     path: str
 
 
-Node = Number | Name | Absolute | Arithmetic | Clause | Both | LearnedReturn | GoalImage
+Node = Number | Name | Absolute | Arithmetic | Clause | And | LearnedReturn | GoalImage
 
 
 @dataclass(frozen=True)
@@ -104,7 +104,7 @@ class Expression:
 
     @property
     def is_return(self) -> bool:
-        """Whether the expression is the learned return alone, which agents maximise without an objective."""
+        """Whether the expression is only the learned return, which agents maximise without an objective."""
         return len(self.terms) == 1 and self.terms[0][0] > 0.0 and isinstance(self.terms[0][1], LearnedReturn)
 
     @property
@@ -138,7 +138,7 @@ def walk(node: Node) -> Iterator[Node]:
     match node:
         case Absolute(inner):
             yield from walk(inner)
-        case Arithmetic(_, left, right) | Clause(_, left, right) | Both(left, right):
+        case Arithmetic(_, left, right) | Clause(_, left, right) | And(left, right):
             yield from walk(left)
             yield from walk(right)
 
@@ -154,7 +154,7 @@ def evaluate(node: Node, values: Lookup, degree: Degree) -> Values:
     """The value of a term of an expression.
 
     Args:
-        node: A node without learned return or goal image, which are not functions of quantities.
+        node: A node without `LearnedReturn` and `GoalImage`, which are not functions of quantities.
         values: Returns the values of a quantity by its name; all quantities have the same shape.
         degree: Turns shortfalls in margins, positive where a clause does not hold, into degrees in [0, 1].
 
@@ -175,19 +175,19 @@ def evaluate(node: Node, values: Lookup, degree: Degree) -> Values:
             return _OPERATIONS[operator](evaluate(left, values, degree), evaluate(right, values, degree))
         case Clause():
             return degree(shortfall(node, values))
-        case Both(left, right):
+        case And(left, right):
             return evaluate(left, values, degree) * evaluate(right, values, degree)
     raise TypeError(f"{type(node).__name__} is not a function of quantities")
 
 
 def shortfall(clause: Clause, values: Lookup) -> Values:
     """The distance by which a clause does not hold, in units of its margin; negative where an inequality holds."""
-    left, right = (evaluate(side, values, _no_degree) for side in (clause.left, clause.right))
+    left, right = (evaluate(side, values, _refuse_degree) for side in (clause.left, clause.right))
     missing = {"<": left - right, ">": right - left, "->": abs(left - right)}[clause.relation]
     return missing / clause.margin
 
 
-def _no_degree(shortfalls: Values) -> Values:
+def _refuse_degree(shortfalls: Values) -> Values:
     raise AssertionError("the parser refuses a clause inside another clause")
 
 

@@ -1,8 +1,8 @@
 """Objectives and constraints of the planner, made from expressions over quantities that the world model predicts.
 
 The model has `label_names`, states with `features` (rows, feature), and `probe(features)`, the predicted quantities.
-Planning differs from scoring in two points, because a prediction is not the truth: degrees fall more slowly, so that a
-search far from the goal still finds the direction, and the plan keeps a distance from the limit of each constraint.
+Planning differs from scoring in two points: degrees fall more slowly, so that a search far from the goal still
+makes progress, and a plan keeps a distance from the limit of each constraint, because predictions have errors.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from torch import Tensor
 
 from latentplan.config import EnvConfig, UserError
 from latentplan.config.quantities import scales
-from latentplan.objectives.box import BoxView, Interval, box_of, planning_degree
+from latentplan.objectives.box import BoxView, box_of, planning_degree
 from latentplan.objectives.expression import (
     Clause,
     Expression,
@@ -46,13 +46,13 @@ from latentplan.planning.objectives import (
 )
 from latentplan.planning.search.registry import Planner
 
-CAUTION = 0.1  # distance that a plan keeps from the limit of a constraint, in margins
-GUIDANCE = 0.25  # weight of the terminal value, as a share of what the plan would earn at the value's rate of reward
+CONSTRAINT_DISTANCE = 0.1  # distance that a plan keeps from the limit of a constraint, in margins
+GUIDE_WEIGHT = 0.25  # of the guide: 1 would add the reward rate of the terminal value at every step of the plan
 GOAL_DISTANCE = 1.0  # root mean square distance of latents that counts as one margin
 GOAL_IMAGE_SIZE = 64  # pixels, as camera frames
 
 
-def plan_goals(
+def build_goals(
     objective: str | Expression | Term | None,
     constraints: str | Sequence[Constraint],
     *,
@@ -61,16 +61,16 @@ def plan_goals(
     planner: Planner,
     encode_goal: Callable[[str], Tensor],
 ) -> tuple[Term | None, Sequence[Constraint]]:
-    """The planner's objective and constraints for goals written as text.
+    """Builds the planner's objective and constraints from text.
 
     Args:
-        objective: Text, or a parsed expression; a function of rollouts, or None for the objective of the training, is
-            returned as it is.
-        constraints: Inequalities separated by `;`; functions of rollouts are returned as they are.
+        objective: Text, or a parsed expression. A function of rollouts, or None for the objective of the training, is
+            returned unchanged.
+        constraints: Inequalities separated by `;`. Functions of rollouts are returned unchanged.
         model: The world model, with `labels` and `label_names`.
         env: Settings of the environment.
         planner: The planner; its horizon, its discount and its use of the terminal value set the weight of the guide.
-        encode_goal: See `plan_objective`.
+        encode_goal: See `build_objective`.
 
     Raises:
         UserError: A text is not an expression, or names a quantity that this model does not predict.
@@ -83,35 +83,30 @@ def plan_goals(
     if isinstance(objective, str):
         objective = parse_objective(objective, known)
     if isinstance(objective, Expression):
-        objective = _plan_expression(objective, model, env, planner, encode_goal)
+        objective = _build_expression(objective, model, env, planner, encode_goal)
     if isinstance(constraints, str):
         clauses = parse_constraints(constraints, known)
         require_labels(clauses, model.label_names)
-        constraints = [plan_constraint(clauses)]
+        constraints = [build_constraint(clauses)]
     return objective, constraints
 
 
-def learned_box(expression: Expression, model: Any) -> dict[str, Interval] | None:
-    """The box that an expression asks for; None if the expression is not a box or the model has no goal heads."""
-    return box_of(expression, model.goal_names) if getattr(model, "goal_dim", 0) else None
-
-
-def plan_objective(
+def build_objective(
     expression: Expression,
     frames_per_step: int,
     learned: Objective,
     guide: Objective | None,
     encode_goal: Callable[[str], Tensor],
 ) -> Objective:
-    """The predicted score of an expression, summed over the env frames of each rollout with the rollout's weights.
+    """Builds the predicted score of an expression, summed over the env frames of a rollout with the rollout's weights.
 
-    No model predicts the score of an expression beyond the rollout. The guide stands in for that terminal value: states
-    with a high value for the training task, in which the body has not fallen, allow most other tasks too.
+    The model has no terminal value for an expression. The guide replaces the terminal value: from states with a high
+    value for the training task, in which the body has not fallen, most other tasks are possible too.
 
     Args:
         expression: Expression to maximise.
         frames_per_step: Env frames per model step.
-        learned: Objective that `return` stands for.
+        learned: The objective for `return`.
         guide: Added once if the expression does not contain `return`; None adds nothing.
         encode_goal: Returns the latent (latent,) of the image at a path, or one latent per orientation of the beliefs
             (turn, latent); called once per goal image.
@@ -134,20 +129,23 @@ def plan_objective(
     return sum(objectives[1:], objectives[0])
 
 
-def plan_constraint(clauses: Sequence[Clause]) -> Objective:
-    """Predicted violation of the clauses in margins, summed over steps; 0 where all hold by at least `CAUTION`."""
+def build_constraint(clauses: Sequence[Clause]) -> Objective:
+    """Builds the predicted violation of clauses in margins, summed over steps.
+
+    The violation is 0 if all clauses hold by at least `CONSTRAINT_DISTANCE` at every step.
+    """
     return Objective(partial(_violation, tuple(clauses)), needs_states=True, needs=("probe",))
 
 
 def require_labels(nodes: Sequence[Node], labels: Sequence[str]) -> None:
-    """Refuses expressions about quantities that a model does not predict.
+    """Checks that a model predicts all quantities of expressions.
 
     Args:
         nodes: The expressions.
         labels: Names of the quantities that the model predicts.
 
     Raises:
-        UserError: A quantity is not among the labels; the message names the first one.
+        UserError: A quantity is not among the labels; the message names the first such quantity.
     """
     for name in [part.name for node in nodes for part in walk(node) if isinstance(part, Name)]:
         if name not in labels:
@@ -183,7 +181,7 @@ def predicted_quantities(rollout: Rollout) -> Lookup:
     """A function from the name of a quantity to its predicted values after every step, (step, rows), float32."""
 
     @cache
-    def labels() -> Tensor:  # called on the first look-up only: not every model has a probe
+    def labels() -> Tensor:  # called at the first look-up only, because not every model has a probe
         features = torch.stack([state.features for state in rollout.states])
         flat = rollout.model.probe(rearrange(features, "step rows feature -> (step rows) feature")).float()
         return rearrange(flat, "(step rows) label -> label step rows", step=len(features))
@@ -191,27 +189,28 @@ def predicted_quantities(rollout: Rollout) -> Lookup:
     return lambda name: labels()[list(rollout.model.label_names).index(name)]
 
 
-def _plan_expression(
+def _build_expression(
     expression: Expression, model: Any, env: EnvConfig, planner: Planner, encode_goal: Callable[[str], Tensor]
 ) -> Term | None:
     """The planner's objective for an expression; None if the expression is the learned return."""
     require_labels([node for _, node in expression.terms], model.label_names)
     has_value = supports(model, "value") if planner.terminal_value is None else planner.terminal_value
-    box = learned_box(expression, model) if has_value else None
+    has_goal_heads = bool(getattr(model, "goal_dim", 0))
+    box = box_of(expression, model.goal_names) if has_value and has_goal_heads else None
     if box is not None:
         return conditioned(BoxView(box, env.action_repeat))
     if expression.is_return:
         return None
     # A value of v stands for a reward of v (1 - discount) in every future step; the plan has `horizon` steps.
     horizon = planner.goal_horizon or planner.horizon
-    guide = GUIDANCE * horizon * (1.0 - planner.discount) * terminal_value() if has_value else None
+    guide = GUIDE_WEIGHT * horizon * (1.0 - planner.discount) * terminal_value() if has_value else None
     learned = predicted_return(model, planner.terminal_value)
-    return plan_objective(expression, env.action_repeat, learned, guide, encode_goal)
+    return build_objective(expression, env.action_repeat, learned, guide, encode_goal)
 
 
 def _violation(clauses: Sequence[Clause], rollout: Rollout) -> Tensor:
     values = predicted_quantities(rollout)
-    excesses = [torch.as_tensor(shortfall(clause, values)) + CAUTION for clause in clauses]
+    excesses = [torch.as_tensor(shortfall(clause, values)) + CONSTRAINT_DISTANCE for clause in clauses]
     return reduce(torch.stack(excesses).clamp_min(0.0), "clause step rows -> rows", "sum")
 
 

@@ -9,8 +9,8 @@ The grammar, which `_Parser` reads by recursive descent, one method per rule:
     factor:       "-" factor | NUMBER | NAME | "task" "(" NAME ")" | "abs" "(" sum ")" | "(" conjunction ")"
                   | "return" | "goal:FILE"
 
-The parser is written by hand because most of its lines are rules and error messages that a grammar cannot state; a
-parser library would save none of these lines and take longer to import than all texts take to parse.
+The parser is written by hand, because a parser library could not replace most of its lines (checks and error messages),
+and would take longer to import than a text takes to parse.
 """
 
 from __future__ import annotations
@@ -25,8 +25,8 @@ from latentplan.config import UserError
 from latentplan.config.quantities import TASK_PREFIX
 from latentplan.objectives.expression import (
     Absolute,
+    And,
     Arithmetic,
-    Both,
     Clause,
     Expression,
     GoalImage,
@@ -53,10 +53,10 @@ _SWITCH = re.compile(r"\s*(?P<start>[0-9]{1,15})\s*:(?P<text>.*)", re.DOTALL)
 
 
 def parse_schedule(text: str, scales: Mapping[str, float]) -> tuple[Phase, ...]:
-    """Objectives with the env frames at which they begin, from a text such as `height > 1.2; 500: speed -> 1.0`.
+    """Parses objectives with the env frames at which they begin, such as `height > 1.2; 500: speed -> 1.0`.
 
     Args:
-        text: Objectives separated by `;`, each but the first preceded by the env frame from which it holds.
+        text: Objectives separated by `;`; each, except the first, begins with its first env frame.
         scales: Scale of every quantity that an objective may name.
 
     Raises:
@@ -75,7 +75,7 @@ def parse_schedule(text: str, scales: Mapping[str, float]) -> tuple[Phase, ...]:
 
 
 def parse_objective(text: str, scales: Mapping[str, float]) -> Expression:
-    """The objective that a text describes: a weighted sum of clauses, clauses joined by `and`, quantities and `return`.
+    """Parses an objective: a weighted sum of clauses, clauses joined by `and`, quantities, `return` and goal images.
 
     Raises:
         UserError: The text is no objective; the message names the position and the nearest name.
@@ -85,7 +85,7 @@ def parse_objective(text: str, scales: Mapping[str, float]) -> Expression:
 
 
 def parse_reward(text: str, scales: Mapping[str, float], setting: str) -> Expression:
-    """The reward that a text describes: an objective of quantities and tasks, without `return` and goal images.
+    """Parses a reward: an objective of quantities and tasks, without `return` and goal images.
 
     Raises:
         UserError: The text is no reward; the message names the setting.
@@ -97,12 +97,12 @@ def parse_reward(text: str, scales: Mapping[str, float], setting: str) -> Expres
 
 
 def parse_constraints(text: str, scales: Mapping[str, float]) -> tuple[Clause, ...]:
-    """Inequalities that must hold at every moment, from a text that separates them by `;` or joins them by `and`.
+    """Parses inequalities that must hold at every env frame, separated by `;` or joined by `and`.
 
     Raises:
         UserError: The text is no constraint; the message names the position and the nearest name.
     """
-    return tuple(clause for part in text.split(";") for clause in _Parser(part, scales).inequalities())
+    return tuple(clause for part in text.split(";") for clause in _Parser(part, scales).read_inequalities())
 
 
 def split_outside_quotes(text: str, separator: str) -> list[str]:
@@ -111,12 +111,12 @@ def split_outside_quotes(text: str, separator: str) -> list[str]:
 
 
 class _Token(NamedTuple):
-    """A piece of text.
+    """A token of the text.
 
     Attributes:
         kind: `goal`, `number`, `word`, `sign` or `end`.
         text: The characters of the token; empty at the end.
-        position: Index of its first character.
+        position: Index of the first character.
     """
 
     kind: str
@@ -126,17 +126,17 @@ class _Token(NamedTuple):
     @property
     def shown(self) -> str:
         """The token for an error message."""
-        return _shortened(self.text) or "the end"
+        return _shorten(self.text) or "the end"
 
 
 class _Parser:
-    """Reads one text; `places` holds the position of each node by its identity."""
+    """Reads one text; `positions` maps the identity of each node to the index of the node's first character."""
 
     def __init__(self, text: str, scales: Mapping[str, float]) -> None:
         self.text, self.scales = text.strip(), scales
         self.tokens = self._tokenize()
         self.index = self.depth = 0
-        self.places: dict[int, int] = {}
+        self.positions: dict[int, int] = {}
 
     def parse(self) -> Node:
         """The whole text as one node."""
@@ -146,7 +146,7 @@ class _Parser:
         return node
 
     def split_sum(self, node: Node, weight: float) -> list[tuple[float, Node]]:
-        """The terms of a weighted sum, the only place where the learned return and goal images may occur."""
+        """Weight and node of each term of a sum; only a whole term may be the learned return or a goal image."""
         match node:
             case Arithmetic("+" | "-" as sign, left, right):
                 factor = weight if sign == "+" else -weight
@@ -159,18 +159,18 @@ class _Parser:
             self._forbid_whole_terms(node)
         return [(weight, node)]
 
-    def inequalities(self) -> list[Clause]:
+    def read_inequalities(self) -> list[Clause]:
         """The clauses of a constraint."""
         found: list[Clause] = []
         pending = [self.parse()]
         while pending:
             node = pending.pop(0)
-            if isinstance(node, Both):
+            if isinstance(node, And):
                 pending[:0] = [node.left, node.right]
             elif isinstance(node, Clause) and node.relation != "->":
                 found.append(node)
             else:
-                self._fail(node, "a constraint is an inequality such as 'cart < 0.5', or several joined by 'and'")
+                self._fail(node, "a constraint is an inequality such as 'cart < 0.5', or inequalities joined by 'and'")
         return found
 
     def _tokenize(self) -> list[_Token]:
@@ -185,7 +185,7 @@ class _Parser:
             token = _Token(str(match and match.lastgroup), match[0] if match else self.text[position], position)
             if match is None:
                 is_goal = token.text == ":" and tokens and tokens[-1].text == "goal"
-                self._fail(token, 'write goal:FILE or goal:"FILE"' if is_goal else f"{token.text!r} means nothing here")
+                self._fail(token, 'write goal:FILE or goal:"FILE"' if is_goal else f"unexpected {token.text!r}")
             if len(tokens) == _MAX_TOKENS:
                 self._fail(token, f"an expression has at most {_MAX_TOKENS} numbers, names and signs")
             tokens.append(token)
@@ -200,7 +200,7 @@ class _Parser:
             for side in (node, right):
                 if not _is_degree(side):
                     self._fail(sign, "'and' joins clauses such as height > 1.2; write weights around parentheses")
-            node = self._place(Both(node, right), node)
+            node = self._set_position(And(node, right), node)
         return node
 
     def _comparison(self) -> Node:
@@ -219,20 +219,20 @@ class _Parser:
             self._fail(relation, "a comparison needs a quantity on one side at least")
         end = self.tokens[self.index - 1]
         written = self.text[first.position : end.position + len(end.text)]
-        return self._place(Clause(relation.text, left, right, margin, written), left)
+        return self._set_position(Clause(relation.text, left, right, margin, written), left)
 
     def _sum(self) -> Node:
         node = self._product()
         while self._next.text in ("+", "-"):
             sign = self._take()
-            node = self._place(self._combine(sign, node, self._product()), node)
+            node = self._set_position(self._combine(sign, node, self._product()), node)
         return node
 
     def _product(self) -> Node:
         node = self._factor()
         while self._next.text == "*":
             sign = self._take()
-            node = self._place(self._combine(sign, node, self._factor()), node)
+            node = self._set_position(self._combine(sign, node, self._factor()), node)
         return node
 
     def _factor(self) -> Node:
@@ -241,7 +241,7 @@ class _Parser:
             self._fail(self._next, f"more than {_MAX_DEPTH} levels of parentheses and signs")
         token = self._take()
         node = self._read(token)
-        self.places[id(node)] = token.position
+        self.positions[id(node)] = token.position
         self.depth -= 1
         return node
 
@@ -282,7 +282,7 @@ class _Parser:
     def _quantity(self, token: _Token, name: str) -> Name:
         if name in self.scales:
             return Name(name)
-        name = _shortened(name)
+        name = _shorten(name)
         if self._next.text == "(":
             self._fail(token, f"unknown function {name!r}; available: abs(QUANTITY), task(NAME)")
         if not self.scales:
@@ -300,7 +300,7 @@ class _Parser:
     def _check_side(self, relation: _Token, side: Node) -> None:
         parts = list(walk(side))
         self._forbid_whole_terms(side)
-        if any(isinstance(part, Clause | Both) for part in parts):
+        if any(isinstance(part, Clause | And) for part in parts):
             self._fail(relation, "a side of a comparison is a quantity, not a clause")
         kinds = {part.name.startswith(TASK_PREFIX) for part in parts if isinstance(part, Name)}
         if len(kinds) > 1:
@@ -313,7 +313,7 @@ class _Parser:
                 self._fail(part, f"{name} can only be weighted and added")
 
     def _scale(self, node: Node) -> float:
-        """The scale of a side: scales add in sums and multiply in products, where a number counts as its size."""
+        """The scale of one side of a clause, as defined at the top of `latentplan.objectives.expression`."""
         match node:
             case Name(name):
                 return self.scales[name]
@@ -341,21 +341,21 @@ class _Parser:
         if token.text != sign:
             self._fail(token, f"expected {wanted or repr(sign)}, got {token.shown!r}")
 
-    def _place(self, node: Node, first: Node) -> Node:
-        """The node, which begins where its first part begins."""
-        self.places[id(node)] = self.places[id(first)]
+    def _set_position(self, node: Node, first: Node) -> Node:
+        """The node; records that the node begins at the position of its first part."""
+        self.positions[id(node)] = self.positions[id(first)]
         return node
 
     def _fail(self, place: _Token | Node, reason: str) -> NoReturn:
-        position = place.position if isinstance(place, _Token) else self.places[id(place)]
-        raise UserError(f"expression {_shortened(self.text)!r}, position {position + 1}: {reason}")
+        position = place.position if isinstance(place, _Token) else self.positions[id(place)]
+        raise UserError(f"expression {_shorten(self.text)!r}, position {position + 1}: {reason}")
 
 
 def _is_degree(node: Node) -> bool:
     """Whether the value of a node is a degree in [0, 1]: a clause, clauses joined by `and`, or the reward of a task."""
     is_reward = isinstance(node, Name) and node.name.startswith(TASK_PREFIX)
-    return is_reward or isinstance(node, Clause | Both)
+    return is_reward or isinstance(node, Clause | And)
 
 
-def _shortened(text: str) -> str:
+def _shorten(text: str) -> str:
     return text if len(text) <= _MAX_SHOWN else text[: _MAX_SHOWN - 3] + "..."

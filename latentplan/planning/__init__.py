@@ -3,11 +3,11 @@
 The package imports torch and einops, and only the settings from the rest of this project.
 """
 
+from latentplan.config.search import SearchOptions
 from latentplan.planning.adapters import CEMTrajectoryOptimizer
 from latentplan.planning.check import check_model
-from latentplan.planning.compiled import compile_rollout
 from latentplan.planning.controller import ModelPredictiveController
-from latentplan.planning.model import FunctionModel, Model
+from latentplan.planning.model import FunctionModel, Model, compile_rollout
 from latentplan.planning.objectives import (
     Objective,
     Rollout,
@@ -27,7 +27,6 @@ from latentplan.planning.realtime.scheduler import Decision, PlanExecutor, PlanS
 from latentplan.planning.realtime.worker import settle
 from latentplan.planning.search.cem import CEMPlanner, icem_planner, mppi_planner
 from latentplan.planning.search.elites import refit
-from latentplan.planning.search.options import SearchOptions
 from latentplan.planning.search.registry import PLANNERS, Planner, SupportsPlan, make_planner
 
 __all__ = [

@@ -1,4 +1,4 @@
-"""The search for a model that is one NumPy function of a state and an action sequence.
+"""The cross-entropy search for a model that is one NumPy function of a state and an action sequence.
 
 `CEMTrajectoryOptimizer` is a `CEMPlanner` with NumPy arrays and other argument names.
 """
@@ -84,11 +84,13 @@ class CEMTrajectoryOptimizer:
             warm_start_mean: Mean at the start of the search, (horizon, action); None starts at zeros.
         """
         model = _RolloutModel(initial_state, rollout_fn)
-        previous = None if warm_start_mean is None else _plan_around(warm_start_mean)
-        nothing = torch.zeros(1, 0, dtype=torch.float64)  # the rollout function holds the state
-        plan = self._planner.plan(model, nothing, previous, generator=self._generator)
+        previous = None if warm_start_mean is None else _make_plan(warm_start_mean)
+        no_state = torch.zeros(1, 0, dtype=torch.float64)  # the model holds the state
+        plan = self._planner.plan(model, no_state, previous, generator=self._generator)
         if bool(plan.info["is_fallback"].any()):
-            warnings.warn("no sequence had a finite return, so nothing was found", RuntimeWarning, stacklevel=2)
+            warnings.warn(
+                "no sequence had a finite return; the plan is the start of the search", RuntimeWarning, stacklevel=2
+            )
         return plan.mean[0].numpy(), plan.var[0].numpy()
 
     def step_numerical_example(
@@ -107,7 +109,7 @@ class CEMTrajectoryOptimizer:
 
 
 class RolloutController:
-    """Receding-horizon control with a `CEMTrajectoryOptimizer`; `ModelPredictiveController(optimizer, ...)` makes one.
+    """Receding-horizon control with a `CEMTrajectoryOptimizer`; made by `ModelPredictiveController(optimizer, ...)`.
 
     Args:
         optimizer: The optimizer that searches at every step.
@@ -133,13 +135,13 @@ class RolloutController:
 
 
 class _RolloutModel:
-    """A model with a fused rollout that calls a function; the return of a sequence is its first reward."""
+    """A model whose rollout calls a function; the first reward of a sequence is the whole return."""
 
     def __init__(self, state: np.ndarray, rollout_fn: RolloutFunction) -> None:
         self._state, self._rollout_fn = state, rollout_fn
 
     def step(self, state: Tensor, action: Tensor) -> tuple[Tensor, Tensor]:
-        raise NotImplementedError("a rollout function imagines whole sequences only")
+        raise NotImplementedError("a rollout function returns no single steps")
 
     def rollout(self, state: Tensor, actions: Tensor) -> tuple[Tensor, Tensor]:
         rewards = torch.zeros(actions.shape[:2], dtype=torch.float64)
@@ -148,8 +150,8 @@ class _RolloutModel:
         return rewards, state
 
 
-def _plan_around(mean: np.ndarray) -> Plan:
-    """Returns a plan with this mean, of which no action has been executed."""
+def _make_plan(mean: np.ndarray) -> Plan:
+    """Returns a plan with this mean (horizon, action), of which no action has been executed."""
     sequence = torch.as_tensor(mean, dtype=torch.float64)[None]
     zero = torch.zeros(1, dtype=torch.long)
     return Plan(sequence, sequence, torch.ones_like(sequence), torch.zeros(1), {}, None, zero == 0, zero)

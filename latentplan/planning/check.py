@@ -16,8 +16,7 @@ _ROWS, _HORIZON, _NUM = 4, 3, 2
 _OPTIONAL = ("value", "policy", "continues", "uncertainty", "rollout", "fast_step", "propose", "particles")
 _PER_ROW = {"propose": _NUM, "particles": _NUM}  # rows that these methods return per row of their input
 
-Inputs = tuple[State, Tensor]
-"""States (rows, ...) and actions (rows, horizon, action)."""
+Inputs = tuple[State, Tensor]  # states (rows, ...) and actions (rows, horizon, action)
 
 _ARGUMENTS: dict[str, Callable[[State, Tensor], tuple[Any, ...]]] = {
     "step": lambda state, actions: (state, actions[:, 0]),
@@ -27,7 +26,7 @@ _ARGUMENTS: dict[str, Callable[[State, Tensor], tuple[Any, ...]]] = {
     "uncertainty": lambda state, actions: (state, actions[:, 0]),
     "rollout": lambda state, actions: (state, actions),
     "fast_step": lambda state, actions: (state, actions[:, 0]),
-    "propose": lambda state, actions: (state, _NUM, actions.shape[1], _generators(actions)),
+    "propose": lambda state, actions: (state, _NUM, actions.shape[1], _make_generators(actions)),
     "particles": lambda state, actions: (state, _NUM),
 }
 
@@ -55,15 +54,16 @@ def check_model(model: Model, state: State, action_dim: int, *, tolerance: float
     generator = torch.Generator().manual_seed(0)
     actions = torch.rand(_ROWS, _HORIZON, action_dim, generator=generator, dtype=torch.float64) * 2 - 1
     actions = actions.to(dtype=action_dtype(state), device=state_device(state))
-    problems = list(_problems(model, rows, actions, tolerance))
+    problems = list(_find_problems(model, rows, actions, tolerance))
     if problems:
         raise ValueError(f"{type(model).__name__} cannot be planned with:\n- " + "\n- ".join(problems))
     return tuple(name for name in _OPTIONAL if supports(model, name))
 
 
-def _problems(model: Any, state: State, actions: Tensor, tolerance: float) -> Iterator[str]:
+def _find_problems(model: Any, state: State, actions: Tensor, tolerance: float) -> Iterator[str]:
+    """Yields the problems of a model for states (rows, ...) and actions (rows, horizon, action)."""
     if not supports(model, "step"):
-        yield "it has no step(state, action)"
+        yield "the model has no step(state, action)"
         return
     particles = getattr(model, "num_particles", 1)
     if isinstance(particles, bool) or not isinstance(particles, Integral) or particles < 1:
@@ -77,74 +77,76 @@ def _problems(model: Any, state: State, actions: Tensor, tolerance: float) -> It
     for name in ("step", *_OPTIONAL):
         if name == "step" and following is None or not supports(model, name):
             continue
-        problems, answer = _try(model, name, inputs)
+        problems, result = _try(model, name, inputs)
         yield from problems
         if not problems:
-            yield from _row_problems(model, name, inputs, answer, tolerance)
+            yield from _check_rows(model, name, inputs, result, tolerance)
     if supports(model, "policy"):
-        yield from _sample_problems(model, inputs)
+        yield from _check_sample(model, inputs)
     if following is not None:
         first = tree_map(lambda leaf: leaf[torch.zeros(_ROWS, dtype=torch.long, device=leaf.device)], state)
-        yield from _disagreements(model, (first, actions), tolerance)
+        yield from _check_agreement(model, (first, actions), tolerance)
 
 
 def _try(model: Any, name: str, inputs: Inputs) -> tuple[list[str], Any]:
     """Returns the problems of a method, and its result; None if the method raised an exception."""
     given = _ARGUMENTS[name](*inputs)
-    return _call(model, name, given, lambda answer: _answer_problems(name, answer, inputs))
+    return _call(model, name, given, lambda result: _check_result(name, result, inputs))
 
 
 def _call(model: Any, name: str, given: tuple[Any, ...], find: Callable[[Any], Iterator[str]]) -> tuple[list[str], Any]:
-    """Returns the problems of a call (exceptions, changed inputs, and those that `find` yields), and its result."""
+    """Returns the problems of a call (exceptions, changed inputs, and problems that `find` yields), and its result."""
     copies = tree_map(lambda leaf: leaf.clone() if isinstance(leaf, Tensor) else leaf, given)
     try:
-        answer = getattr(model, name)(*copies)
-        problems = list(find(answer))
+        result = getattr(model, name)(*copies)
+        problems = list(find(result))
     except Exception as error:
         return [f"{name}() raises {type(error).__name__}: {error}"], None
     pairs = zip(tree_leaves(given), tree_leaves(copies), strict=True)
     if any(isinstance(before, Tensor) and not _is_same(before, after) for before, after in pairs):
         problems.append(f"{name}() changes its inputs; it has to return new tensors")
-    return problems, answer
+    return problems, result
 
 
-def _answer_problems(name: str, answer: Any, inputs: Inputs) -> Iterator[str]:
+def _check_result(name: str, result: Any, inputs: Inputs) -> Iterator[str]:
+    """Yields the problems of a method's result."""
     state, actions = inputs
     rows, horizon = actions.shape[:2]
     if name in ("step", "fast_step", "rollout"):
         shape, order = ((rows,), "(next_state, reward)") if name != "rollout" else ((rows, horizon), "(rewards, state)")
-        if not isinstance(answer, tuple) or len(answer) != 2:
-            yield f"{name}() must return {order}, got {type(answer).__name__}"
+        if not isinstance(result, tuple) or len(result) != 2:
+            yield f"{name}() must return {order}, got {type(result).__name__}"
             return
-        rewards, last = answer if name == "rollout" else answer[::-1]
-        yield from _vector_problems(f"{name}()'s reward" + "s" * (name == "rollout"), rewards, shape)
-        yield from _state_problems(name, state, last)
+        rewards, last = result if name == "rollout" else result[::-1]
+        yield from _check_tensor(f"{name}()'s reward" + "s" * (name == "rollout"), rewards, shape)
+        yield from _check_state(name, state, last)
     elif name == "particles":
-        if tree_structure(answer) != tree_structure(state):
+        if tree_structure(result) != tree_structure(state):
             yield "particles() returns a state of another structure than it was given"
-        elif count_rows(answer) != _NUM * rows:
+        elif count_rows(result) != _NUM * rows:
             yield f"particles() must return {_NUM * rows} rows for {rows} states and {_NUM} particles"
-        elif not all(_is_finite(leaf) for leaf in tree_leaves(answer)):
+        elif not all(_is_finite(leaf) for leaf in tree_leaves(result)):
             yield "particles() returns NaN or infinity"
     else:
         shapes = {"policy": actions[:, 0].shape, "propose": (_NUM * rows, *actions.shape[1:])}
         title = "policy()'s mode" if name == "policy" else f"{name}()"
-        yield from _vector_problems(title, answer, tuple(shapes.get(name, (rows,))))
+        yield from _check_tensor(title, result, tuple(shapes.get(name, (rows,))))
 
 
-def _state_problems(name: str, state: State, following: State) -> Iterator[str]:
+def _check_state(name: str, state: State, following: State) -> Iterator[str]:
+    """Yields the problems of the state that a method returned for a state."""
     if tree_structure(following) != tree_structure(state):
         yield f"{name}() returns a state of another structure than it was given"
         return
     for before, after in zip(tree_leaves(state), tree_leaves(following), strict=True):
         if before.shape != after.shape or before.dtype != after.dtype:
-            is_, was = (f"{tuple(leaf.shape)} {leaf.dtype}" for leaf in (after, before))
-            yield f"{name}() turns a state of {was} into {is_}"
+            new, old = (f"{tuple(leaf.shape)} {leaf.dtype}" for leaf in (after, before))
+            yield f"{name}() turns a state of {old} into {new}"
         elif not _is_finite(after):
             yield f"{name}() returns NaN or infinity in the state"
 
 
-def _row_problems(model: Any, name: str, inputs: Inputs, together: Any, tolerance: float) -> Iterator[str]:
+def _check_rows(model: Any, name: str, inputs: Inputs, together: Any, tolerance: float) -> Iterator[str]:
     """Yields a problem if the first row has another result when it is the only row."""
     if not _agree(together, getattr(model, name)(*_ARGUMENTS[name](*inputs)), tolerance):
         return  # the method samples, so two results differ anyway
@@ -159,15 +161,16 @@ def _row_problems(model: Any, name: str, inputs: Inputs, together: Any, toleranc
         yield f"rows influence each other: {name}() returns something else for a row that comes alone{order}"
 
 
-def _sample_problems(model: Any, inputs: Inputs) -> Iterator[str]:
+def _check_sample(model: Any, inputs: Inputs) -> Iterator[str]:
+    """Yields the problems of a sample of the policy."""
     state, actions = inputs
     shape = tuple(actions[:, 0].shape)
-    given = (state, _generators(actions)[0])
-    problems, _ = _call(model, "policy", given, lambda sample: _vector_problems("policy()'s sample", sample, shape))
+    given = (state, _make_generators(actions)[0])
+    problems, _ = _call(model, "policy", given, lambda sample: _check_tensor("policy()'s sample", sample, shape))
     yield from problems
 
 
-def _disagreements(model: Any, inputs: Inputs, tolerance: float) -> Iterator[str]:
+def _check_agreement(model: Any, inputs: Inputs, tolerance: float) -> Iterator[str]:
     """Yields a problem for each fused or fast method that does not agree with `step`."""
     state, actions = inputs
     if not _agree(model.step(state, actions[:, 0]), model.step(state, actions[:, 0]), tolerance):
@@ -176,15 +179,15 @@ def _disagreements(model: Any, inputs: Inputs, tolerance: float) -> Iterator[str
         if not _agree(model.fast_step(state, actions[:, 0]), model.step(state, actions[:, 0]), 10 * tolerance):
             yield "fast_step() does not agree with step()"
     if supports(model, "rollout") and not _try(model, "rollout", inputs)[0]:
-        answer, stepped = model.rollout(state, actions), []
+        result, stepped = model.rollout(state, actions), []
         for action in actions.unbind(dim=1):
             state, reward = model.step(state, action)
             stepped.append(reward)
-        if not _agree(answer, (torch.stack(stepped, dim=1), state), 10 * tolerance):
+        if not _agree(result, (torch.stack(stepped, dim=1), state), 10 * tolerance):
             yield "rollout() does not agree with step() after step()"
 
 
-def _vector_problems(name: str, tensor: Any, shape: tuple[int, ...]) -> Iterator[str]:
+def _check_tensor(name: str, tensor: Any, shape: tuple[int, ...]) -> Iterator[str]:
     if not isinstance(tensor, Tensor):
         yield f"{name} must be a tensor, got {type(tensor).__name__}"
     elif tuple(tensor.shape) != shape:
@@ -195,7 +198,7 @@ def _vector_problems(name: str, tensor: Any, shape: tuple[int, ...]) -> Iterator
         yield f"{name} is NaN or infinite"
 
 
-def _generators(actions: Tensor) -> list[torch.Generator]:
+def _make_generators(actions: Tensor) -> list[torch.Generator]:
     return [torch.Generator(actions.device).manual_seed(row) for row in range(len(actions))]
 
 

@@ -26,15 +26,15 @@ class ModelPredictiveController:
     With a `CEMTrajectoryOptimizer` and a rollout function as arguments, the class makes a `RolloutController`.
 
     Args:
-        planner: The planner; see `Planner`.
-        model: The model in which it searches.
+        planner: The planner.
+        model: The model in which the planner searches.
         objective: Maximised; see `CEMPlanner.plan`.
         constraints: Violations that plans must avoid.
         generator: One random stream, or a list with one per environment.
         replan_every: Number of actions executed from each plan; at most the planner's horizon.
 
     Attributes:
-        plan: The plans in use; None before the first.
+        plan: The plans in use; None before the first action and after a reset.
 
     Raises:
         ValueError: `replan_every` does not lie in 1 to the horizon.
@@ -93,13 +93,13 @@ class ModelPredictiveController:
         where = where.to("cpu", torch.bool)
         rows = where.nonzero().squeeze(1)
         if len(rows) == 0:
-            raise ValueError("act_where() needs at least one environment; skip() lets others act everywhere")
+            raise ValueError("act_where() needs at least one environment, got none; call skip() instead")
         before = self.plan, self._is_stale
-        whole = None if self.plan is None or len(self.plan.is_warm) != len(where) else self.plan.aged()
-        self.plan = None if whole is None or self.plan is None else self.plan.take(rows)
-        stale = None if whole is None else self._is_stale
+        aged = None if self.plan is None or len(self.plan.is_warm) != len(where) else self.plan.aged()
+        self.plan = None if aged is None or self.plan is None else self.plan.take(rows)
+        stale = None if aged is None else self._is_stale
         self._is_stale = None if stale is None else stale[rows]
-        generator = _streams_of(self.generator, where) or self.generator
+        generator = _select_streams(self.generator, where) or self.generator
         try:
             action = self._act(tree_map(lambda leaf: leaf[rows.to(leaf.device)], state), generator)
         except BaseException:
@@ -107,13 +107,14 @@ class ModelPredictiveController:
             raise
         assert self.plan is not None
         spread = self.plan.spread(where)
-        is_alike = whole is not None and whole.mean.shape == spread.mean.shape  # differs after a change of objective
-        self.plan = whole.updated(where, spread) if whole is not None and is_alike else spread
+        # After a change of objective the new plans may have another length.
+        is_alike = aged is not None and aged.mean.shape == spread.mean.shape
+        self.plan = aged.updated(where, spread) if aged is not None and is_alike else spread
         self._is_stale = None if stale is None else stale & ~where
         return action
 
     def skip(self) -> None:
-        """Ages the plan by one step, in which another agent acted in every environment."""
+        """Ages the plan by one step; call this method when another agent acts in every environment."""
         if self.plan is not None:
             self.plan = self.plan.aged()
 
@@ -127,28 +128,8 @@ class ModelPredictiveController:
             return None
         batch, horizon = self.plan.actions.shape[:2]
         index = self.plan.elapsed.clamp_max(horizon - 1)
-        is_left = self.plan.is_warm & (self.plan.elapsed < horizon) & ~self._stale()
+        is_left = self.plan.is_warm & (self.plan.elapsed < horizon) & ~self._find_stale()
         return self.plan.actions[torch.arange(batch), index], is_left
-
-    def _act(self, state: State, generator: Generators) -> Tensor:
-        started = time.perf_counter()
-        if self.plan is None or self.plan.mean.shape[0] != count_rows(state):
-            self.plan = self._search(state, None, generator)
-            is_due = torch.ones(count_rows(state), dtype=torch.bool)
-        else:
-            is_due = ~self.plan.is_warm | (self.plan.elapsed >= self.replan_every) | self._stale()
-            if bool(is_due.all()):
-                self.plan = self._search(state, self.plan, generator)
-            elif bool(is_due.any()):
-                with _streams_kept(_streams_of(generator, ~is_due), _streams_of(generator, is_due)):
-                    self.plan = self.plan.updated(is_due, self._search(state, self.plan, generator))
-        self._is_stale = None
-        action = self.plan.actions[torch.arange(len(is_due)), self.plan.elapsed]
-        self.plan = self.plan.executed(self.plan.elapsed + 1)
-        if state_device(state).type == "cuda":
-            torch.cuda.synchronize(state_device(state))
-        self._latencies_ms.append(1000 * (time.perf_counter() - started))
-        return action
 
     def reset(self, mask: Tensor | None = None) -> None:
         """Forgets the plan, so that the next search starts cold.
@@ -171,7 +152,7 @@ class ModelPredictiveController:
         self.objective = objective
         if constraints is not None:
             self.constraints = constraints
-        if self.plan is not None:  # a plan for the old objective is not executed further
+        if self.plan is not None:  # no further action of a plan for the old objective is executed
             self._is_stale = torch.ones_like(self.plan.is_warm)
 
     @property
@@ -191,11 +172,33 @@ class ModelPredictiveController:
         p50, p95, p99 = torch.quantile(times, torch.tensor([0.5, 0.95, 0.99], dtype=torch.float64)).tolist()
         return {"mean_ms": float(times.mean()), "p50_ms": p50, "p95_ms": p95, "p99_ms": p99}
 
-    def _stale(self) -> Tensor:
+    def _act(self, state: State, generator: Generators) -> Tensor:
+        started = time.perf_counter()
+        if self.plan is None or self.plan.mean.shape[0] != count_rows(state):
+            self.plan = self._search(state, None, generator)
+            is_due = torch.ones(count_rows(state), dtype=torch.bool)
+        else:
+            is_due = ~self.plan.is_warm | (self.plan.elapsed >= self.replan_every) | self._find_stale()
+            if bool(is_due.all()):
+                self.plan = self._search(state, self.plan, generator)
+            elif bool(is_due.any()):
+                with _keep_streams(_select_streams(generator, ~is_due), _select_streams(generator, is_due)):
+                    self.plan = self.plan.updated(is_due, self._search(state, self.plan, generator))
+        self._is_stale = None
+        action = self.plan.actions[torch.arange(len(is_due)), self.plan.elapsed]
+        self.plan = self.plan.executed(self.plan.elapsed + 1)
+        if state_device(state).type == "cuda":
+            torch.cuda.synchronize(state_device(state))
+        self._latencies_ms.append(1000 * (time.perf_counter() - started))
+        return action
+
+    def _find_stale(self) -> Tensor:
+        """Returns the environments whose plan was made for another objective, (batch,) bool."""
         assert self.plan is not None
         return torch.zeros_like(self.plan.is_warm) if self._is_stale is None else self._is_stale
 
     def _search(self, state: State, previous: Plan | None, generator: Generators) -> Plan:
+        """Returns a new plan, of which no action has been executed."""
         plan = self.planner.plan(
             self.model,
             state,
@@ -208,10 +211,12 @@ class ModelPredictiveController:
 
 
 @contextlib.contextmanager
-def _streams_kept(waiting: list[torch.Generator], due: list[torch.Generator]) -> Iterator[None]:
+def _keep_streams(waiting: list[torch.Generator], due: list[torch.Generator]) -> Iterator[None]:
     """Restores the random streams of environments that keep their plan, so that only replanned ones draw numbers.
 
-    A stream that a replanned environment shares is not restored.
+    Args:
+        waiting: Streams of environments that keep their plan; a stream that is also in `due` is not restored.
+        due: Streams of environments that are replanned.
     """
     states = [(stream, stream.get_state()) for stream in waiting if all(stream is not other for other in due)]
     try:
@@ -221,8 +226,8 @@ def _streams_kept(waiting: list[torch.Generator], due: list[torch.Generator]) ->
             stream.set_state(state)
 
 
-def _streams_of(generators: Generators, where: Tensor) -> list[torch.Generator]:
-    """Returns the streams of the environments in where (batch,) bool; an empty list if all environments share one."""
+def _select_streams(generators: Generators, where: Tensor) -> list[torch.Generator]:
+    """Returns the streams of the environments in where (batch,) bool; none if all environments share one stream."""
     if generators is None or isinstance(generators, torch.Generator):
         return []
     return [generators[row] for row in where.nonzero().squeeze(1).tolist()]

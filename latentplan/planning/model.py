@@ -10,7 +10,7 @@ A model needs one method, `step`. Optional methods and attributes are detected b
     rollout(state, actions (rows, horizon, action)) -> (rewards (rows, horizon), last_state)     fused fast path
     fast_step(state, action)                         the same as step, faster; need not pass gradients
     propose(state, num, horizon, generators) -> actions (batch num, horizon, action)    fused: sequences of the policy,
-                                                     its mode first, then samples, one generator per row of state
+                                                     the mode first, then samples, one generator per row of state
     particles(state, num) -> state                   `num` versions of each row, batch-major: (batch num) rows
     num_particles                                    number of versions in which every candidate is scored, default 1
 
@@ -23,6 +23,7 @@ Every row of an output must depend on the same row of the inputs only, and a met
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any, Protocol
 
 import torch
@@ -168,3 +169,51 @@ def check_shape(name: str, tensor: Tensor, shape: Sequence[int]) -> None:
     """
     if tensor.shape != torch.Size(shape):
         raise ValueError(f"{name} must have shape {tuple(shape)}, got {tuple(tensor.shape)}")
+
+
+def compile_rollout(model: Model, **options: Any) -> Model:
+    """Returns the same model with a `rollout` that is compiled as one program over all steps of a plan.
+
+    Compiling saves time if a step consists of many small operations (equations of motion, a small network), because
+    Python's overhead per operation is then larger than the arithmetic. The first search of each size waits seconds to a
+    minute for the compiler. Results are the same up to rounding. Objectives and constraints that read the states of a
+    rollout, and `use_continues`, still call `model.step`.
+
+    Args:
+        model: Any model; its own `rollout` is compiled if it has one, else a loop over its `step`.
+        options: Options of `torch.compile`; on a GPU, `mode="reduce-overhead"` records CUDA graphs.
+
+    Returns:
+        A model with all attributes of `model`. It can be pickled if `model` can, and compiles again after unpickling.
+
+    Raises:
+        torch._dynamo.exc.BackendCompilerFailed: While planning, if torch finds no C++ compiler.
+    """
+    return _CompiledModel(model, options)
+
+
+class _CompiledModel:
+    """A model around another one, with a compiled rollout."""
+
+    def __init__(self, model: Model, options: dict[str, Any]) -> None:
+        self._model, self._options = model, options
+        rollout = model.rollout if supports(model, "rollout") else partial(_step_through, model)  # type: ignore[attr-defined]
+        self.rollout = torch.compile(rollout, **options)
+
+    def __getattr__(self, name: str) -> Any:  # called for attributes that this class lacks
+        return getattr(self._model, name)
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return partial(compile_rollout, **self._options), (self._model,)
+
+    def step(self, state: State, action: Tensor) -> tuple[State, Tensor]:
+        return self._model.step(state, action)
+
+
+def _step_through(model: Model, state: State, actions: Tensor) -> tuple[Tensor, State]:
+    """Returns rewards (rows, horizon) and the last state of steps along actions (rows, horizon, action)."""
+    rewards = []
+    for step in range(actions.shape[1]):
+        state, reward = take_step(model, state, actions[:, step])
+        rewards.append(reward)
+    return torch.stack(rewards, dim=1), state

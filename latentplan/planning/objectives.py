@@ -23,9 +23,9 @@ from torch.nn import functional
 
 from latentplan.planning.model import Model, State, check_shape, require, supports
 
-Term = Callable[["Rollout"], Tensor]
-Constraint = Callable[["Rollout"], Tensor]
-View = Callable[[Model], Model]
+Term = Callable[["Rollout"], Tensor]  # the value of each row, (rows,), maximised
+Constraint = Callable[["Rollout"], Tensor]  # the violation of each row, (rows,); at most 0 where it is satisfied
+View = Callable[[Model], Model]  # see `conditioned`
 
 
 @dataclass(frozen=True)
@@ -38,8 +38,8 @@ class Rollout:
         num_particles: Number of rollouts of each candidate.
         actions: Actions, (rows, horizon, action).
         rewards: Predicted reward of each step, (rows, horizon), float32 or float64.
-        weights: Discount of each step and, last, of the final state: (horizon + 1,), or (rows, horizon + 1) if the
-            probability that the episode goes on is included.
+        weights: Discount of each step and of the last state, (horizon + 1,); or (rows, horizon + 1) if the discount
+            includes the probability that the episode goes on.
         start: State before the first step.
         last_state: State after the last step.
         states: State after each step if a term needs the states, otherwise empty.
@@ -58,14 +58,14 @@ class Rollout:
 
 @dataclass(frozen=True)
 class Objective:
-    """A term, or several composed: `objective(rollout) -> (rows,)`, to be maximised.
+    """A term or a composition of terms, `objective(rollout) -> (rows,)`, which a search maximises.
 
     Attributes:
         function: Computes the term from a rollout.
-        needs_states: Whether the term reads the states between start and end, which a fused rollout does not return.
+        needs_states: Whether the term reads the states between start and end; a model's `rollout` does not return them.
         num_particles: Number of rollouts of each candidate that the term needs.
         needs: Methods that the model must have.
-        view: View of the model for a search for this objective alone, see `conditioned`; a sum of terms has none.
+        view: View of the model for a search for this objective alone, see `conditioned`; None for a sum of terms.
     """
 
     function: Term
@@ -171,9 +171,9 @@ def uncertainty_penalty() -> Objective:
 def risk(objective: Term, *, measure: str = "cvar", num_particles: int = 8, worst_share: float = 0.25) -> Objective:
     """Returns an objective with a risk measure over several rollouts of each candidate.
 
-    The rollouts of a candidate differ if the model makes them differ: by `particles(state, num)`, which returns several
-    versions of each state (members of an ensemble, samples of a belief), or by a step that samples. A constraint needs
-    no risk measure, because its violation is the largest over the rollouts.
+    The rollouts of a candidate differ if the model has `particles(state, num)`, which returns several versions of each
+    state (members of an ensemble, samples of a belief), or if a step of the model samples. A constraint needs no risk
+    measure, because its violation is the largest over the rollouts.
 
     Args:
         objective: Objective of one rollout.
@@ -187,7 +187,8 @@ def risk(objective: Term, *, measure: str = "cvar", num_particles: int = 8, wors
     if measure not in ("mean", "worst", "cvar"):
         raise ValueError(f"measure must be mean, worst or cvar, got {measure!r}")
     if num_particles < 1 or not 0.0 < worst_share <= 1.0:
-        raise ValueError(f"risk needs particles and a share in (0, 1], got {num_particles} and {worst_share}")
+        given = f"got {num_particles} and {worst_share}"
+        raise ValueError(f"num_particles must be at least 1 and worst_share must lie in (0, 1], {given}")
     inner, share = as_objective(objective), {"mean": 1.0, "worst": 0.0, "cvar": worst_share}[measure]
     return Objective(partial(_worst, inner, share), inner.needs_states, num_particles, inner.needs)
 
@@ -195,7 +196,7 @@ def risk(objective: Term, *, measure: str = "cvar", num_particles: int = 8, wors
 def at_every_state(function: Callable[[State], Tensor]) -> Objective:
     """Returns the constraint that `function(state) -> (rows,)` is at most 0 in every imagined state.
 
-    The violation is the part of the function above 0, summed over the steps.
+    The violation is the positive part of the function, summed over the steps.
     """
     return Objective(partial(_excess, function), needs_states=True)
 
@@ -203,9 +204,10 @@ def at_every_state(function: Callable[[State], Tensor]) -> Objective:
 def conditioned(view: View) -> Objective:
     """Returns the objective of a learned goal: the goal's reward, and its value of the last state.
 
-    A goal-conditioned model has a reward, a value and a policy for each goal of a family; a view of it has those of one
-    goal. A search for `conditioned(view)` alone runs in the view: the goal's policy makes proposals, and plans have
-    `horizon` steps. In a sum, `conditioned(view)` is scored in rollouts of the model, as every other term is.
+    A goal-conditioned model has a reward, a value and a policy for each goal of a family. A view of this model is a
+    model with the reward, the value and the policy of one goal. A search for `conditioned(view)` alone runs in the
+    view: the goal's policy makes proposals, and plans have `horizon` steps. In a sum, `conditioned(view)` is scored in
+    rollouts of the model, as every other term is.
 
     Args:
         view: `view(model)` returns a model with the same states and steps, but with the reward, the `value` and, for
@@ -214,10 +216,10 @@ def conditioned(view: View) -> Objective:
     return Objective(partial(_conditioned_return, view), needs_states=True, view=view)
 
 
-def seen_for(model: Model, objective: Term | None) -> tuple[Model, Term | None]:
+def apply_view(model: Model, objective: Term | None) -> tuple[Model, Term | None]:
     """Returns the model to search in and the objective to search for.
 
-    For a learned goal alone the model is the goal's view, and the objective is None, the view's own return.
+    For a learned goal alone, the model is the view of this goal, and the objective is None: the view's own return.
     """
     view = objective.view if isinstance(objective, Objective) else None
     if view is None:
@@ -226,7 +228,15 @@ def seen_for(model: Model, objective: Term | None) -> tuple[Model, Term | None]:
 
 
 def predicted_return(model: Model, use_value: bool | None) -> Objective:
-    """Returns the default objective: reward, plus terminal value if `use_value` (None: if the model has a value)."""
+    """Returns the default objective: the reward, plus the terminal value if `use_value`.
+
+    Args:
+        model: The model of the search.
+        use_value: Whether the value is added; None adds it if the model has one.
+
+    Raises:
+        ValueError: `use_value` is true and the model has no value.
+    """
     if use_value is None:
         use_value = supports(model, "value")
     if use_value:
@@ -236,27 +246,26 @@ def predicted_return(model: Model, use_value: bool | None) -> Objective:
 
 def _compose(operation: Callable[[Any, Any], Any], left: Objective, right: Term | float) -> Objective:
     if not callable(right):
-        return Objective(
-            partial(_with_number, operation, left, float(right)), left.needs_states, left.num_particles, left.needs
-        )
+        function = partial(_combine_with_number, operation, left, float(right))
+        return Objective(function, left.needs_states, left.num_particles, left.needs)
     other = as_objective(right)
     particles = {left.num_particles, other.num_particles} - {1}
     if len(particles) > 1:
         raise ValueError(f"terms of one objective must agree on num_particles, got {sorted(particles)}")
     return Objective(
-        partial(_both, operation, left, other),
+        partial(_combine_terms, operation, left, other),
         left.needs_states or other.needs_states,
         max(left.num_particles, other.num_particles),
         (*left.needs, *other.needs),
     )
 
 
-def _with_number(operation: Callable[[Any, Any], Any], left: Term, right: float, rollout: Rollout) -> Tensor:
+def _combine_with_number(operation: Callable[[Any, Any], Any], left: Term, right: float, rollout: Rollout) -> Tensor:
     result: Tensor = operation(left(rollout), right)
     return result
 
 
-def _both(operation: Callable[[Any, Any], Any], left: Term, right: Term, rollout: Rollout) -> Tensor:
+def _combine_terms(operation: Callable[[Any, Any], Any], left: Term, right: Term, rollout: Rollout) -> Tensor:
     result: Tensor = operation(left(rollout), right(rollout))
     return result
 
@@ -303,8 +312,8 @@ def _action_changes(rollout: Rollout) -> Tensor:
 
 
 def _uncertainty(rollout: Rollout) -> Tensor:
-    befores = (rollout.start, *rollout.states[:-1])
-    pairs = zip(befores, rollout.actions.unbind(dim=1), strict=True)
+    before = (rollout.start, *rollout.states[:-1])
+    pairs = zip(before, rollout.actions.unbind(dim=1), strict=True)
     uncertainties = torch.stack([rollout.model.uncertainty(state, action) for state, action in pairs], dim=1)
     check_shape("uncertainty()", uncertainties, rollout.rewards.shape)
     return -(rollout.weights[..., :-1] * uncertainties).sum(dim=1)
@@ -314,18 +323,19 @@ def _worst(inner: Term, share: float, rollout: Rollout) -> Tensor:
     num_worst = max(1, round(share * rollout.num_particles))  # a model may have more particles than the term needs
     values = rearrange(inner(rollout), "(row particle) -> row particle", particle=rollout.num_particles)
     worst = torch.topk(values, num_worst, dim=1, largest=False).values.mean(dim=1)
-    # NaN sorts as the largest number, so a NaN particle would be left out of the worst ones.
+    # NaN sorts as the largest number, so `topk` never counts a NaN particle among the worst.
     worst = worst.masked_fill(values.isnan().any(dim=1), float("nan"))
     return repeat(worst, "row -> (row particle)", particle=rollout.num_particles)
 
 
 def _conditioned_return(view: View, rollout: Rollout) -> Tensor:
-    seen = view(rollout.model)
-    require(seen, "value", "a learned goal")
+    viewed = view(rollout.model)
+    require(viewed, "value", "a learned goal")
     before = (rollout.start, *rollout.states[:-1])
     pairs = zip(before, rollout.actions.unbind(1), strict=True)
-    rewards = torch.stack([seen.step(state, action)[1] for state, action in pairs], dim=1).to(rollout.rewards.dtype)
-    value: Tensor = seen.value(rollout.last_state).to(rewards.dtype)  # type: ignore[attr-defined]
+    rewards = torch.stack([viewed.step(state, action)[1] for state, action in pairs], dim=1)
+    rewards = rewards.to(rollout.rewards.dtype)
+    value: Tensor = viewed.value(rollout.last_state).to(rewards.dtype)  # type: ignore[attr-defined]
     return (rewards * rollout.weights[..., :-1]).sum(dim=1) + rollout.weights[..., -1] * value
 
 

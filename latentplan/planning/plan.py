@@ -1,4 +1,4 @@
-"""The result of a search, as a value. Planners keep no plan: the caller passes the previous plan to the next search."""
+"""The plan that a search returns. A planner keeps no plan: the caller passes the previous plan to the next search."""
 
 from __future__ import annotations
 
@@ -11,6 +11,8 @@ import torch
 from einops import rearrange
 from torch import Tensor
 
+TENSORS = ("actions", "mean", "var", "expected_return", "elites", "is_warm", "elapsed")  # attributes of a `Plan`
+
 
 @dataclass(frozen=True)
 class Plan:
@@ -20,8 +22,8 @@ class Plan:
         actions: The chosen sequence within the bounds, (batch, horizon, action).
         mean: Mean of the search distribution, (batch, horizon, action).
         var: Variance of the search distribution, (batch, horizon, action).
-        expected_return: Predicted return, (batch,): the mean return of the last elites, or with `final` best or better
-            the return of the chosen sequence. NaN where no candidate had a finite return.
+        expected_return: Predicted return, (batch,): the mean return of the last elites, or the return of the chosen
+            sequence if the option `final` is `best` or `better`. NaN where no candidate had a finite return.
         info: Diagnostics, (batch,) or (batch, iteration), and the reason the search ended; see `CEMPlanner.plan`.
         elites: Kept elites, (batch, kept, horizon, action), if the planner keeps some.
         is_warm: Whether the next search may start from this plan, (batch,) bool on the CPU.
@@ -71,7 +73,7 @@ class Plan:
         return (self.info["is_fallback"] & ~self.info["is_policy"]).cpu()
 
     def warn_of_failures(self) -> None:
-        """Warns if a search found no finite return in some environment, so that the caller's policy acts there."""
+        """Warns if no candidate of some environment had a finite return, so that the caller's policy acts there."""
         if bool((self.failures() & (self.info["num_nonfinite"] > 0).cpu()).any()):
             warnings.warn("a search found nothing finite; the policy acts", RuntimeWarning, stacklevel=2)
 
@@ -91,12 +93,11 @@ class Plan:
     def take(self, rows: Tensor) -> Plan:
         """Returns the plans of the environments at rows (chosen,) int, which may repeat."""
 
-        def pick(value: Any) -> Any:
+        def select(value: Any) -> Any:
             return value[rows.to(value.device)] if isinstance(value, Tensor) else value
 
-        fields = ("actions", "mean", "var", "expected_return", "elites", "is_warm", "elapsed")
-        info = {name: pick(value) for name, value in self.info.items()}
-        return Plan(info=info, **{name: pick(getattr(self, name)) for name in fields})
+        info = {name: select(value) for name, value in self.info.items()}
+        return Plan(info=info, **{name: select(getattr(self, name)) for name in TENSORS})
 
     def spread(self, mask: Tensor) -> Plan:
         """Returns these plans, in order, at the environments in mask (batch,) bool, and cold copies elsewhere."""
@@ -105,15 +106,14 @@ class Plan:
     def updated(self, mask: Tensor, new: Plan) -> Plan:
         """Returns this plan, with the environments in mask (batch,) bool taken from a newer plan."""
 
-        def choose(old: Any, fresh: Any) -> Any:
-            if not isinstance(old, Tensor) or not isinstance(fresh, Tensor) or old.shape != fresh.shape:
-                return fresh  # diagnostics of another length exist for the newer search only
-            chosen = rearrange(mask.to(old.device), f"batch -> batch {' '.join(['1'] * (old.ndim - 1))}")
-            return torch.where(chosen, fresh, old)
+        def select(older: Any, newer: Any) -> Any:
+            if not isinstance(older, Tensor) or not isinstance(newer, Tensor) or older.shape != newer.shape:
+                return newer  # diagnostics of another length exist for the newer search only
+            is_newer = rearrange(mask.to(older.device), f"batch -> batch {' '.join(['1'] * (older.ndim - 1))}")
+            return torch.where(is_newer, newer, older)
 
-        info = {name: choose(self.info.get(name), value) for name, value in new.info.items()}
-        fields = ("actions", "mean", "var", "expected_return", "elites", "is_warm", "elapsed")
-        return Plan(info=info, **{name: choose(getattr(self, name), getattr(new, name)) for name in fields})
+        info = {name: select(self.info.get(name), value) for name, value in new.info.items()}
+        return Plan(info=info, **{name: select(getattr(self, name), getattr(new, name)) for name in TENSORS})
 
 
 @dataclass(frozen=True)
@@ -144,7 +144,7 @@ def shift_plan(
     Args:
         previous: The previous plan, of any length.
         horizon: Number of actions of the next plan.
-        tail: `zero`, `hold` (the last action again) or `policy`.
+        tail: How the tail is filled: `zero`, `hold` (the last action repeated) or `policy`.
         bounds: Lowest and highest action, each (action,).
         policy_tail: `policy_tail(sequence, is_tail) -> sequence` fills the tail with the model's policy.
     """

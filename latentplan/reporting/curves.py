@@ -18,10 +18,15 @@ CLOCKS = {"env_frames": "environment frames", "minutes": "minutes"}
 
 
 def read_curve(metrics_csv: str | os.PathLike[str], clock: str, column: str) -> tuple[list[float], list[float]]:
-    """Times and values of one column of a metrics file, from the rows in which the clock and the column have a value.
+    """Times and values of one column of a metrics file, from the rows with a value in both columns.
+
+    Args:
+        metrics_csv: Metrics of a run.
+        clock: Name of the column with the times.
+        column: Name of the column with the values.
 
     Raises:
-        ValueError: The file lacks one of the two columns; the message names those it has.
+        ValueError: The file lacks one of the two columns; the message names the existing columns.
     """
     with open(metrics_csv, newline="", encoding="utf-8") as file:
         reader = csv.DictReader(file)

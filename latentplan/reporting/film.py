@@ -1,4 +1,4 @@
-"""Films of episodes, made by a callback of the rollout."""
+"""Films of episodes, written by a callback that gets every step of an episode."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ DEFAULT_FPS = 20.0
 
 
 class Moment(Protocol):
-    """One step of an episode, as rollouts hand it to their callback."""
+    """One step of an episode; `latentplan.evaluation.episodes.Step` is one."""
 
     @property
     def episode(self) -> int:
@@ -42,7 +42,7 @@ class Moment(Protocol):
 
 
 class ImaginingAgent(Protocol):
-    """An agent that can picture the end of its plan.
+    """An agent that can decode the last state of its plan.
 
     Attributes:
         steps_ahead: Model steps from the present to the last imagined frame.
@@ -59,7 +59,7 @@ class GoalScores(Protocol):
     """Scores of the objective and the constraints of the episode that is filmed."""
 
     @property
-    def worth(self) -> Sequence[float]:
+    def objective_scores(self) -> Sequence[float]:
         """Score of the objective at each env frame so far; empty without an objective."""
 
     @property
@@ -76,18 +76,18 @@ def filming(
     every: int = 1,
     goals: GoalScores | None = None,
 ) -> Iterator[Callable[[Moment], None]]:
-    """Films the first episode that is played inside the block, in real time if the environment gives its frame rate.
+    """Films the first episode inside the `with` block, in real time if the environment tells its frame rate.
 
     Args:
-        path: Path of the film, `.mp4` or `.webm`; the film appears when the block ends without an error.
-        env: The environment that is played; its `render_large` gives the picture if it has this method.
+        path: Path of the film, `.mp4` or `.webm`; the file is created when the block ends without an error.
+        env: The environment of the episode; its method `render_large`, where it exists, renders the pictures.
         planner: The agent, if it plans; None leaves the right side empty.
         every: Decisions per frame of the film; the end of the episode always gets a frame. The film keeps the duration
             of the episode.
-        goals: Scores of an objective or constraints; the film then shows them in a strip.
+        goals: Scores of an objective or constraints; the film shows the scores in a strip.
 
     Yields:
-        The callback for the rollout.
+        The callback, to be called with every step.
     """
     with contextlib.ExitStack() as stack:
         films: list[VideoWriter] = []
@@ -144,5 +144,5 @@ def _compose(
         [f"return {moment.total_return:.1f}    step {moment.decision}"],
         horizon=None if planner is None else planner.steps_ahead,
         absence="episode over" if is_over else "no plan",
-        strip=None if goals is None else draw_goal_strip(goals.worth, goals.clauses),
+        strip=None if goals is None else draw_goal_strip(goals.objective_scores, goals.clauses),
     )

@@ -1,4 +1,4 @@
-"""Frames of a film: the camera beside the frame that the plan predicts, lines of text, and a strip about the goals."""
+"""Frames of a film: the camera beside the imagined frame, lines of text, and a strip with the goals."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ _UNMET = (225, 100, 85)
 _LINE = (120, 170, 240)
 _FONT = cv2.FONT_HERSHEY_SIMPLEX
 _MAX_CLAUSES = STRIP_HEIGHT // LINE_HEIGHT
-_WINDOW = 250  # env frames in the trace of the objective
+_WINDOW = 250  # env frames in the line of scores
 
 
 def compose_frame(
@@ -75,11 +75,11 @@ def compose_frame(
 
 
 def draw_goal_strip(scores: Sequence[float], clauses: Sequence[tuple[str, bool]], width: int = STRIP_WIDTH) -> Frame:
-    """The strip about the goals: a trace of the objective on the left, the clauses on the right.
+    """A strip with the goals: the scores of the objective as a line on the left, the clauses on the right.
 
     Args:
-        scores: Score of the objective at each env frame so far; the last 250 are drawn, on a scale that holds 0 and 1.
-            Without scores the clauses begin on the left.
+        scores: Score of the objective at each env frame so far; the last 250 are drawn, on a scale that includes 0 and
+            1. Without scores the clauses begin on the left.
         clauses: Text of every clause, and whether the clause is met; the last of four rows counts clauses without a
             row of their own.
         width: Width in pixels, even.

@@ -1,7 +1,7 @@
-"""Writer of VP9 video files that are whole or absent.
+"""Writer of VP9 video files, which creates a complete file or none.
 
 OpenCV's writer raises no error and drops frames of a wrong size, so `VideoWriter` checks every frame and reads the file
-back before the file gets its name. VP9 is the only codec of the OpenCV wheel that browsers play.
+back before it renames the file. VP9 is the only codec of the OpenCV wheel that browsers play.
 """
 
 from __future__ import annotations
@@ -22,9 +22,9 @@ CODECS = {".mp4": "vp09", ".webm": "VP90"}
 
 
 class VideoWriter:
-    """Writes RGB frames to a VP9 file, which appears, whole and checked, when the `with` block ends without an error.
+    """Writes RGB frames to a VP9 file, which is checked and renamed when the `with` block ends without an error.
 
-    A block that ends with an exception leaves no new file, and keeps an older file of the same name.
+    If the block ends with an exception, no new file remains, and an older file of the same name is kept.
     """
 
     def __init__(self, path: str | os.PathLike[str], fps: float, size: tuple[int, int]) -> None:
@@ -94,7 +94,7 @@ def check_video_path(path: str | os.PathLike[str]) -> Path:
     """The path, if its ending is allowed for a film.
 
     Raises:
-        UserError: The ending is not allowed; the message names those that are.
+        UserError: The ending is not allowed; the message names the allowed endings.
     """
     checked = Path(path)
     if checked.suffix not in CODECS:

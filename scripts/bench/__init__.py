@@ -1,5 +1,7 @@
 """The benchmarks of `scripts/benchmark.py`.
 
-One module per command: train, render, decide, plan, compile, ablate, zero_shot, realtime, soak, learn. A module whose
-name begins with the name of a command holds a part of it; machine, options, report and statistics are shared.
+Each command has a module of the same name: train, render, decide, paths, plan, compile, ablate, zero_shot, realtime,
+soak, learn. Other modules hold a part of one command, with its name in front (also ablation_arms for ablate, path_calls
+for paths, anchors for learn), or are shared: estimates, machine, options, report, workers. The package peers
+holds planners of other libraries for plan; `readme_film.py` draws the film of the README.
 """

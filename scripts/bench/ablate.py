@@ -1,4 +1,4 @@
-"""`benchmark.py ablate --checkpoint DIR`: the return of a trained planner without each of its parts.
+"""`benchmark.py ablate --checkpoint DIR`: the return of a trained planner with one part left out in each arm.
 
 All arms play the same starts, so the table shows paired differences of episode returns, with 95 % intervals; decision
 times are in milliseconds.
@@ -6,13 +6,15 @@ times are in milliseconds.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
-from bench.ablation_arms import NAMES, REFERENCE, Arm, Outcome, check_checkpoint, parse_arms, play_arm, single_thread
-from bench.report import format_table, interval, number, write_csv, write_json
+from bench.ablation_arms import NAMES, REFERENCE, Outcome, check_checkpoint, parse_arms, play_arm
+from bench.report import format_interval, format_number, format_table, write_csv, write_json
+from bench.workers import run_in_order
 from latentplan.commands.shell import ComputeRequest
 from latentplan.config import to_dict
 from latentplan.config.checks import at_least
@@ -21,14 +23,14 @@ from latentplan.config.parsing import option
 
 @dataclass(frozen=True, kw_only=True)
 class Request(ComputeRequest):
-    """What is played.
+    """Flags of `benchmark.py ablate`.
 
     Attributes:
         checkpoint: Folder of a trained agent, or of a run (its best checkpoint).
         episodes: Episodes of each arm, from the same starts.
         seed: Seed of the starts: episode i starts from a state that depends only on the seed and i.
-        arms: Arms, separated by commas: known names, and name:field=value,field=value for settings of the search.
-        workers: Arms played at once, each in a process of its own.
+        arms: Arms, separated by commas: known names, or name:field=value,field=value for settings of the search.
+        workers: Arms that play at once, each in its own process.
         json: Result as JSON.
         csv: Every episode as CSV.
     """
@@ -47,7 +49,7 @@ class Request(ComputeRequest):
 
 
 def run(request: Request) -> int:
-    """Play every arm from the same starts and compare with the full planner."""
+    """Plays every arm from the same starts and compares the arms with the full planner."""
     episodes, seed, workers, checkpoint = request.episodes, request.seed, request.workers, str(request.checkpoint)
     info, planner = check_checkpoint(request.checkpoint)
     arms = parse_arms(request.arms, planner)
@@ -67,7 +69,8 @@ def run(request: Request) -> int:
     }
     print(f"{about['domain']}-{about['task']}, {episodes} episodes per arm, {workers} at once", flush=True)
     outcomes: dict[str, Outcome] = {}
-    for outcome in _play(checkpoint, arms, seeds, device, workers):
+    play = partial(play_arm, checkpoint=checkpoint, seeds=seeds, device=device)
+    for outcome in run_in_order(play, arms, workers):
         outcomes[outcome.arm.name] = outcome
         print(f"{outcome.arm.name}: mean return {sum(outcome.returns) / episodes:.1f}", flush=True)
         write_csv(request.csv, episode_rows(list(outcomes.values()), seeds))
@@ -78,7 +81,7 @@ def run(request: Request) -> int:
 
 def compare_arms(outcomes: Sequence[Outcome]) -> dict[str, dict[str, Any]]:
     """The mean return of each arm and its paired difference to the first arm, as plain values."""
-    from bench.statistics import mean_estimate, paired_difference
+    from bench.estimates import mean_estimate, paired_difference
 
     reference = outcomes[0].returns
     compared = {}
@@ -108,11 +111,11 @@ def summary_table(compared: dict[str, dict[str, Any]]) -> str:
         rows.append(
             [
                 name,
-                number(facts["mean_return"]),
-                interval(facts["ci95"]),
-                number(facts["minus_full"], sign=True),
-                interval(facts["minus_full_ci95"], sign=True),
-                number(facts["decision_ms"]["p50"], 2),
+                format_number(facts["mean_return"]),
+                format_interval(facts["ci95"]),
+                format_number(facts["minus_full"], sign=True),
+                format_interval(facts["minus_full_ci95"], sign=True),
+                format_number(facts["decision_ms"]["p50"], 2),
                 "-" if share is None else f"{100.0 * share:.0f} %",
             ]
         )
@@ -126,19 +129,3 @@ def episode_rows(outcomes: Sequence[Outcome], seeds: Sequence[int]) -> list[dict
         for outcome in outcomes
         for index, (seed, total, median_ms) in enumerate(zip(seeds, outcome.returns, outcome.episode_ms, strict=True))
     ]
-
-
-def _play(checkpoint: str, arms: Sequence[Arm], seeds: Sequence[int], device: str, workers: int) -> Iterator[Outcome]:
-    """Yields the outcomes in the order of the arms, each as soon as it and all arms before it are finished."""
-    if workers == 1:
-        for arm in arms:
-            yield play_arm(checkpoint, arm, seeds, device, 1)
-        return
-    import multiprocessing
-    from concurrent.futures import ProcessPoolExecutor
-
-    context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(min(workers, len(arms)), context, single_thread) as pool:
-        futures = [pool.submit(play_arm, checkpoint, arm, seeds, device, 1) for arm in arms]
-        for future in futures:
-            yield future.result()

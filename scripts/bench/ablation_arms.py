@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -14,7 +13,7 @@ from latentplan.config.planner import override_planner
 
 REFERENCE = "full"
 NAMES = (REFERENCE, "no_actor", "no_value", "cold", "horizon1", "actor", "random")
-DIFFERENT_ACTION = 0.1
+DIFFERENT_ACTION = 0.1  # difference from which two actions in [-1, 1] count as different
 
 
 class Arm(NamedTuple):
@@ -23,7 +22,7 @@ class Arm(NamedTuple):
     Attributes:
         name: Name of the row in the table.
         mode: `planner`, `actor` or `random`.
-        planner: Settings of the search that replace those of the checkpoint.
+        planner: Settings of the search that replace the settings of the checkpoint.
     """
 
     name: str
@@ -54,7 +53,7 @@ def parse_arms(text: str, base: PlannerConfig) -> list[Arm]:
     """The arms of a text such as `full,actor,wide:init_std=1.0,num_iterations=6`; the reference always comes first.
 
     Args:
-        text: Known names, and `name:field=value,field=value` for settings that replace those of `base`.
+        text: Known names, and `name:field=value,field=value` for settings that replace settings of `base`.
         base: Settings of the search in the checkpoint.
 
     Raises:
@@ -68,27 +67,26 @@ def parse_arms(text: str, base: PlannerConfig) -> list[Arm]:
             raise_unknown("arm", name, NAMES)
         if words and (not name or name in NAMES):
             raise UserError(f"arm {name!r} takes no settings; write newname:{words[0]}")
-        given[name] = dict(_setting(name, word) for word in words)
+        given[name] = dict(_parse_setting(name, word) for word in words)
     names = [REFERENCE, *(name for name in given if name != REFERENCE)]
-    return [_arm(name, given.get(name, {}), base) for name in names]
+    return [_make_arm(name, given.get(name, {}), base) for name in names]
 
 
 def without_actor(base: PlannerConfig) -> dict[str, Any]:
     """Settings of a search that does not use the actor."""
     tail = {"tail": "zero"} if base.tail == "policy" else {}
-    trust = {} if base.surprise_limit is None else {"surprise_limit": None}
-    return {"num_policy_samples": 0, **tail, **trust}
+    surprise = {} if base.surprise_limit is None else {"surprise_limit": None}
+    return {"num_policy_samples": 0, **tail, **surprise}
 
 
-def play_arm(checkpoint: str, arm: Arm, seeds: Sequence[int], device: str, threads: int) -> Outcome:
+def play_arm(arm: Arm, checkpoint: str, seeds: Sequence[int], device: str) -> Outcome:
     """Plays one episode per seed, with the render quality of the checkpoint.
 
     Args:
+        arm: The arm that plays, with one CPU thread.
         checkpoint: Folder of a checkpoint or of a run.
-        arm: The arm that plays.
         seeds: Seeds of the starts.
         device: `cpu` or `cuda`.
-        threads: Number of CPU threads.
     """
     import numpy as np
     import torch
@@ -98,7 +96,7 @@ def play_arm(checkpoint: str, arm: Arm, seeds: Sequence[int], device: str, threa
     from latentplan.evaluation.episodes import Step, run_episodes
     from latentplan.evaluation.statistics import latency_percentiles
 
-    torch.set_num_threads(threads)
+    torch.set_num_threads(1)
     _, config, _ = load_model(checkpoint)
     agent: Any = load_agent(checkpoint, mode=arm.mode, device=device, **arm.planner)
     differs: list[bool] = []
@@ -123,14 +121,8 @@ def play_arm(checkpoint: str, arm: Arm, seeds: Sequence[int], device: str, threa
     )
 
 
-def single_thread() -> None:
-    """Limits a new process to one thread, before torch and the renderer are imported."""
-    for name in ("OMP_NUM_THREADS", "MKL_NUM_THREADS"):
-        os.environ[name] = "1"
-
-
 def check_checkpoint(path: Path) -> tuple[dict[str, Any], PlannerConfig]:
-    """Information about a checkpoint, and its settings of the search.
+    """The description of a checkpoint, and its settings of the search.
 
     Raises:
         UserError: The checkpoint is missing or damaged.
@@ -155,7 +147,7 @@ def _split_arms(text: str) -> list[tuple[str, list[str]]]:
     return arms
 
 
-def _setting(arm: str, word: str) -> tuple[str, str]:
+def _parse_setting(arm: str, word: str) -> tuple[str, str]:
     field, equals, value = word.partition("=")
     if not equals:
         raise UserError(f"arm {arm!r} must be name:field=value,field=value, got {word!r}")
@@ -164,7 +156,7 @@ def _setting(arm: str, word: str) -> tuple[str, str]:
     return field, value
 
 
-def _arm(name: str, settings: dict[str, str], base: PlannerConfig) -> Arm:
+def _make_arm(name: str, settings: dict[str, str], base: PlannerConfig) -> Arm:
     if name in ("actor", "random"):
         return Arm(name, name, {})
     known: dict[str, dict[str, Any]] = {

@@ -1,11 +1,11 @@
-"""Published returns of training from pixels, for comparison with our learning curves.
+"""Published returns of training from pixels, to compare with the learning curves of this project.
 
 Episode returns of `dm_control.suite`, at most 1,000; frames are simulator control steps, before action repeat. Read
 from the result files in the public repositories of TD-MPC2 (nicklashansen/tdmpc2, 3 seeds), DreamerV3
 (danijar/dreamerv3, 10 seeds, training episodes), MR.Q (facebookresearch/MRQ, 10 seeds) and DrQ-v2
 (facebookresearch/drqv2), off the curve of EfficientZero V2 (Shengjiewang-Jason/EfficientZeroV2), and from the tables of
-ResAct (2025) and COVR (2026), the latter with an outside vision-language model. PlaNet, Dreamer, CURL and DrQ are as
-those tables repeat them.
+ResAct (2025) and COVR (2026), the latter with an outside vision-language model. The returns of PlaNet, Dreamer, CURL
+and DrQ come from these two tables.
 """
 
 from __future__ import annotations
@@ -84,7 +84,7 @@ _REPEAT_2: dict[str, dict[str, Row]] = {
     },
 }
 
-# Action repeat 8 for cartpole, 4 for reacher, cheetah and cup, 2 for finger and walker; after 100,000 frames.
+# Returns after 100,000 frames; action repeat 8 for cartpole, 4 for reacher, cheetah and cup, 2 for finger and walker.
 _METHODS = tuple(f"{name} (own repeat)" for name in ("PlaNet", "Dreamer", "CURL", "DrQ", "ResAct", "COVR"))
 METHODS = ("TD-MPC2", "DreamerV3", "MR.Q", "DrQ-v2", "EfficientZero V2", *_METHODS)
 _OWN_REPEAT: dict[str, tuple[float, ...]] = {
@@ -97,10 +97,10 @@ _OWN_REPEAT: dict[str, tuple[float, ...]] = {
 }
 
 
-def published(task: str) -> dict[str, Mapping[int, float]]:
-    """Returns of each method on a task `domain-name`, by frames; empty where none are known.
+def published_returns_of(task: str) -> dict[str, Mapping[int, float]]:
+    """Returns of each method on a task `domain-name`, by env frames; empty for a task without published returns.
 
-    Methods that repeat actions as often as `configs/` does here, and not twice, are marked `own repeat`.
+    The mark `own repeat` stands at methods with the action repeat of the project's `configs/` instead of 2.
     """
     rows: dict[str, Row] = dict(_REPEAT_2.get(task, {}))
     for method, value in zip(_METHODS, _OWN_REPEAT.get(task, ()), strict=False):

@@ -1,7 +1,7 @@
-"""`benchmark.py compile`: searches in small models, stepped by Python and with `compile_rollout`.
+"""`benchmark.py compile`: searches in small models, stepped in Python or compiled by `compile_rollout`.
 
-The table shows median milliseconds per search of both, their ratio, the seconds of compilation, and the largest
-difference of the planned actions.
+The table shows median milliseconds per search of both versions, the ratio of the two medians, the seconds of
+compilation, and the largest difference between the planned actions.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from statistics import median
 from typing import TYPE_CHECKING, Any
 
 from bench.options import SearchRequest
-from bench.report import format_table, number, write_json
+from bench.report import format_number, format_table, write_json
 from latentplan.config.checks import at_least
 from latentplan.config.parsing import option
 
@@ -21,15 +21,15 @@ if TYPE_CHECKING:
 
     from latentplan.planning import CEMPlanner, Model
 
-WARM_UP_PLANS = 3  # torch compiles for the first size, then once more for sizes that vary
+WARM_UP_PLANS = 3  # torch.compile compiles at the first size, and again, for any size, at the second
 
 
 @dataclass(frozen=True, kw_only=True)
 class Request(SearchRequest):
-    """What is timed.
+    """Flags of `benchmark.py compile`.
 
     Attributes:
-        plans: Timed searches of each model, taken in turns.
+        plans: Timed searches of each version of each model.
         json: Result as JSON.
     """
 
@@ -42,7 +42,7 @@ class Request(SearchRequest):
 
 
 def run(request: Request) -> int:
-    """Time searches in both versions of each model, in turns, and print how they compare."""
+    """Times searches in both versions of each model, in turns, and prints the comparison."""
     plans, sizes = request.plans, request.sizes
     device_name = request.use_device()
     import torch
@@ -67,7 +67,8 @@ def run(request: Request) -> int:
     print(f"{machine['name']} ({device.type}, {machine['threads']} threads), {extent}")
     header = ["model", "stepped, ms p50", "compiled", "ratio", "compilation, s", "actions differ by"]
     keys = (("stepped_ms", 1), ("compiled_ms", 1), ("ratio", 2), ("compilation_s", 1), ("largest_difference", 7))
-    print(format_table(header, [[row["model"], *(number(row[key], digits) for key, digits in keys)] for row in rows]))
+    lines = [[row["model"], *(format_number(row[key], digits) for key, digits in keys)] for row in rows]
+    print(format_table(header, lines))
     write_json(request.json, {**sizes, "plans": plans, "machine": machine, "rows": rows})
     return 0
 
@@ -107,18 +108,18 @@ def measure_model(model: Model, state: torch.Tensor, planner: CEMPlanner, plans:
 
     Returns:
         `stepped_ms`, `compiled_ms`, their `ratio`, `compilation_s` (extra seconds of the first compiled searches) and
-        `largest_difference` between the planned action sequences of both.
+        `largest_difference` between the planned action sequences of both versions.
     """
     import torch
 
-    from bench.machine import now
+    from bench.machine import read_clock
     from latentplan.planning import compile_rollout
 
     def search(arm: Model, seed: int) -> tuple[float, torch.Tensor]:
         generator = torch.Generator(state.device).manual_seed(seed)
-        started = now(state.device)
+        started = read_clock(state.device)
         actions = planner.plan(arm, state, generator=generator).actions
-        return now(state.device) - started, actions
+        return read_clock(state.device) - started, actions
 
     arms = (model, compile_rollout(model))
     first = [sum(search(arm, seed)[0] for seed in range(WARM_UP_PLANS)) for arm in arms]

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from bench.options import ComposeRequest
-from bench.report import format_table, number, write_json
+from bench.report import format_number, format_table, write_json
 from latentplan.commands.flags import overrides
 from latentplan.config import Config, PlannerConfig, UserError, to_dict
 from latentplan.config.checks import at_least
@@ -33,11 +33,11 @@ UNTRAINED_DISCOUNT = 0.99
 
 @dataclass(frozen=True, kw_only=True)
 class Request(ComposeRequest):
-    """What is timed.
+    """Flags of `benchmark.py decide`.
 
     Attributes:
         checkpoint: Folder of a trained agent, or of a run; None times an untrained agent.
-        batch: Environments decided for at once.
+        batch: Environments of each decision.
         decisions: Decisions that are timed.
         json: Result as JSON.
         planner: Settings of the search.
@@ -54,11 +54,11 @@ class Request(ComposeRequest):
         at_least(self, batch=1, decisions=1)
         for name in ("domain", "preset", "action_dim"):
             if self.checkpoint is not None and getattr(self, name) is not None:
-                raise UserError(f"--{name.replace('_', '-')} has no effect with --checkpoint; give one of them")
+                raise UserError(f"--{name.replace('_', '-')} has no effect with --checkpoint; give one of the two")
 
 
 def run(request: Request) -> int:
-    """Time decisions on random frames and print their percentiles."""
+    """Times decisions on random frames and prints the percentiles."""
     batch, decisions = request.batch, request.decisions
     composed = None if request.checkpoint is not None else request.compose({"planner": request.planner})
     device_name = request.use_device()
@@ -67,12 +67,16 @@ def run(request: Request) -> int:
     from bench.machine import describe_machine
 
     device = torch.device(device_name)
-    model, config, discount = _load(request, composed, device)
+    model, config, discount = _load_model(request, composed, device)
     arms = {
         name: measure_decisions(agent, batch, decisions) for name, agent in _agents(model, config, discount).items()
     }
     rows = [
-        [name, *(number(facts["decision_ms"][key], 2) for key in ("p50", "p95", "p99")), f"{facts['model_steps']:,}"]
+        [
+            name,
+            *(format_number(facts["decision_ms"][key], 2) for key in ("p50", "p95", "p99")),
+            f"{facts['model_steps']:,}",
+        ]
         for name, facts in arms.items()
     ]
     machine = describe_machine(device)
@@ -87,7 +91,7 @@ def measure_decisions(agent: Agent, batch: int, decisions: int) -> dict[str, Any
     """Milliseconds from frames in memory to actions, and model steps per decision and environment.
 
     Args:
-        agent: The agent; a planner is warm-started.
+        agent: The agent; the plans of a planning agent are warm-started.
         batch: Frames per decision; a single frame has no batch axis.
         decisions: Number of timed decisions.
 
@@ -107,13 +111,13 @@ def measure_decisions(agent: Agent, batch: int, decisions: int) -> dict[str, Any
         agent.act(frames)
         if index >= WARM_UP_DECISIONS:
             milliseconds.append(1000.0 * (time.perf_counter() - started))
-    with counted_model_steps(agent.model) as counts:  # type: ignore[attr-defined]
+    with count_model_steps(agent.model) as counts:  # type: ignore[attr-defined]
         agent.act(frames)
     return {"decision_ms": latency_percentiles(np.asarray(milliseconds)), "model_steps": counts["rows"] // batch}
 
 
 @contextmanager
-def counted_model_steps(model: WorldModel) -> Iterator[dict[str, int]]:
+def count_model_steps(model: WorldModel) -> Iterator[dict[str, int]]:
     """Counts the model steps of all rows, under `rows`, inside the `with` block."""
     counts = {"rows": 0}
 
@@ -134,8 +138,8 @@ def counted_model_steps(model: WorldModel) -> Iterator[dict[str, int]]:
             delattr(model, name)
 
 
-def _load(request: Request, composed: Config | None, device: torch.device) -> tuple[WorldModel, Config, float]:
-    """Model, settings and discount: of the checkpoint, or of an untrained agent."""
+def _load_model(request: Request, composed: Config | None, device: torch.device) -> tuple[WorldModel, Config, float]:
+    """The model, settings and discount of the checkpoint, or of an untrained agent with composed settings."""
     if composed is not None:
         import torch
 

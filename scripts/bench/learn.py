@@ -17,9 +17,9 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
-from bench.anchors import FRAMES, published
+from bench.anchors import FRAMES, published_returns_of
 from bench.learn_plot import Curve, Point, plot_runs
-from bench.report import format_table, interval, number, write_csv, write_json
+from bench.report import format_interval, format_number, format_table, write_csv, write_json
 from latentplan.commands import train
 from latentplan.commands.flags import overrides, read_request
 from latentplan.config import Config, Device, RunConfig, UserError, make_folder, to_dict
@@ -27,7 +27,7 @@ from latentplan.config.checks import above_zero
 from latentplan.config.files import Preset, read_config
 from latentplan.config.parsing import option
 
-OWN_FLAGS = {  # settings that these runs differ in, or are told by
+OWN_FLAGS = {  # settings that flags of this benchmark set for each run
     "env.domain": "--tasks",
     "env.task": "--tasks",
     "run.seed": "--seeds",
@@ -36,22 +36,22 @@ OWN_FLAGS = {  # settings that these runs differ in, or are told by
     "run.run_dir": "--out",
 }
 FINISHED = "finished.json"
-NEAR = 0.03  # of a number of frames: how far from it an evaluation may be that stands for it
+FRAMES_TOLERANCE = 0.03  # largest distance of an evaluation from a number of frames, as a share of that number
 OWN = "latentplan"
 
 
 @dataclass(frozen=True, kw_only=True)
 class Request:
-    """What is trained.
+    """Flags of `benchmark.py learn`.
 
     Attributes:
         tasks: Tasks, each as domain-task.
         seeds: Seeds of each task.
-        frames: Simulator frames of each run; without frames and minutes, the budget of the preset holds.
-        minutes: Minutes of each run; given with frames, a run ends with whichever is reached first.
-        thresholds: Evaluation returns for which the frames and minutes to reach them are reported.
-        mode: Agent that the reported evaluation returns are of.
-        out: Folder of the runs and results; finished runs in it are not repeated.
+        frames: Simulator frames of each run; without frames and minutes, a run has the budget of the preset.
+        minutes: Minutes of each run; with frames given too, a run ends at the first of the two limits.
+        thresholds: Evaluation returns; the frames and minutes until each of these returns are reported.
+        mode: Agent whose evaluation returns are reported.
+        out: Folder of the runs and results; finished runs in this folder are not repeated.
         preset: Machine class, as for training; None takes `gpu` where CUDA is usable, else `cpu`.
         device: Device, as for training; None takes CUDA where it is usable.
         config: YAML file of settings, as for training.
@@ -98,12 +98,12 @@ class Request:
 
 
 def run(request: Request) -> int:
-    """Train what is missing, then collect, tabulate and plot the curves."""
+    """Trains the unfinished runs, then collects, tabulates and plots the curves of all runs."""
     tasks, thresholds, mode, out = request.tasks, request.thresholds, request.mode, request.out
     budget, extra = request.budget, request.forwarded
     folders = {(task, seed): out / f"{task}-seed{seed}" for task in tasks for seed in request.seeds}
-    for (task, seed), folder in folders.items():  # a mistake in any run stops before the first
-        asked = read_request(train.Request, _new_run(task, seed, folder, budget, extra))
+    for (task, seed), folder in folders.items():  # refuses a mistake in any run before the first run begins
+        asked = read_request(train.Request, _new_run_flags(task, seed, folder, budget, extra))
         check_same(train.resolve(asked), folder)
     make_folder(out)
     for (task, seed), folder in folders.items():
@@ -113,18 +113,18 @@ def run(request: Request) -> int:
     print(run_table(curves, thresholds))
     finals = final_estimates(curves)
     print(format_table(["task", "runs", "interquartile mean", "95 %"], [_final_row(*item) for item in finals.items()]))
-    anchors = {task: compare(task, curves, thresholds) for task in dict.fromkeys(tasks)}
-    for task, rows in anchors.items():
-        print(anchor_table(task, rows, thresholds))
+    comparisons = {task: compare(task, curves, thresholds) for task in dict.fromkeys(tasks)}
+    for task, rows in comparisons.items():
+        print(comparison_table(task, rows, thresholds))
     runs = run_facts(curves, thresholds)
-    write_json(out / "summary.json", {"mode": mode, "runs": runs, "final": finals, "anchors": anchors})
+    write_json(out / "summary.json", {"mode": mode, "runs": runs, "final": finals, "anchors": comparisons})
     plot_runs(curves, mode, out / "curves.png")
     print(f"curves.csv, summary.json and curves.png are in {out}")
     return 0
 
 
 def read_run(task: str, seed: int, folder: Path, mode: str) -> Curve:
-    """The evaluations of a run, with the final one.
+    """The evaluations of a run, including the final evaluation.
 
     Raises:
         UserError: The run has no evaluation, or its files are damaged.
@@ -148,25 +148,17 @@ def read_run(task: str, seed: int, folder: Path, mode: str) -> Curve:
 
 
 def check_same(config: Config, folder: Path) -> None:
-    """Checks that the run in a folder, if there is one, has these settings, apart from its budget.
+    """Checks that the run in a folder, if there is one, has these settings, except for the budget.
 
     Raises:
-        UserError: A setting differs; the message names the first one.
+        UserError: A setting differs; the message names the first such setting.
     """
     if not (folder / "config.yaml").exists():
         return
-    asked, begun = (_settings(each) for each in (config, read_config(folder / "config.yaml")))
+    asked, begun = (_comparable_settings(each) for each in (config, read_config(folder / "config.yaml")))
     for name, value in asked.items():
         if begun[name] != value:
             raise UserError(f"{folder} was begun with --{name} {begun[name]}, not {value}: choose another --out")
-
-
-def _settings(config: Config) -> dict[str, Any]:
-    from latentplan.envs import default_task
-
-    env = replace(config.env, task=config.env.task or default_task(config.env.domain))
-    sections = to_dict(replace(config, env=env, run=RunConfig(seed=config.run.seed)))
-    return {f"{section}.{name}": value for section, fields in sections.items() for name, value in fields.items()}
 
 
 def first_reaching(curve: Curve, threshold: float) -> Point | None:
@@ -175,7 +167,7 @@ def first_reaching(curve: Curve, threshold: float) -> Point | None:
 
 
 def run_facts(curves: Sequence[Curve], thresholds: Sequence[int]) -> list[dict[str, Any]]:
-    """Per run: env frames, minutes, final return, and frames and minutes to each threshold (None if not reached)."""
+    """Env frames, minutes and final return of each run, and frames and minutes to each threshold (None if missed)."""
     facts = []
     for curve in curves:
         reached = {str(threshold): first_reaching(curve, threshold) for threshold in thresholds}
@@ -198,18 +190,22 @@ def run_table(curves: Sequence[Curve], thresholds: Sequence[int]) -> str:
     """`run_facts` as a text table; frames and minutes to a threshold share a cell."""
     rows = []
     for facts in run_facts(curves, thresholds):
-        cells = [f"{facts['task']} seed {facts['seed']}", number(facts["env_frames"], 0), number(facts["minutes"])]
+        cells = [
+            f"{facts['task']} seed {facts['seed']}",
+            format_number(facts["env_frames"], 0),
+            format_number(facts["minutes"]),
+        ]
         for threshold in map(str, thresholds):
             frames, minutes = facts["frames_to"][threshold], facts["minutes_to"][threshold]
             cells.append("-" if frames is None else f"{frames:,.0f} / {minutes:.1f}")
-        rows.append([*cells, number(facts["final_return"])])
+        rows.append([*cells, format_number(facts["final_return"])])
     header = ["run", "frames", "minutes", *(f"frames / min to {threshold}" for threshold in thresholds), "final"]
     return format_table(header, rows)
 
 
 def final_estimates(curves: Sequence[Curve]) -> dict[str, dict[str, Any]]:
     """Interquartile mean of the final returns with its interval, by task and, for several tasks, over all."""
-    from bench.statistics import interquartile_estimate
+    from bench.estimates import interquartile_estimate
 
     groups: dict[str, list[float]] = {}
     for curve in curves:
@@ -224,25 +220,25 @@ def final_estimates(curves: Sequence[Curve]) -> dict[str, dict[str, Any]]:
 
 
 def compare(task: str, curves: Sequence[Curve], thresholds: Sequence[int]) -> dict[str, dict[str, Any]]:
-    """Our runs of a task and published results, by method; our runs come first.
+    """Results of this project's runs of a task, followed by published results, by method.
 
     Returns:
-        Per method `returns` by env frames (for our runs the interquartile mean over the evaluations near that number of
-        frames, with `intervals`), and `frames_to` each threshold. For published methods `frames_to` is the first number
-        of frames with a known return above the threshold; for our runs the median, None if half of them do not reach
-        the threshold.
+        For each method `returns` by env frames (for own runs the interquartile mean over the evaluations near that
+        number of frames, with `intervals`), and `frames_to` each threshold. For published methods `frames_to` is the
+        first number of frames with a known return of at least the threshold; for own runs the median over runs, None
+        if half of the runs do not reach the threshold.
     """
-    from bench.statistics import interquartile_estimate
+    from bench.estimates import interquartile_estimate
 
     own = [curve for curve in curves if curve.task == task]
     returns, intervals = {}, {}
     for frames in FRAMES:
-        near = [point.total_return for curve in own if (point := _nearest(curve, frames)) is not None]
+        near = [point.total_return for curve in own if (point := _nearest_point(curve, frames)) is not None]
         if near:
             returns[frames], *intervals[frames] = interquartile_estimate([near])
     rows: dict[str, dict[str, Any]] = {OWN: {"returns": returns, "intervals": intervals}}
     rows[OWN]["frames_to"] = {str(threshold): _median_frames(own, threshold) for threshold in thresholds}
-    for method, known in published(task).items():
+    for method, known in published_returns_of(task).items():
         reached = {
             str(threshold): next((frames for frames in sorted(known) if known[frames] >= threshold), None)
             for threshold in thresholds
@@ -251,21 +247,30 @@ def compare(task: str, curves: Sequence[Curve], thresholds: Sequence[int]) -> di
     return rows
 
 
-def anchor_table(task: str, rows: Mapping[str, Mapping[str, Any]], thresholds: Sequence[int]) -> str:
+def comparison_table(task: str, rows: Mapping[str, Mapping[str, Any]], thresholds: Sequence[int]) -> str:
     """The result of `compare` as a text table."""
     table = []
     for method, facts in rows.items():
-        cells = [number(facts["returns"].get(frames), 0) for frames in FRAMES]
-        reached = [number(facts["frames_to"][str(threshold)], 0) for threshold in thresholds]
+        cells = [format_number(facts["returns"].get(frames), 0) for frames in FRAMES]
+        reached = [format_number(facts["frames_to"][str(threshold)], 0) for threshold in thresholds]
         table.append([method, *cells, *reached])
     columns = [*(f"at {frames:,}" for frames in FRAMES), *(f"frames to {threshold}" for threshold in thresholds)]
     return format_table([task, *columns], table)
 
 
-def _nearest(curve: Curve, frames: int) -> Point | None:
-    """The evaluation nearest to a number of env frames; None if none is near enough (see `NEAR`)."""
+def _comparable_settings(config: Config) -> dict[str, Any]:
+    """The settings by name, with the default task filled in and without the budget and folder of the run."""
+    from latentplan.envs import default_task
+
+    env = replace(config.env, task=config.env.task or default_task(config.env.domain))
+    sections = to_dict(replace(config, env=env, run=RunConfig(seed=config.run.seed)))
+    return {f"{section}.{name}": value for section, fields in sections.items() for name, value in fields.items()}
+
+
+def _nearest_point(curve: Curve, frames: int) -> Point | None:
+    """The evaluation nearest to a number of env frames; None if its distance exceeds `FRAMES_TOLERANCE`."""
     point = min(curve.points, key=lambda point: abs(point.env_frames - frames))
-    return point if abs(point.env_frames - frames) <= NEAR * frames else None
+    return point if abs(point.env_frames - frames) <= FRAMES_TOLERANCE * frames else None
 
 
 def _median_frames(curves: Sequence[Curve], threshold: int) -> float | None:
@@ -275,17 +280,17 @@ def _median_frames(curves: Sequence[Curve], threshold: int) -> float | None:
 
 
 def _train(task: str, seed: int, folder: Path, budget: list[str], extra: list[str]) -> None:
-    """Runs `train.py` in a process of its own, unless the folder holds the finished run already."""
+    """Runs `train.py` in a new process, unless the folder holds the finished run with this budget."""
     marker = folder / FINISHED
-    if _finished_with(marker) == budget:
+    if _read_budget(marker) == budget:
         print(f"{folder} is finished and not repeated", flush=True)
         return
     is_begun = (folder / "config.yaml").exists()
-    arguments = ["--resume", str(folder), *budget] if is_begun else _new_run(task, seed, folder, budget, extra)
+    arguments = ["--resume", str(folder), *budget] if is_begun else _new_run_flags(task, seed, folder, budget, extra)
     script = Path(__file__).resolve().parent.parent / "train.py"
     print(f"training {task}, seed {seed}", flush=True)
     training = subprocess.Popen([sys.executable, str(script), *arguments])
-    previous = signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches the run too, which then saves its state
+    previous = signal.signal(signal.SIGINT, signal.SIG_IGN)  # the run gets Ctrl-C too, and saves its state
     try:
         code = training.wait()
     finally:
@@ -297,7 +302,7 @@ def _train(task: str, seed: int, folder: Path, budget: list[str], extra: list[st
     write_json(marker, {"budget": budget})
 
 
-def _finished_with(marker: Path) -> list[str] | None:
+def _read_budget(marker: Path) -> list[str] | None:
     """The budget of a finished run; None if the run is not finished or its marker cannot be read."""
     try:
         budget: list[str] = json.loads(marker.read_text())["budget"]
@@ -306,11 +311,11 @@ def _finished_with(marker: Path) -> list[str] | None:
     return budget
 
 
-def _new_run(task: str, seed: int, folder: Path, budget: list[str], extra: list[str]) -> list[str]:
+def _new_run_flags(task: str, seed: int, folder: Path, budget: list[str], extra: list[str]) -> list[str]:
     domain, _, name = task.partition("-")
     chosen = ["--domain", domain, *(["--task", name] if name else []), "--seed", str(seed)]
     return [*chosen, "--run-dir", str(folder), *budget, *extra]
 
 
 def _final_row(name: str, facts: dict[str, Any]) -> list[str]:
-    return [name, str(facts["runs"]), number(facts["mean"]), interval((facts["low"], facts["high"]))]
+    return [name, str(facts["runs"]), format_number(facts["mean"]), format_interval((facts["low"], facts["high"]))]

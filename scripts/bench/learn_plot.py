@@ -6,12 +6,12 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
-from bench.anchors import METHODS, published
+from bench.anchors import METHODS, published_returns_of
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-MARKERS = "sD^v<>PX*hp"  # one per method of METHODS
+MARKERS = "sD^v<>PX*hp"  # one marker for each method in METHODS
 
 
 class Point(NamedTuple):
@@ -56,7 +56,7 @@ def plot_runs(curves: Sequence[Curve], mode: str, png: Path) -> None:
 
 def _mark_published(axes: Axes, task: str, last: float) -> None:
     """Marks published returns at the env frames that a panel shows."""
-    for method, known in published(task).items():
+    for method, known in published_returns_of(task).items():
         marker = MARKERS[METHODS.index(method)]
         shown = {frames: value for frames, value in known.items() if frames <= last}
         if shown:

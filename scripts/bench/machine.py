@@ -1,4 +1,4 @@
-"""Description of the machine, its peak FLOP/s, and a clock that waits for the device."""
+"""The machine: its description, its peak FLOP/s, and a clock that waits for the device."""
 
 from __future__ import annotations
 
@@ -49,15 +49,15 @@ def product_limits(device: torch.device, size: int | None = None, repeats: int =
         right = torch.randn(size, size, device=device, dtype=dtype)
         seconds = []
         for _ in range(repeats + 1):
-            started = now(device)
+            started = read_clock(device)
             torch.mm(left, right)
-            seconds.append(now(device) - started)
+            seconds.append(read_clock(device) - started)
         limits[name] = 2.0 * size**3 / min(seconds[1:])
     return limits
 
 
-def now(device: torch.device) -> float:
-    """Seconds of a monotonic clock, read after the device has finished all its work."""
+def read_clock(device: torch.device) -> float:
+    """Waits until the device has finished all work, and returns the seconds of a monotonic clock."""
     if device.type == "cuda":
         torch.cuda.synchronize(device)
     return time.perf_counter()

@@ -1,4 +1,4 @@
-"""What several benchmarks can be asked for."""
+"""Flags that several benchmarks share."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ from latentplan.config.files import Layer, Preset, compose
 
 @dataclass(frozen=True, kw_only=True)
 class ComposeRequest(ComputeRequest):
-    """The settings of a run, for a benchmark that starts none.
+    """Flags for the settings of a run, in a benchmark that starts no run.
 
     Attributes:
-        domain: Domain of `dm_control.suite` whose settings hold; None takes `walker`.
+        domain: Domain of `dm_control.suite`, for its settings; None takes `walker`.
         preset: Machine class, as for training; None takes `gpu` where CUDA is usable, else `cpu`.
         action_dim: Size of the action; None asks the simulator.
     """
@@ -33,7 +33,7 @@ class ComposeRequest(ComputeRequest):
         """The settings that a run with this domain, preset and device would have.
 
         Args:
-            settings: Settings that were given, by section and name.
+            settings: Given settings, by section and name.
 
         Raises:
             UserError: The domain is unknown or a value is not allowed.
@@ -60,7 +60,7 @@ class ComposeRequest(ComputeRequest):
 
 @dataclass(frozen=True, kw_only=True)
 class SearchRequest(ComputeRequest):
-    """The size of a search.
+    """Flags for the size of a search.
 
     Attributes:
         samples: Candidates per iteration.

@@ -1,4 +1,4 @@
-"""The calls that `benchmark.py paths` times."""
+"""Calls of the world model that `benchmark.py paths` times."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ Calls = dict[str, Callable[[WorldModel], Any]]
 
 
 def planner_calls(model: WorldModel, rows: int, horizon: int) -> Calls:
-    """What a search asks for, without gradients."""
+    """Calls of a search, without gradients."""
     state, actions = _states(model, rows), _actions(model, rows, horizon)
     noise = torch.randn_like(actions)
 
@@ -30,14 +30,14 @@ def planner_calls(model: WorldModel, rows: int, horizon: int) -> Calls:
 
 
 def frame_calls(model: WorldModel) -> Calls:
-    """Belief update and actor for one frame."""
+    """The belief update and the actor for one frame."""
     state, action = _states(model, 1), _actions(model, 1, 1)[:, 0]
     frames = torch.randint(0, 256, (1, 64, 64, 3), dtype=torch.uint8, device=model.device)
 
     @torch.inference_mode()
     def decide(model: WorldModel) -> Any:
-        deter = model.backend.advance(model, state, action)
-        return model.backend.act(model, model.backend.see(model, deter, frames))
+        advance, see, act = model.backend.frame_functions(model)
+        return act(see(advance(state, action), frames))
 
     return {"one frame": decide}
 
@@ -58,14 +58,14 @@ def learner_calls(model: WorldModel, learning: LearningConfig) -> Calls:
     latest = [parameter.detach() for parameter in model.parameters()]
 
     def observe(model: WorldModel) -> None:
-        _descend(*model.backend.observe(model, embeddings, actions, deter, noise))
+        _run_backward(*model.backend.observe(model, embeddings, actions, deter, noise))
 
     def predict(model: WorldModel) -> None:
         deters, prior = model.backend.predict(model, starts, following)
-        _descend((deters,), prior)
+        _run_backward((deters,), prior)
 
     def imagine(model: WorldModel) -> None:
-        _descend(model.backend.imagine(model, first, action_noise, latent_noise, learning.gradient_decay))
+        _run_backward(model.backend.imagine(model, first, action_noise, latent_noise, learning.gradient_decay))
 
     return {
         "observation, gradients written out": observe,
@@ -97,5 +97,5 @@ def _actions(model: WorldModel, rows: int, time: int) -> torch.Tensor:
     return torch.rand(rows, time, model.action_dim, device=model.device) * 2.0 - 1.0
 
 
-def _descend(*outputs: tuple[torch.Tensor, ...]) -> None:
+def _run_backward(*outputs: tuple[torch.Tensor, ...]) -> None:
     torch.stack([part.sum() for parts in outputs for part in parts]).sum().backward()

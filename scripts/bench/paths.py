@@ -1,4 +1,4 @@
-"""`benchmark.py paths`: what each fast path of the world model gains over its reference."""
+"""`benchmark.py paths`: milliseconds of each fast path of the world model beside its reference."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 from unittest.mock import patch
 
 from bench.options import ComposeRequest
-from bench.report import format_table, number, write_json
+from bench.report import format_number, format_table, write_json
 from latentplan.commands.flags import overrides
 from latentplan.config import LearningConfig, ModelConfig, UserError
 from latentplan.config.checks import at_least
@@ -29,12 +29,12 @@ Call = Callable[["WorldModel"], Any]
 
 @dataclass(frozen=True, kw_only=True)
 class Request(ComposeRequest):
-    """What is timed.
+    """Flags of `benchmark.py paths`.
 
     Attributes:
         samples: Candidates of the rollouts.
         horizon: Model steps of each candidate.
-        repeats: Calls that are timed of each path.
+        repeats: Timed calls of each path.
         json: Result as JSON.
         model: Settings of the model.
         learning: Settings of the learning.
@@ -55,7 +55,7 @@ class Request(ComposeRequest):
 
 
 def run(request: Request) -> int:
-    """Time every fast path that runs on the device beside its reference, in turns, and print the medians."""
+    """Times every fast path of the device and its reference, in turns, and prints the medians."""
     samples, horizon, repeats = list(request.samples), request.horizon, request.repeats
     config = request.compose({"model": request.model, "learning": request.learning})
     device_name = request.use_device()
@@ -73,7 +73,12 @@ def run(request: Request) -> int:
         reference_ms, fast_ms = _milliseconds(model, call, reference, fast, context, repeats, device)
         results.append({"path": name, "reference_ms": reference_ms, "fast_ms": fast_ms})
     rows = [
-        [row["path"], number(row["reference_ms"], 3), number(row["fast_ms"], 3), number(_ratio(row), 2)]
+        [
+            row["path"],
+            format_number(row["reference_ms"], 3),
+            format_number(row["fast_ms"], 3),
+            format_number(_ratio(row), 2),
+        ]
         for row in results
     ]
     machine = describe_machine(device)
@@ -97,17 +102,17 @@ def _milliseconds(
     repeats: int,
     device: torch.device,
 ) -> tuple[float, float]:
-    """Medians of the reference and of the fast path, whose calls take turns."""
-    from bench.machine import now
+    """Median milliseconds of the reference and of the fast path; the two are called in turns."""
+    from bench.machine import read_clock
 
     seconds: tuple[list[float], list[float]] = ([], [])
     for repeat in range(WARM_UP_CALLS + repeats):
         for backend, times, inside in ((reference, seconds[0], nullcontext), (fast, seconds[1], context)):
             model.backend = backend
             with inside():
-                started = now(device)
+                started = read_clock(device)
                 call(model)
-                ended = now(device)
+                ended = read_clock(device)
             if repeat >= WARM_UP_CALLS:
                 times.append(ended - started)
     return 1000.0 * median(seconds[0]), 1000.0 * median(seconds[1])
@@ -116,7 +121,7 @@ def _milliseconds(
 def _paths(
     model: WorldModel, learning: Any, samples: list[int], horizon: int, device: torch.device
 ) -> Iterator[tuple[str, Call, Backend, Backend, Callable[[], AbstractContextManager[Any]]]]:
-    """Name, call, reference, fast backend and surroundings of each path that runs on the device."""
+    """Name, call, reference backend, fast backend and context of each fast path of the device."""
     import torch
 
     from bench.path_calls import augmentation_calls, frame_calls, learner_calls, planner_calls
@@ -145,7 +150,7 @@ def _paths(
     for name, call in augmentation_calls(model, learning).items() if device.type == "cpu" else ():
         yield name, call, Backend(precision), backend(), nullcontext
     for name, call in learner_calls(model, learning).items():
-        # Both in float32, as on a GPU, so that only the path differs.
+        # Reference and fast path in float32, as on a GPU, so that only the path differs.
         yield name, call, Backend(), GpuBackend(), nullcontext
 
 

@@ -1,6 +1,7 @@
-"""`benchmark.py plan`: our planner beside planners of other libraries, on the same model with the same settings.
+"""`benchmark.py plan`: the project's planner beside planners of other libraries, on one model with one setting.
 
-The table shows milliseconds per search as percentiles, and ratios to our planner and to the matrix products alone.
+The table shows milliseconds per search as percentiles, and ratios to the project's planner and to the matrix products
+alone.
 """
 
 from __future__ import annotations
@@ -13,7 +14,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from bench.options import ComposeRequest, SearchRequest
 from bench.peers.install import FOLDER, PEERS, PeerError
-from bench.report import format_table, number, write_json
+from bench.report import format_number, format_table, write_json
 from latentplan.commands.flags import overrides
 from latentplan.config import ModelConfig, to_dict
 from latentplan.config.checks import at_least
@@ -58,13 +59,13 @@ class Comparison(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True)
 class Request(SearchRequest, ComposeRequest):
-    """What is timed.
+    """Flags of `benchmark.py plan`.
 
     Attributes:
-        peers: Other planners, or `none`; each is installed on first use, in an environment of its own.
+        peers: Other planners, or `none`; each is installed on first use, in a Python environment apart from this one.
         plans: Timed searches of each planner, taken in turns.
         json: Result as JSON.
-        scaling: Picture of the time of our planner against samples, horizon, iterations and environments.
+        scaling: Picture of the time of this planner against samples, horizon, iterations and environments.
         model: Settings of the model.
     """
 
@@ -89,7 +90,7 @@ class Request(SearchRequest, ComposeRequest):
 
 
 def run(request: Request) -> int:
-    """Time every planner in turns and print how they compare."""
+    """Times every planner in turns and prints the comparison."""
     plans, sizes = request.plans, request.sizes
     config = request.compose({"model": request.model})
     device_name = request.use_device()
@@ -117,7 +118,7 @@ def run(request: Request) -> int:
         "machine": machine,
     }
     print(f"{machine['name']} ({device.type}, {machine['threads']} threads), {config.env.domain}, {sizes}")
-    print(table(result))
+    print(comparison_table(result))
     if request.scaling is not None:
         from bench.plan_scaling import measure_scaling, plot_scaling, scaling_table
 
@@ -129,14 +130,13 @@ def run(request: Request) -> int:
 
 
 def compare(problem: Problem, peers: Sequence[str], plans: int, folder: Path = FOLDER) -> Comparison:
-    """Time every planner.
+    """Times every planner.
 
     Args:
-        problem: What is searched.
+        problem: The search.
         peers: Names of `PEERS`.
-        plans: Searches of each that are timed; every planner has one before any has its next, so that a busy machine
-            slows all alike.
-        folder: Where the peers' environment is, or will be.
+        plans: Timed searches of each planner. The planners take turns, so that a busy machine slows down all of them.
+        folder: Folder of the peers' Python environment, which is made on first use.
     """
     from bench.peers.client import PeerProcess
     from bench.peers.problem import DTYPES
@@ -145,7 +145,7 @@ def compare(problem: Problem, peers: Sequence[str], plans: int, folder: Path = F
     processes: list[PeerProcess] = []
     try:
         for name in peers:
-            with _leaving_out(name, left_out):
+            with _left_out_on_error(name, left_out):
                 processes.append(PeerProcess(name, problem, folder))
         peer_arms = [_peer_arm(process, dtype) for process in processes for dtype in DTYPES]
         times = _take_turns([*own_arms(problem), *peer_arms], plans, left_out)
@@ -157,22 +157,22 @@ def compare(problem: Problem, peers: Sequence[str], plans: int, folder: Path = F
 
 
 def own_arms(problem: Problem) -> list[Arm]:
-    """Our planner, a plain loop, and the matrix products alone."""
+    """This project's planner, a plain loop, and the matrix products alone."""
     from bench.peers.problem import DTYPES
-    from bench.plan_searches import matrix_products, our_search, plain_search, timed
+    from bench.plan_searches import matrix_products, plain_search, planner_search, timed
 
     return [
-        *(Arm(OURS, dtype, timed(our_search(problem, dtype), problem)) for dtype in DTYPES),
+        *(Arm(OURS, dtype, timed(planner_search(problem, dtype), problem)) for dtype in DTYPES),
         Arm(PLAIN, "float32", timed(plain_search(problem), problem)),
         *(Arm(PRODUCTS, dtype, timed(matrix_products(problem, dtype), problem)) for dtype in DTYPES),
     ]
 
 
 def summarise(times: Times, threads: int) -> dict[str, Any]:
-    """Percentiles of every planner and the ratios between them; a ratio to other libraries is None without one.
+    """Percentiles of every planner and ratios between planners; a ratio to other libraries is None without a library.
 
     Args:
-        times: Milliseconds of each search by planner and dtype, those of `OURS` and `PRODUCTS` among them.
+        times: Milliseconds of each search by planner and dtype, including `OURS` and `PRODUCTS`.
         threads: CPU threads of every planner.
     """
     import numpy as np
@@ -200,24 +200,27 @@ def summarise(times: Times, threads: int) -> dict[str, Any]:
     }
 
 
-def table(result: dict[str, Any]) -> str:
+def comparison_table(result: dict[str, Any]) -> str:
     """The comparison as a text table."""
     best, limits = result["best_dtype"], result["matrix_limit_ms"]
     ours = next(row["p50_ms"] for row in result["rows"] if row["planner"] == OURS and row["dtype"] == best)
     lines = [
-        [row["planner"], row["dtype"], *(number(row[f"{p}_ms"]) for p in ("p50", "p95", "p99"))]
-        + [number(row["p50_ms"] / ours, 2), number(row["p50_ms"] / limits[row["dtype"]], 2)]
+        [row["planner"], row["dtype"], *(format_number(row[f"{p}_ms"]) for p in ("p50", "p95", "p99"))]
+        + [format_number(row["p50_ms"] / ours, 2), format_number(row["p50_ms"] / limits[row["dtype"]], 2)]
         for row in result["rows"]
     ]
-    lines += [[PRODUCTS, dtype, number(ms), "-", "-", number(ms / ours, 2), "1.00"] for dtype, ms in limits.items()]
+    lines += [
+        [PRODUCTS, dtype, format_number(ms), "-", "-", format_number(ms / ours, 2), "1.00"]
+        for dtype, ms in limits.items()
+    ]
     header = ["planner", "dtype", "p50 ms", "p95", "p99", "x ours", "x products"]
     return "\n".join(
         [
             format_table(header, lines),
             f"{result['settings']['plans']} searches each; fastest peer / ours: "
-            f"{number(result['ratio_fastest_peer'], 2)} as shipped, "
-            f"{number(result['ratio_fastest_peer_same_dtype'], 2)} in {best}; "
-            f"ours / its matrix products: {number(result['ratio_matrix_limit'], 2)}",
+            f"{format_number(result['ratio_fastest_peer'], 2)} as shipped, "
+            f"{format_number(result['ratio_fastest_peer_same_dtype'], 2)} in {best}; "
+            f"ours / its matrix products: {format_number(result['ratio_matrix_limit'], 2)}",
         ]
     )
 
@@ -232,14 +235,14 @@ def _take_turns(arms: Sequence[Arm], plans: int, left_out: dict[str, str]) -> Ti
     for _ in range(WARM_UP_PLANS + plans):
         for arm in arms:
             if arm.planner not in left_out:
-                with _leaving_out(arm.planner, left_out):
+                with _left_out_on_error(arm.planner, left_out):
                     times[arm.planner, arm.dtype].append(arm.search_ms())
     return {key: laps[WARM_UP_PLANS:] for key, laps in times.items() if key[0] not in left_out}
 
 
 @contextmanager
-def _leaving_out(name: str, left_out: dict[str, str]) -> Iterator[None]:
-    """Records the reason if a library cannot take part, and goes on without it."""
+def _left_out_on_error(name: str, left_out: dict[str, str]) -> Iterator[None]:
+    """Records and prints the reason if a library cannot take part; the caller goes on without the library."""
     try:
         yield
     except PeerError as error:

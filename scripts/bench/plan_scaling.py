@@ -1,4 +1,4 @@
-"""Milliseconds of our planner by the size of the search, for `benchmark.py plan --scaling`."""
+"""Milliseconds of the project's planner by the size of the search, for `benchmark.py plan --scaling`."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ from statistics import median
 from typing import Any
 
 from bench.peers.problem import Problem
-from bench.plan_searches import our_search, timed
-from bench.report import format_table, number
+from bench.plan_searches import planner_search, timed
+from bench.report import format_number, format_table
 
 FACTORS = (0.25, 0.5, 1.0, 2.0, 4.0)  # multiples of the requested samples, horizon and iterations
 BATCHES = (1, 4, 16, 64)
@@ -42,7 +42,10 @@ def measure_scaling(problem: Problem, dtype: str) -> list[dict[str, Any]]:
 
 def scaling_table(rows: Sequence[dict[str, Any]]) -> str:
     """The points as a text table."""
-    lines = [[row["axis"], f"{row['value']:,}", number(row["p50_ms"]), number(row["of_linear"], 2)] for row in rows]
+    lines = [
+        [row["axis"], f"{row['value']:,}", format_number(row["p50_ms"]), format_number(row["of_linear"], 2)]
+        for row in rows
+    ]
     return format_table(["along", "value", "p50 ms", "of linear"], lines)
 
 
@@ -74,6 +77,6 @@ def _values(base: int) -> list[int]:
 
 def _search_at(problem: Problem, dtype: str, axis: str, value: int) -> Any:
     if axis == "environments":
-        return our_search(problem, dtype, value)
+        return planner_search(problem, dtype, value)
     changes: dict[str, Any] = {axis: value}
-    return our_search(replace(problem, **changes), dtype)
+    return planner_search(replace(problem, **changes), dtype)

@@ -1,4 +1,4 @@
-"""Searches of `benchmark.py plan`: our planner, a plain CEM loop, and the bare matrix products of a search."""
+"""Searches of `benchmark.py plan`: the project's planner, a plain CEM loop, and only the matrix products."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from bench.machine import now
+from bench.machine import read_clock
 from bench.peers.problem import DTYPES, Problem, build_model, start_state, summed_rewards
 from latentplan.planning import CEMPlanner
 
@@ -21,15 +21,15 @@ def timed(search: Search, problem: Problem) -> Callable[[], float]:
 
     @torch.no_grad()
     def search_ms() -> float:
-        started = now(device)
+        started = read_clock(device)
         search()
-        return 1000.0 * (now(device) - started)
+        return 1000.0 * (read_clock(device) - started)
 
     return search_ms
 
 
-def our_search(problem: Problem, dtype: str, batch: int = 1) -> Search:
-    """A cold search of our planner from `batch` starts at once, without terminal value."""
+def planner_search(problem: Problem, dtype: str, batch: int = 1) -> Search:
+    """A cold search of the project's planner from `batch` starts at once, without terminal value."""
     model, start = build_model(problem, dtype), start_state(problem, batch)
     planner = CEMPlanner(
         action_dim=problem.action_dim,
@@ -81,7 +81,7 @@ def product_shapes(problem: Problem) -> list[tuple[int, int, int]]:
 
 
 def matrix_products(problem: Problem, dtype: str) -> Search:
-    """The matrix products of a search alone, written into memory that is already allocated."""
+    """Only the matrix products of a search, written into allocated memory."""
     shapes = product_shapes(problem)
     operands = {
         (rows, inner, outer): [

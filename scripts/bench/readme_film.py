@@ -1,4 +1,4 @@
-"""Draw the moving picture of the README: `python -m scripts.bench.readme_film docs/walker.webp`.
+"""Draws the film of the README: `python -m scripts.bench.readme_film docs/walker.webp`.
 
 The shipped walker plays with its planner; on the left is the camera, on the right the decoded last state of the plan
 that the walker executes. Every decision of the film is planned (`surprise_limit=None`), so that each has a picture.
@@ -17,12 +17,12 @@ from latentplan.config import EnvConfig
 from latentplan.envs import make_env
 from latentplan.reporting.film import PANEL_SIZE, compose_frame
 
-FIRST, LAST = 80, 190  # decisions that the film shows; the walker has found its gait by the first
+FIRST, LAST = 80, 190  # decisions of the film, after the walker has stood up and begun to walk
 QUALITY = 60  # of the WebP encoder, in [0, 100]
 
 
 def draw_film(path: Path, first: int = FIRST, last: int = LAST) -> int:
-    """Number of pictures written to an endless animated WebP of decisions `first` to `last`, in real time."""
+    """Writes decisions `first` to `last` as an endless animated WebP in real time; returns the number of pictures."""
     agent: Any = load_agent("checkpoints/walker-walk", surprise_limit=None)
     env = make_env(EnvConfig(domain="walker", task="walk", render_quality="exact"))
     frame, _ = env.reset(seed=0)

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from bench.report import format_table, interval, number, write_json
+from bench.report import format_interval, format_number, format_table, write_json
 from latentplan.commands.shell import ComputeRequest
 from latentplan.config import UserError, to_dict
 from latentplan.config.checks import at_least
@@ -21,18 +21,20 @@ if TYPE_CHECKING:
     from bench.realtime_measurements import Row, Trial
 
 PARTS = ("iterations", "rates", "error", "replan")
+_RETURN = ("return", "95 %")
+_LATENCY = ("ms p50", "p95")
 
 
 @dataclass(frozen=True, kw_only=True)
 class Request(ComputeRequest):
-    """What is measured.
+    """Flags of `benchmark.py realtime`.
 
     Attributes:
         checkpoint: Folder of a trained agent, or of a run (its best checkpoint).
         episodes: Episodes of each point, from the same starts.
         seed: Seed of the starts: episode i starts from a state that depends only on the seed and i.
         parts: Parts of the measurement.
-        rates: Decisions per second of the worlds that do not wait.
+        rates: Decisions per second of environments that do not wait.
         json: Result as JSON, written anew after every point.
         plot: Result as a picture.
     """
@@ -56,7 +58,7 @@ class Request(ComputeRequest):
 
 
 def run(request: Request) -> int:
-    """Measure the parts that were asked for, one point after the other."""
+    """Measures the parts of the request, one point after the other."""
     episodes, seed, checkpoint = request.episodes, request.seed, str(request.checkpoint)
     device = request.use_device()
     import torch
@@ -86,7 +88,7 @@ def run(request: Request) -> int:
         trial = Trial(checkpoint, device, env, seeds, planner.horizon)
         for part, row in measure_parts(trial, request.parts, request.rates):
             result[part].append(row)
-            print(_progress(part, row), flush=True)
+            print(_progress_line(part, row), flush=True)
             write_json(request.json, {**about, **result})
     finally:
         env.close()
@@ -122,28 +124,24 @@ def part_table(part: str, rows: Sequence[Row]) -> str:
         "error": ("step", "latent distance", "of no change", "reward error", "of no change"),
         "replan": ("replan every", "horizon", *_RETURN, "ms mean"),
     }
-    return format_table(columns[part], [_cells(part, row) for row in rows])
+    return format_table(columns[part], [_row_cells(part, row) for row in rows])
 
 
-_RETURN = ("return", "95 %")
-_LATENCY = ("ms p50", "p95")
-
-
-def _cells(part: str, row: Mapping[str, Any]) -> list[str]:
+def _row_cells(part: str, row: Mapping[str, Any]) -> list[str]:
     if part == "error":
         names = ("latent_distance", "latent_change", "reward_error", "reward_change")
-        return [str(row["step"]), *(number(row[name], 3) for name in names)]
-    earned = [number(row["mean_return"]), interval(row["ci95"])]
-    latency = [number(row["decision_ms"][name], 2) for name in ("p50", "p95")]
+        return [str(row["step"]), *(format_number(row[name], 3) for name in names)]
+    earned = [format_number(row["mean_return"]), format_interval(row["ci95"])]
+    latency = [format_number(row["decision_ms"][name], 2) for name in ("p50", "p95")]
     if part == "iterations":
         return [row["iterations"], *earned, *latency]
     if part == "replan":
-        return [str(row["replan_every"]), str(row["horizon"]), *earned, number(row["mean_decision_ms"], 2)]
+        return [str(row["replan_every"]), str(row["horizon"]), *earned, format_number(row["mean_decision_ms"], 2)]
     planned = f"{100.0 * row['planned_fraction']:.0f} %"
     return [row["agent"], f"{row['control_hz']:g}", *earned, *latency, str(row["deadline_misses"]), planned]
 
 
-def _progress(part: str, row: Mapping[str, Any]) -> str:
+def _progress_line(part: str, row: Mapping[str, Any]) -> str:
     if part == "error":
         return f"error, step {row['step']}: latent distance {row['latent_distance']:.3f}"
     point = {

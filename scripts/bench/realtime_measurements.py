@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from latentplan.envs.suite import SuiteEnv
     from latentplan.evaluation.statistics import Episode
 
-ITERATIONS = {  # the first search of a warm planner is cold and has 5 iterations, as in the cold planner
+ITERATIONS = {  # the first search of a warm planner is cold, with 5 iterations as in the cold planner
     "5 cold": {"num_iterations": 5, "warm_start": False},
     **{f"{count} warm": {"num_iterations": 5, "warm_start_iterations": count} for count in (5, 3, 2, 1)},
 }
@@ -52,12 +52,11 @@ class Trial:
 
         Args:
             mode: Mode of the agent.
-            settings: Settings of the search that replace those of the checkpoint.
+            settings: Settings of the search that replace the settings of the checkpoint.
             control_hz: Decisions per second of an environment that does not wait; None for one that waits.
             prepare: Changes the agent before it plays.
         """
-        from latentplan.evaluation.clock import VirtualClock
-        from latentplan.evaluation.latency import Latency
+        from latentplan.evaluation.clock import Latency, VirtualClock
         from latentplan.evaluation.timed import iterate_timed_episodes, load_timed_agent, summarize_timed
 
         clock = VirtualClock(control_hz, Latency())
@@ -97,12 +96,12 @@ def measure_replanning(trial: Trial) -> Iterator[Row]:
 def measure_error(trial: Trial) -> Iterator[Row]:
     """Yields the distance between imagined and observed latents and rewards by model steps, in episodes of the actor.
 
-    Each row also holds the errors of a model that predicts no change: latent and reward stay as they are at the start.
+    Each row also holds the errors of predicting no change, with latent and reward as at the start.
     """
     from latentplan.agents.checkpoint import load_agent
 
     agent: Any = load_agent(trial.checkpoint, mode="actor", device=trial.device)
-    parts = [_prediction_errors(agent.model, *_record(agent, trial.env, seed)) for seed in trial.seeds]
+    parts = [_prediction_errors(agent.model, *_record_episode(agent, trial.env, seed)) for seed in trial.seeds]
     parts = [part for part in parts if part.shape[1]]
     if not parts:
         return
@@ -112,7 +111,7 @@ def measure_error(trial: Trial) -> Iterator[Row]:
         yield {"step": step, **dict(zip(names, values, strict=True))}
 
 
-def _record(agent: Any, env: SuiteEnv, seed: int) -> tuple[list[Any], list[np.ndarray], list[float]]:
+def _record_episode(agent: Any, env: SuiteEnv, seed: int) -> tuple[list[Any], list[np.ndarray], list[float]]:
     """Beliefs of an episode, the action at each belief, and the reward that followed the action."""
     from latentplan.models.symmetry import first_turn
 

@@ -84,9 +84,8 @@ def _draw_error(axes: Any, rows: Rows) -> None:
     for name, colour, label in (("latent", BLUE, "latent distance"), ("reward", ORANGE, "reward error")):
         error = {"latent": "latent_distance", "reward": "reward_error"}[name]
         axes.plot(steps, [row[error] for row in rows], "o-", color=colour, markersize=4, label=label)
-        axes.plot(
-            steps, [row[f"{name}_change"] for row in rows], ":", color=colour, label=f"{name}, if nothing changed"
-        )
+        unchanged = [row[f"{name}_change"] for row in rows]
+        axes.plot(steps, unchanged, ":", color=colour, label=f"{name}, predicting no change")
     axes.set_yscale("log")
     axes.set_xticks([step for step in steps if step == 1 or step % 5 == 0])
     axes.set_xlabel("imagined step")

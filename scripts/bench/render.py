@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from bench.report import format_table, number, write_json
+from bench.report import format_number, format_table, write_json
 from latentplan.config import RENDER_QUALITIES, EnvConfig
 from latentplan.config.checks import at_least
 from latentplan.config.files import DOMAINS, compose
@@ -20,12 +20,12 @@ from latentplan.config.parsing import option, raise_unknown
 if TYPE_CHECKING:
     import numpy as np
 
-REPEATS = 3
+REPEATS = 3  # timed renderings of each state
 
 
 @dataclass(frozen=True)
 class Request:
-    """What is rendered.
+    """Flags of `benchmark.py render`.
 
     Attributes:
         domains: Domains of `dm_control.suite`.
@@ -45,7 +45,7 @@ class Request:
 
 
 def run(request: Request) -> int:
-    """Render the same states in every quality and compare time and pictures."""
+    """Renders the same states in every quality and compares times and pictures."""
     from latentplan.envs import render_info
 
     info = render_info()
@@ -55,7 +55,7 @@ def run(request: Request) -> int:
         for domain in request.domains
     }
     rows = [
-        [f"{domain}, {quality}", number(facts["frame_ms"], 2), number(facts["pixel_change"], 2)]
+        [f"{domain}, {quality}", format_number(facts["frame_ms"], 2), format_number(facts["pixel_change"], 2)]
         for domain, qualities in measured.items()
         for quality, facts in qualities.items()
     ]

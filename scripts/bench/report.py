@@ -20,19 +20,19 @@ def format_table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     return "\n".join(_aligned(line, widths) for line in (header, ["-" * width for width in widths], *rows))
 
 
-def number(value: float | None, digits: int = 1, sign: bool = False) -> str:
+def format_number(value: float | None, digits: int = 1, sign: bool = False) -> str:
     """A number for a table; `-` for None and NaN."""
     if value is None or math.isnan(value):
         return "-"
     return f"{value:{'+' if sign else ''},.{digits}f}"
 
 
-def interval(ends: Sequence[float | None], digits: int = 1, sign: bool = False) -> str:
+def format_interval(ends: Sequence[float | None], digits: int = 1, sign: bool = False) -> str:
     """An interval for a table; `-` if an end is None."""
     low, high = ends
     if low is None or high is None:
         return "-"
-    return f"{number(low, digits, sign)} to {number(high, digits, sign)}"
+    return f"{format_number(low, digits, sign)} to {format_number(high, digits, sign)}"
 
 
 def write_json(path: Path | None, result: Mapping[str, Any]) -> None:

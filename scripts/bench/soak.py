@@ -1,6 +1,6 @@
 """`benchmark.py soak --checkpoint DIR`: deadlines that agents miss on the wall clock.
 
-Agents take turns on recorded frames with an agent that does nothing, whose misses are those of the machine. The table
+Agents take turns on recorded frames with an idle agent, which misses deadlines only because of the machine. The table
 shows missed deadlines per 10,000 decisions; decision times and wake-up delays are in milliseconds.
 """
 
@@ -14,7 +14,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from bench.report import format_table, number, write_json
+from bench.report import format_number, format_table, write_json
 from latentplan.commands.shell import ComputeRequest
 from latentplan.config.checks import above_zero, at_least
 from latentplan.config.parsing import option, raise_unknown
@@ -28,7 +28,7 @@ MODES = ("actor", "gated", "background", "planner")
 IDLE = "no-op"
 NUM_FRAMES = 250
 WARM_UP_DECISIONS = 5
-DEADLINE_SHARE = 0.3  # share of a period for a search; encoding and gating take as much, the machine takes the rest
+DEADLINE_SHARE = 0.3  # share of a period for a search; encoding and gating take about as much
 PAUSE_SECONDS = 0.2  # between blocks, so that a search in the background does not disturb the next agent
 
 
@@ -50,7 +50,7 @@ class Tally:
 
 
 class IdleAgent:
-    """Does nothing, so that its missed deadlines are those of the machine."""
+    """Does nothing; misses deadlines only because of the machine."""
 
     def act(self, frame: np.ndarray) -> None:
         """Does nothing."""
@@ -61,11 +61,11 @@ class IdleAgent:
 
 @dataclass(frozen=True, kw_only=True)
 class Request(ComputeRequest):
-    """What is counted.
+    """Flags of `benchmark.py soak`.
 
     Attributes:
         checkpoint: Folder of a trained agent, or of a run (its best checkpoint).
-        mode: Modes of the agent, some of actor, gated, background and planner; an idle agent joins them.
+        mode: Modes of the agent, among actor, gated, background and planner; an idle agent takes part too.
         control_hz: Decisions per second.
         decisions: Decisions that are due, of each agent.
         block: Decisions of one agent before the next agent takes over.
@@ -89,7 +89,7 @@ class Request(ComputeRequest):
 
 
 def run(request: Request) -> int:
-    """Let the agents take turns in real time, and count what each misses."""
+    """Lets the agents take turns in real time, and counts the deadlines that each agent misses."""
     modes, control_hz, checkpoint = request.mode, request.control_hz, str(request.checkpoint)
     decisions, block = request.decisions, request.block
     device = request.use_device()
@@ -110,7 +110,7 @@ def run(request: Request) -> int:
     code = 0
     from latentplan.planning import settle
 
-    with _loaded_agents(checkpoint, modes, device, 1000.0 * DEADLINE_SHARE / control_hz) as agents:
+    with _load_agents(checkpoint, modes, device, 1000.0 * DEADLINE_SHARE / control_hz) as agents:
         settle()
         try:
             take_turns(agents, frames, control_hz, decisions, block, tallies)
@@ -202,10 +202,10 @@ def soak_table(rows: Mapping[str, dict[str, Any]]) -> str:
             name,
             f"{row['decisions_due']:,}",
             f"{row['deadline_misses']:,}",
-            number(row["misses_per_10000"]),
-            "-" if name == IDLE else number(row["minus_no_op"], sign=True),
-            *(number(row["decision_ms"][key], 2) for key in ("p50", "p99", "max")),
-            number(row["wake_ms"]["p99"], 2),
+            format_number(row["misses_per_10000"]),
+            "-" if name == IDLE else format_number(row["minus_no_op"], sign=True),
+            *(format_number(row["decision_ms"][key], 2) for key in ("p50", "p99", "max")),
+            format_number(row["wake_ms"]["p99"], 2),
         ]
         for name, row in rows.items()
     ]
@@ -213,7 +213,7 @@ def soak_table(rows: Mapping[str, dict[str, Any]]) -> str:
 
 
 def _record_frames(checkpoint: Path, device: str) -> list[np.ndarray]:
-    """Observations of an episode of the actor."""
+    """Frames of an episode of the actor, uint8 (64, 64, 3) each."""
     from latentplan.agents.checkpoint import load_agent, load_model
     from latentplan.envs import make_env
 
@@ -233,7 +233,7 @@ def _record_frames(checkpoint: Path, device: str) -> list[np.ndarray]:
 
 
 @contextlib.contextmanager
-def _loaded_agents(checkpoint: str, modes: Sequence[str], device: str, deadline_ms: float) -> Any:
+def _load_agents(checkpoint: str, modes: Sequence[str], device: str, deadline_ms: float) -> Any:
     """The agents by name, ready to act; agents that search before they act have a deadline."""
     from latentplan.agents.background import BackgroundAgent
     from latentplan.agents.checkpoint import load_agent

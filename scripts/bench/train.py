@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from bench.options import ComposeRequest
-from bench.report import format_table, number, write_json
+from bench.report import format_number, format_table, write_json
 from latentplan.commands.flags import overrides
 from latentplan.config import LearningConfig, ModelConfig, ReplayConfig
 from latentplan.config.checks import at_least
@@ -19,10 +19,10 @@ from latentplan.config.parsing import option
 
 @dataclass(frozen=True, kw_only=True)
 class Request(ComposeRequest):
-    """What is timed.
+    """Flags of `benchmark.py train`.
 
     Attributes:
-        updates: Updates that are timed.
+        updates: Timed updates.
         json: Result as JSON.
         model: Settings of the model.
         learning: Settings of the learning.
@@ -41,7 +41,7 @@ class Request(ComposeRequest):
 
 
 def run(request: Request) -> int:
-    """Time updates on synthetic replay and print where the time goes."""
+    """Times updates on synthetic replay and prints the time of each part."""
     config = request.compose({"model": request.model, "learning": request.learning, "replay": request.replay})
     device_name = request.use_device()
     action_dim = request.action_size(config)
@@ -52,10 +52,10 @@ def run(request: Request) -> int:
     from bench.train_update import measure_update
     from latentplan.training.resources import set_up_torch
 
-    set_up_torch(torch.get_num_threads(), device)  # as a run does
+    set_up_torch(torch.get_num_threads(), device)  # as in a run
     before = product_limits(device)
     measured = measure_update(config, action_dim, device, request.updates)
-    after = product_limits(device)  # the better of two: other work may have disturbed one
+    after = product_limits(device)  # the better of two measurements, because other work may disturb one
     limits = {name: max(before[name], after[name]) for name in before}
     result = {
         "domain": config.env.domain,
@@ -74,10 +74,10 @@ def _summary(result: dict[str, Any]) -> str:
     rows = [
         [
             name,
-            number(part["ms"], 2),
-            number(100.0 * part["ms"] / total_ms),
-            number(part["flop"] / 1e9, 2),
-            number(part["flop"] / part["ms"] / 1e6) if part["flop"] and part["ms"] > 0 else "-",
+            format_number(part["ms"], 2),
+            format_number(100.0 * part["ms"] / total_ms),
+            format_number(part["flop"] / 1e9, 2),
+            format_number(part["flop"] / part["ms"] / 1e6) if part["flop"] and part["ms"] > 0 else "-",
         ]
         for name, part in {**result["parts"], "in turn": {"ms": total_ms, "flop": result["flop"]}}.items()
     ]

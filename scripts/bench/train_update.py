@@ -13,7 +13,7 @@ from torch import Tensor
 from torch.utils._pytree import tree_leaves
 from torch.utils.flop_counter import FlopCounterMode
 
-from bench.machine import now
+from bench.machine import read_clock
 from latentplan.config import Config
 from latentplan.models import WorldModel
 from latentplan.models.fast import accelerate
@@ -52,7 +52,7 @@ class StandaloneLearner(OwnOptimizers, Learner):
 
 
 class StandaloneGraph(OwnOptimizers, GraphedLearner):
-    """A learner that updates without a Trainer, with the whole update in one CUDA graph."""
+    """A learner that updates without a Trainer, with each update in one CUDA graph."""
 
 
 class PhaseMeter:
@@ -96,8 +96,8 @@ def measure_update(config: Config, action_dim: int, device: torch.device, update
 
     `update_ms` is the time in a training run, where the two halves of an update overlap; `in_turn_ms` is the time of
     the halves one after the other. `sample`, `behaviour`, `optimizer` and `other` are timed within `in_turn_ms`;
-    `encode`, `recurrence` and `decode` are run forward and backward by themselves on the same batch, and `heads` is the
-    rest of the world model's loss, with its gradient clipping.
+    `encode`, `recurrence` and `decode` are run alone, forward and backward, on the same batch, and `heads` is the rest
+    of the world model's loss, including the gradient clipping.
 
     Returns:
         Plain values: `parts` (ms and counted operations of each), `update_ms`, `graph_ms` (the same update as one CUDA
@@ -110,7 +110,7 @@ def measure_update(config: Config, action_dim: int, device: torch.device, update
     learner = StandaloneLearner(model, config.learning, DISCOUNT, replay, seed=0).to(device)
     learner.own_optimizers = learner.configure_optimizers()
     alone = _parts_alone(model, _sample(learner, np.random.default_rng(3)))
-    laps, flop = _timed_laps(learner, alone, device, updates), _counted_lap(learner, alone)
+    laps, flop = _measure_laps(learner, alone, device, updates), _count_lap(learner, alone)
     parts = {name: {"ms": 1000.0 * median(lap[name] for lap in laps), "flop": int(flop.get(name, 0))} for name in PARTS}
     seconds, in_turn = (median(lap[name] for lap in laps) for name in ("update", "in_turn"))
     sizes = config.learning
@@ -138,19 +138,20 @@ def measure_graph(config: Config, action_dim: int, device: torch.device, updates
     learner.own_optimizers = learner.configure_optimizers()
     rng, seconds = np.random.default_rng(1), []
     for _ in range(GRAPH_WARM_UP_UPDATES + 1 + updates):  # after the warm-up, one update records the graph
-        rows, started = replay.draw(config.learning.batch_size, config.learning.sequence_length, rng), now(device)
+        rows = replay.draw(config.learning.batch_size, config.learning.sequence_length, rng)
+        started = read_clock(device)
         learner.training_step(rows, 0)
-        seconds.append(now(device) - started)
+        seconds.append(read_clock(device) - started)
     learner.catch_up()
     return 1000.0 * median(seconds[-updates:])
 
 
 def synthetic_replay(config: Config, action_dim: int, device: torch.device) -> Replay:
     """A replay of random frames, actions and rewards, in episodes that are four sequences long."""
-    where = device if config.replay.on_device else torch.device("cpu")
+    storage = device if config.replay.on_device else torch.device("cpu")
     length = config.learning.sequence_length
     num_rows = max(NUM_ROWS, 8 * length)
-    replay = Replay(num_rows, action_dim, config.model.deter_dim, 1, where)
+    replay = Replay(num_rows, action_dim, config.model.deter_dim, 1, storage)
     rng = np.random.default_rng(0)
     rows = Rows(
         frames=rng.integers(0, 256, (num_rows, 64, 64, 3), dtype=np.uint8),
@@ -165,27 +166,27 @@ def synthetic_replay(config: Config, action_dim: int, device: torch.device) -> R
     return replay
 
 
-def _timed_laps(learner: StandaloneLearner, alone: Parts, device: torch.device, updates: int) -> list[Lap]:
-    """Seconds of each part; parts run alone follow every update, so that a busy machine slows both alike."""
-    meter = PhaseMeter(learner, lambda: now(device))
+def _measure_laps(learner: StandaloneLearner, alone: Parts, device: torch.device, updates: int) -> list[Lap]:
+    """Seconds of each part; updates and parts run alone take turns, so that a busy machine slows down both."""
+    meter = PhaseMeter(learner, lambda: read_clock(device))
     rng = np.random.default_rng(1)
     laps = []
     for _ in range(WARM_UP_UPDATES + updates):
-        lap = _lap(learner, alone, meter, rng)
+        lap = _measure_lap(learner, alone, meter, rng)
         laps.append({**lap, "update": lap["sample"] + _overlapped_seconds(learner, device, rng)})
     meter.close()
     return laps[WARM_UP_UPDATES:]
 
 
-def _counted_lap(learner: StandaloneLearner, alone: Parts) -> Lap:
+def _count_lap(learner: StandaloneLearner, alone: Parts) -> Lap:
     with FlopCounterMode(display=False) as counter:
         meter = PhaseMeter(learner, lambda: float(counter.get_total_flops()))
-        lap = _lap(learner, alone, meter, np.random.default_rng(2))
+        lap = _measure_lap(learner, alone, meter, np.random.default_rng(2))
     meter.close()
     return lap
 
 
-def _lap(learner: StandaloneLearner, alone: Parts, meter: PhaseMeter, rng: np.random.Generator) -> Lap:
+def _measure_lap(learner: StandaloneLearner, alone: Parts, meter: PhaseMeter, rng: np.random.Generator) -> Lap:
     meter.start()
     batch = _sample(learner, rng)
     meter.mark("sample")
@@ -195,7 +196,7 @@ def _lap(learner: StandaloneLearner, alone: Parts, meter: PhaseMeter, rng: np.ra
     for name, forward in alone.items():
         learner.model.zero_grad(set_to_none=True)
         meter.skip()
-        _descend(forward())
+        _run_backward(forward())
         meter.mark(name)
     heads = meter.lap["model"] - sum(meter.lap[name] for name in alone)
     return {**meter.lap, "heads": heads, "in_turn": in_turn}
@@ -204,9 +205,9 @@ def _lap(learner: StandaloneLearner, alone: Parts, meter: PhaseMeter, rng: np.ra
 def _overlapped_seconds(learner: StandaloneLearner, device: torch.device, rng: np.random.Generator) -> float:
     """Seconds of an update as in a run: behaviour learns from the previous batch while the model learns."""
     learner.training_step(_sample(learner, rng), 0)
-    batch, started = _sample(learner, rng), now(device)
+    batch, started = _sample(learner, rng), read_clock(device)
     learner.training_step(batch, 0)
-    seconds = now(device) - started
+    seconds = read_clock(device) - started
     learner.catch_up()
     return seconds
 
@@ -240,6 +241,6 @@ def _parts_alone(model: WorldModel, batch: Batch) -> Parts:
     return {"encode": encode, "recurrence": recur, "decode": decode}
 
 
-def _descend(outputs: Any) -> None:
+def _run_backward(outputs: Any) -> None:
     leaves = [leaf for leaf in tree_leaves(outputs) if leaf.requires_grad]
     torch.autograd.backward(leaves, [torch.ones_like(leaf) for leaf in leaves])

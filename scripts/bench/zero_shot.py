@@ -7,13 +7,15 @@ quantities of the simulator; decision times are in milliseconds.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from bench.ablation_arms import check_checkpoint, single_thread
-from bench.report import format_table, interval, number, write_json
+from bench.ablation_arms import check_checkpoint
+from bench.report import format_interval, format_number, format_table, write_json
+from bench.workers import run_in_order
 from latentplan.commands.flags import overrides
 from latentplan.commands.saved import search_settings
 from latentplan.commands.shell import ComputeRequest
@@ -27,10 +29,10 @@ if TYPE_CHECKING:
     from latentplan.evaluation.episodes import Step
 
 PUSH_PROBABILITY = 0.04  # per decision
-PURSUERS = ("planner", "gated", "random moments", "random gate")
-OBJECTIVE_PLAYERS = (*PURSUERS, "actor", "random")
-CONSTRAINT_PLAYERS = (*PURSUERS, "unconstrained", "actor", "random")
-TRAINED_PLAYERS = ("trained planner", "trained actor")  # of another checkpoint, after its own reward
+PLANNING_PLAYERS = ("planner", "gated", "random moments", "random gate")
+OBJECTIVE_PLAYERS = (*PLANNING_PLAYERS, "actor", "random")
+CONSTRAINT_PLAYERS = (*PLANNING_PLAYERS, "unconstrained", "actor", "random")
+TRAINED_PLAYERS = ("trained planner", "trained actor")  # agents of another checkpoint, without a new goal
 
 
 class Job(NamedTuple):
@@ -70,18 +72,18 @@ class Conditions(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True)
 class Request(ComputeRequest):
-    """What is played.
+    """Flags of `benchmark.py zero-shot`.
 
     Attributes:
         checkpoint: Folder of a trained agent, or of a run (its best checkpoint).
-        objectives: Objectives as of `eval`, separated by |.
-        constraints: Constraints as of `eval`, separated by |; each is pursued with the objective of the training.
-        players: Rows of each goal; some of planner, gated, random moments, random gate, unconstrained, actor, random.
-        trained: Agent trained for the goals, to compare with: two rows more, its planner and its actor.
+        objectives: Objectives as in `eval`, separated by |.
+        constraints: Constraints as in `eval`, separated by |; the objective is the objective of the training.
+        players: Rows of each goal, among planner, gated, random moments, random gate, unconstrained, actor, random.
+        trained: Agent trained for the goals, for comparison: adds a row for its planner and one for its actor.
         episodes: Episodes of each row, from the same starts.
         seed: Seed of the starts: episode i starts from a state that depends only on the seed and i.
         push: Standard deviation of kicks to all joint velocities, at one decision in 25, the same for every player.
-        workers: Rows played at once, each in a process of its own.
+        workers: Rows that are played at once, each in its own process.
         json: Result as JSON.
         planner: Settings of the search, in place of the agent's own.
     """
@@ -105,7 +107,7 @@ class Request(ComputeRequest):
 
 
 def run(request: Request) -> int:
-    """Play every goal with every player from the same starts."""
+    """Plays every goal with every player from the same starts."""
     checkpoint, episodes, seed = str(request.checkpoint), request.episodes, request.seed
     workers, push = request.workers, request.push or 0.0
     jobs = list_jobs(request)
@@ -138,21 +140,22 @@ def run(request: Request) -> int:
     }
     print(f"{about['domain']}-{about['task']}, {episodes} episodes per row, {workers} at once", flush=True)
     rows: list[dict[str, Any]] = []
-    for row in _play(Conditions(checkpoint, seeds, device, changes, push, trained_for), jobs, workers):
+    conditions = Conditions(checkpoint, seeds, device, changes, push, trained_for)
+    for row in run_in_order(partial(play_job, conditions), jobs, workers):
         rows.append(row)
-        print(f"{row['goal']}, {row['player']}: {number(row['mean'], row['digits'])}", flush=True)
+        print(f"{row['goal']}, {row['player']}: {format_number(row['mean'], row['digits'])}", flush=True)
         write_json(request.json, {**about, "rows": rows})
     print(summary_table(rows))
     return 0
 
 
 def list_jobs(request: Request) -> list[Job]:
-    """The rows that a request asks for.
+    """The rows of a request.
 
     Raises:
         UserError: There is no row, or a player is unknown.
     """
-    objectives, constraints = _parts(request.objectives), _parts(request.constraints)
+    objectives, constraints = _split_goals(request.objectives), _split_goals(request.constraints)
     if not objectives and not constraints:
         raise UserError("give --objectives 'height > 1.2 | speed -> 2.0' or --constraints 'cart < 0.5', or both")
     known = (*OBJECTIVE_PLAYERS, "unconstrained")
@@ -186,7 +189,7 @@ def play_job(conditions: Conditions, job: Job) -> dict[str, Any]:
     """
     import torch
 
-    from bench.statistics import mean_estimate
+    from bench.estimates import mean_estimate
     from bench.zero_shot_agents import load_zero_shot_agent
     from latentplan.agents.checkpoint import load_model
     from latentplan.envs import make_env
@@ -204,11 +207,11 @@ def play_job(conditions: Conditions, job: Job) -> dict[str, Any]:
     agent = load_zero_shot_agent(player, checkpoint, conditions.device, search)
     goals = read_goals(job.objective, job.constraint, config.env.domain)
     assert goals is not None, "a job names an objective or a constraint"
-    # Each agent plays in the environment of its own training, with the reward of the same task.
+    # Each agent plays in the environment of its own training, but all with the reward of the same task.
     env = make_env(replace(goal_env(config.env), task=own.env.task, objective=own.env.objective))
     try:
-        scored = score_env(env, goals, agent if job.player in PURSUERS else None)
-        result = summarize(run_episodes(scored, agent, conditions.seeds, on_step=_pusher(env, conditions)))
+        scored = score_env(env, goals, agent if job.player in PLANNING_PLAYERS else None)
+        result = summarize(run_episodes(scored, agent, conditions.seeds, on_step=_make_pusher(env, conditions)))
     finally:
         env.close()
     is_objective = job.objective is not None
@@ -238,19 +241,19 @@ def summary_table(rows: Sequence[dict[str, Any]]) -> str:
         [
             f"{row['goal']} ({row['kind']})",
             row["player"],
-            number(row["mean"], row["digits"]),
-            interval(row["ci95"], row["digits"]),
-            number(row["mean_return"]),
-            interval(row["return_ci95"]),
+            format_number(row["mean"], row["digits"]),
+            format_interval(row["ci95"], row["digits"]),
+            format_number(row["mean_return"]),
+            format_interval(row["return_ci95"]),
             f"{100.0 * row['planned_fraction']:.0f} %",
-            number(row["decision_ms"]["p50"], 2),
+            format_number(row["decision_ms"]["p50"], 2),
         ]
         for row in rows
     ]
     return format_table(header, lines)
 
 
-def _parts(text: str) -> list[str]:
+def _split_goals(text: str) -> list[str]:
     return list(dict.fromkeys(part.strip() for part in split_outside_quotes(text, "|") if part.strip()))
 
 
@@ -261,7 +264,7 @@ def _check_goals(jobs: Sequence[Job], domain: str) -> None:
         read_goals(job.objective, job.constraint, domain)
 
 
-def _pusher(env: SuiteEnv, conditions: Conditions) -> Callable[[Step], None] | None:
+def _make_pusher(env: SuiteEnv, conditions: Conditions) -> Callable[[Step], None] | None:
     """A callback that kicks the body before decisions; kicks depend on the episode's seed and the decision only."""
     if conditions.push == 0.0:
         return None
@@ -274,19 +277,3 @@ def _pusher(env: SuiteEnv, conditions: Conditions) -> Callable[[Step], None] | N
             velocities += conditions.push * draw.normal(size=velocities.shape)
 
     return push
-
-
-def _play(conditions: Conditions, jobs: Sequence[Job], workers: int) -> Iterator[dict[str, Any]]:
-    """Yields the rows in order, each as soon as it and all rows before it are finished."""
-    if workers == 1:
-        for job in jobs:
-            yield play_job(conditions, job)
-        return
-    import multiprocessing
-    from concurrent.futures import ProcessPoolExecutor
-
-    context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(min(workers, len(jobs)), context, single_thread) as pool:
-        futures = [pool.submit(play_job, conditions, job) for job in jobs]
-        for future in futures:
-            yield future.result()

@@ -11,9 +11,9 @@ from latentplan.config.planner import override_planner
 
 
 class PlainGate(GatedAgent):
-    """Plans at random decisions and acts by the actor at all others, for every objective."""
+    """Plans at random decisions and acts by the actor at all other decisions, whatever the objective."""
 
-    _is_foreign = False  # act by the actor between plans, as for the training objective, instead of by the last plan
+    _is_goal_untrained = False  # so that between plans the actor acts, and not the rest of the last plan
 
 
 def load_zero_shot_agent(player: str, checkpoint: str, device: str, planner: dict[str, Any]) -> Any:

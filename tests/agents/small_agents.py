@@ -1,4 +1,4 @@
-"""A world model and settings small enough for tests of agents."""
+"""World models and settings that are small enough for tests of agents."""
 
 import torch
 
@@ -14,10 +14,15 @@ CONFIG = Config(
 
 
 def make_model():
-    """An untrained world model whose predicted rewards and actor's modes differ between states."""
+    """An untrained world model on the fast path."""
+    return accelerate(make_plain_model())
+
+
+def make_plain_model(sizes=SIZES, heads=("reward_head", "actor"), labels=None):
+    """An untrained world model in plain torch; the outputs of the given heads differ between states."""
     torch.manual_seed(0)
-    model = accelerate(WorldModel(CONFIG.model, action_dim=2))
+    model = WorldModel(sizes, action_dim=2, labels=labels)
     with torch.no_grad():
-        model.reward_head.mlp.output.weight.normal_(std=0.3)
-        model.actor.mlp.output.weight.normal_(std=0.3)
+        for head in heads:
+            getattr(model, head).mlp.output.weight.normal_(std=0.3)
     return model

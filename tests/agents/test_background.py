@@ -11,7 +11,7 @@ from latentplan.agents.actor import ActorAgent
 from latentplan.agents.background import BackgroundAgent
 from latentplan.config import Config, PlannerConfig, UserError
 from latentplan.models import WorldModel
-from tests.agents.small_agents import SIZES
+from tests.agents.small_agents import SIZES, make_plain_model
 
 CONFIG = Config(
     model=SIZES,
@@ -21,16 +21,12 @@ CONFIG = Config(
 
 @pytest.fixture(scope="module")
 def model():
-    torch.manual_seed(0)
-    model = WorldModel(CONFIG.model, action_dim=2)
-    with torch.no_grad():
-        for head in (model.reward_head, model.actor):
-            head.mlp.output.weight.normal_(std=0.3)
-    return model
+    return make_plain_model()
 
 
 @pytest.fixture
 def film():
+    """Twelve frames of three environments, (time, environment, 64, 64, 3)."""
     return np.random.default_rng(0).integers(0, 256, (12, 3, 64, 64, 3), dtype=np.uint8)
 
 
@@ -75,10 +71,8 @@ def test_background_agent_acts_by_the_actor_until_the_first_plan_is_due(model, f
         action = agent.act(frames[0])
         assert action.shape == (2,) and action.dtype == np.float32 and np.abs(action).max() <= 1.0
         history.append((agent.last_source, agent.plan_age))
-        if len(history) <= 2:
-            assert np.allclose(
-                action, actor.act(frames[0]), atol=0.02
-            )  # the background agent's actor computes in bfloat16
+        if len(history) <= 2:  # the background agent's actor computes in bfloat16
+            assert np.allclose(action, actor.act(frames[0]), atol=0.02)
     assert history[:3] == [("actor", None), ("actor", None), ("plan", 1)]
     assert set(history[6:]) == {("plan", 0), ("plan", 1)}
 
@@ -136,7 +130,7 @@ def test_act_keeps_a_pending_reset_when_a_decision_fails(model, film):
     assert np.allclose(agent.act(film[1]), fresh.act(film[1]), atol=1e-5)
 
 
-def test_set_objective_takes_the_goal_actor_at_once_when_the_model_learned_goals(film):
+def test_set_objective_changes_to_the_actor_of_a_learned_goal_at_once(film):
     torch.manual_seed(0)
     model = WorldModel(CONFIG.model, action_dim=2, labels={"cart": 1.0}, goal_dim=8)
     with torch.no_grad():
@@ -158,12 +152,9 @@ def test_set_objective_changes_the_plans_and_not_the_actor(film):
     model = WorldModel(CONFIG.model, action_dim=2, labels={"cart": 1.0})
     agents = [make(model), make(model)]
     agents[1].set_objective("cart > 100", constraints="cart > 50")
-    told = agents[1].scheduler.executor.goals
-    assert len(told["constraints"]) == 1
-    assert set(pickle.loads(pickle.dumps(told["objective"])).needs) == {
-        "probe",
-        "value",
-    }  # the term can be sent to a process
+    goals = agents[1].scheduler.executor.goals
+    sent = pickle.loads(pickle.dumps(goals["objective"]))  # as for a worker process
+    assert len(goals["constraints"]) == 1 and set(sent.needs) == {"probe", "value"}
     first, later = [[agent.act(frames[0]) for agent in agents] for frames in film[:3]][::2]
     assert np.array_equal(*first) and not np.array_equal(*later)
     with pytest.raises(UserError, match="height"):
@@ -182,7 +173,7 @@ def test_background_agent_gets_plans_from_a_real_worker(model, film, worker):
             sources.add(agent.last_source)
             if "plan" in sources:
                 break
-            time.sleep(0.02)  # without a period every plan of a few steps comes too late
+            time.sleep(0.02)  # without a pause, more decisions pass during a search than a plan has steps
         assert "plan" in sources
         process = agent.scheduler.executor.process
     assert process is None or not process.is_alive()

@@ -1,4 +1,4 @@
-"""What all agents have in common: shapes and bounds of actions, random streams, resets, exploration."""
+"""Properties of all agents: shapes and bounds of actions, random streams, resets, exploration."""
 
 import numpy as np
 import pytest
@@ -24,12 +24,6 @@ def make_actor(model, **options):
 
 
 AGENTS = [pytest.param(make_planner, id="planner"), pytest.param(make_actor, id="actor")]
-
-
-@pytest.fixture
-def film():
-    """Five frames of three environments, (time, environment, 64, 64, 3)."""
-    return np.random.default_rng(0).integers(0, 256, (5, 3, 64, 64, 3), dtype=np.uint8)
 
 
 @pytest.mark.parametrize("make", AGENTS)

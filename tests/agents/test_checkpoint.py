@@ -1,4 +1,4 @@
-"""Checkpoints: loading restores the saved agent, or fails with one line that says why."""
+"""Checkpoints: loading restores the saved agent, or fails with the reason in one line."""
 
 import copy
 import hashlib
@@ -11,13 +11,14 @@ from safetensors.torch import load_file, save_file
 
 from latentplan.agents.checkpoint import load_agent, load_model, read_info, resolve_checkpoint, save_checkpoint
 from latentplan.agents.planning import PlanningAgent
-from latentplan.config import Config, EnvConfig, ModelConfig, PlannerConfig, UserError
+from latentplan.config import Config, EnvConfig, PlannerConfig, UserError
 from latentplan.models import WorldModel
 from latentplan.models.fast import accelerate
+from tests.agents.small_agents import SIZES, make_plain_model
 
 CONFIG = Config(
     env=EnvConfig(domain="cartpole", task="swingup"),
-    model=ModelConfig(deter_dim=16, hidden_dim=16, encoder_channels=(8, 8), decoder_channels=2, num_bins=15),
+    model=SIZES,
     planner=PlannerConfig(horizon=3, num_samples=16, num_elites=4, num_iterations=2, num_policy_samples=2),
 )
 INFO = {"domain": "cartpole", "task": "swingup", "env_frames": 1000, "discount": 0.9, "metrics": [{"planner": 1.5}]}
@@ -26,11 +27,9 @@ FRAMES = np.random.default_rng(0).integers(0, 256, (4, 64, 64, 3), dtype=np.uint
 
 @pytest.fixture(scope="module")
 def model():
-    torch.manual_seed(0)
-    model = accelerate(WorldModel(CONFIG.model, action_dim=2))
+    model = accelerate(make_plain_model(heads=("reward_head",)))
     with torch.no_grad():
-        model.reward_head.mlp.output.weight.normal_(std=0.3)
-        # A checkpoint holds float16: weights that are float16 already come back exactly.
+        # A checkpoint holds float16, so that only float16 weights are restored exactly.
         for parameter in model.parameters():
             parameter.copy_(parameter.half().float())
     return model

@@ -1,6 +1,7 @@
-"""The gated agent: plans at doubtful decisions, within its budget, warm-started from the aged plan."""
+"""The gated agent: plans doubtful decisions within its budget, warm-started from the aged plan."""
 
 import copy
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -10,8 +11,7 @@ from latentplan.agents.actor import ActorAgent
 from latentplan.agents.gated import SIGNALS, GatedAgent, RunningScale
 from latentplan.agents.planning import PlanningAgent
 from latentplan.config import Config, PlannerConfig
-from latentplan.models import WorldModel
-from tests.agents.small_agents import SIZES
+from tests.agents.small_agents import SIZES, make_plain_model
 
 CONFIG = Config(
     model=SIZES,
@@ -23,17 +23,12 @@ CONFIG = Config(
 
 @pytest.fixture(scope="module")
 def model():
-    torch.manual_seed(0)
-    model = WorldModel(CONFIG.model, action_dim=2)
-    with torch.no_grad():
-        for head in (model.reward_head, model.value_head, model.actor):
-            head.mlp.output.weight.normal_(std=0.3)
-    return model
+    return make_plain_model(heads=("reward_head", "value_head", "actor"))
 
 
 @pytest.fixture
 def film():
-    """Frames of three environments, (time, environment, 64, 64, 3)."""
+    """Forty frames of three environments, (time, environment, 64, 64, 3)."""
     return np.random.default_rng(0).integers(0, 256, (40, 3, 64, 64, 3), dtype=np.uint8)
 
 
@@ -42,7 +37,7 @@ def make(model, **options):
 
 
 class Script(GatedAgent):
-    """A gated agent whose doubts are given, one for each decision."""
+    """A gated agent with a given doubt at each decision."""
 
     def __init__(self, model, doubts):
         super().__init__(model, CONFIG, 0.9)
@@ -69,8 +64,8 @@ def test_gated_agent_exceeds_the_budget_only_by_decisions_that_must_be_planned(m
     agent.set_objective(goal)
     for index in range(60):
         agent.act(film[index % 37, 0])
-        run_out = 0 if goal is None else index // 3
-        assert agent._num_planned <= max(1 + run_out, 0.4 * (index + 1)) + 1e-6
+        num_ended_plans = 0 if goal is None else index // 3
+        assert agent._num_planned <= max(1 + num_ended_plans, 0.4 * (index + 1)) + 1e-6
     assert agent.planned_fraction > 0.15
 
 
@@ -85,7 +80,7 @@ def test_gated_agent_plans_the_most_doubtful_environments_when_the_budget_does_n
     assert agent.last_source == ["plan", "actor", "actor"]
 
 
-def test_signal_is_the_mismatch_since_the_last_plan_when_the_objective_is_not_the_actors(model, film):
+def test_signal_is_the_mismatch_since_the_last_plan_under_an_untrained_goal(model, film):
     agent = make(model, planning_budget=0.3, signal="value")
     agent.set_objective(lambda rollout: rollout.actions[:, 0, 0])
     expected, seen = 0.0, []
@@ -236,6 +231,14 @@ def test_gated_agent_acts_by_the_actor_when_no_candidate_has_a_finite_return(mod
             assert gated.last_source == ["actor"] * 3
 
 
+def test_gated_agent_reports_the_actor_when_the_deadline_leaves_no_time_for_a_search(model, film):
+    agent = make(model, planning_budget=1.0, planner=replace(CONFIG.planner, deadline_ms=1e-6))
+    for frames in film[:3]:
+        agent.act(frames)
+        assert agent.last_source == ["actor"] * 3
+    assert agent.planned_fraction == 1.0  # share of decisions with a requested search
+
+
 def test_signals_choose_different_decisions(model, film):
     moments = {}
     for signal in SIGNALS:
@@ -270,12 +273,12 @@ def test_running_scale_has_the_mean_and_std_of_all_values():
 
 
 @pytest.mark.parametrize(("options", "words"), [({"planning_budget": 1.2}, "1.2"), ({"signal": "noise"}, "mismatch")])
-def test_gated_agent_refuses_budgets_and_signals_that_do_not_exist(model, options, words):
+def test_gated_agent_refuses_a_budget_above_1_and_an_unknown_signal(model, options, words):
     with pytest.raises(ValueError, match=words):
         make(model, **options)
 
 
-def test_gated_agent_executes_the_rest_of_the_plan_when_the_objective_is_not_the_actors(model, film):
+def test_gated_agent_executes_the_rest_of_the_plan_under_an_untrained_goal(model, film):
     agent, sources = make(model, planning_budget=0.3, signal="random"), []
     agent.set_objective(lambda rollout: -rollout.actions[:, 0, 0])
     for frames in film:
@@ -287,7 +290,7 @@ def test_gated_agent_executes_the_rest_of_the_plan_when_the_objective_is_not_the
     horizon = agent.controller.planner.horizon
     assert set(sources) == {"plan", "tail"} and sources[0] == "plan"
     longest = max(len(run) for run in "".join(source[0] for source in sources).split("p"))
-    assert 1 <= longest <= horizon - 1  # a search follows a plan that has run out
+    assert 1 <= longest <= horizon - 1  # a search follows the end of a plan
 
 
 def test_gated_agent_plans_at_once_when_an_objective_is_set(model, film):
@@ -296,7 +299,7 @@ def test_gated_agent_plans_at_once_when_an_objective_is_set(model, film):
         agent.set_objective(goal)
         agent.act(film[1, 0])
         assert agent.last_source == "plan"
-    for nothing_else in (None, "return"):
-        agent.set_objective(nothing_else)
+    for learned in (None, "return"):
+        agent.set_objective(learned)
         agent.act(film[2, 0])
         assert agent.last_source == "actor"

@@ -1,4 +1,4 @@
-"""The table of agent modes: every row can be used, a new row is enough for a new mode."""
+"""The table of agent modes: every mode is usable, and a new row in the table is enough for a new mode."""
 
 import numpy as np
 import pytest
@@ -58,7 +58,7 @@ def test_table_needs_the_standard_library_only(run_python):
     assert finished.stdout.strip() == "['latentplan']", finished.stderr
 
 
-def test_planning_modes_are_those_whose_agents_take_an_objective():
+def test_planning_modes_lists_modes_of_agents_with_set_objective():
     assert planning_modes() == ("planner", "gated", "background")
     for name, mode in MODES.items():
         assert hasattr(mode.load(), "set_objective") == mode.plans, name

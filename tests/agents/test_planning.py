@@ -13,23 +13,17 @@ from latentplan.models.symmetry import TurnedModel
 from tests.agents.small_agents import CONFIG, make_model
 
 
-def cautious(rollout):
-    """A constraint: small first actions."""
+def limit_first_action(rollout):
+    """A constraint: the sum of the absolute values of the first action is at most 0.1."""
     return rollout.actions[:, 0].abs().sum(-1) - 0.1
 
 
-ASKED = [{"objective": lambda rollout: rollout.actions[:, 0, 0]}, {"constraints": [cautious]}]
+GOALS = [{"objective": lambda rollout: rollout.actions[:, 0, 0]}, {"constraints": [limit_first_action]}]
 
 
 @pytest.fixture(scope="module")
 def model():
     return make_model()
-
-
-@pytest.fixture
-def film():
-    """Five frames of three environments, (time, environment, 64, 64, 3)."""
-    return np.random.default_rng(0).integers(0, 256, (5, 3, 64, 64, 3), dtype=np.uint8)
 
 
 @pytest.fixture
@@ -97,10 +91,10 @@ def test_planning_agent_acts_by_the_actor_when_a_frame_exceeds_the_surprise_limi
     assert limited.last_source == ("actor" if is_surprised else "plan") and limited.was_surprised == is_surprised
 
 
-@pytest.mark.parametrize("asked", ASKED)
-def test_planning_agent_ignores_surprise_when_an_objective_or_constraint_is_set(model, frames, asked):
+@pytest.mark.parametrize("goals", GOALS)
+def test_planning_agent_ignores_surprise_when_an_objective_or_constraint_is_set(model, frames, goals):
     planner = make_planner(model)
     limited = make_planner(model, surprise_limit=1e-6)
     for agent in (planner, limited):
-        agent.set_objective(**asked)
+        agent.set_objective(**goals)
     assert np.array_equal(planner.act(frames[0]), limited.act(frames[0])) and limited.last_source == "plan"

@@ -1,4 +1,4 @@
-"""Every agent in `checkpoints/` is as its description says, and earns far more than a random agent."""
+"""Every agent in `checkpoints/` matches its description, and earns far more than a random agent."""
 
 import hashlib
 from pathlib import Path
@@ -11,7 +11,7 @@ from latentplan.envs import make_env
 from latentplan.evaluation.episodes import episode_seed
 
 CHECKPOINTS = Path(__file__).parents[2] / "checkpoints"
-# Return of the first decisions of evaluation episode 0; the last two columns are measured returns on the same start.
+# Floors of the return of the first decisions of evaluation episode 0, beside measured returns from the same start.
 FLOORS = {
     # agent: (decisions, floor)      actor   random agent
     "ball_in_cup-catch": (50, 120),  # 200       11
@@ -46,7 +46,7 @@ def earned(folder, mode, decisions):
 
 
 @pytest.mark.parametrize("name", sorted(path.name for path in CHECKPOINTS.iterdir()))
-def test_shipped_checkpoint_is_as_described_and_its_planner_acts(name):
+def test_shipped_checkpoint_matches_its_description_and_its_planner_acts(name):
     info = read_info(CHECKPOINTS / name)
     assert name == f"{info['domain']}-{info['task']}"
     weights = (CHECKPOINTS / name / "weights.safetensors").read_bytes()

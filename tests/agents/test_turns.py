@@ -1,4 +1,4 @@
-"""Agents that see four quarter turns of every frame: the turn of the frame does not change the action."""
+"""Agents with four quarter turns of every frame: turning the frame does not change the action."""
 
 import copy
 import dataclasses
@@ -13,12 +13,12 @@ from latentplan.agents.checkpoint import load_agent, save_checkpoint
 from latentplan.agents.export import export_actor
 from latentplan.agents.gated import GatedAgent
 from latentplan.agents.planning import PlanningAgent
-from latentplan.config import Config, LearningConfig, ModelConfig, PlannerConfig, UserError
-from latentplan.models import WorldModel
+from latentplan.config import Config, LearningConfig, UserError
+from tests.agents import small_agents
+from tests.agents.small_agents import make_plain_model
 
-SIZES = ModelConfig(deter_dim=16, hidden_dim=16, encoder_channels=(8, 8), decoder_channels=2, num_bins=15, turns=4)
-PLANNER = PlannerConfig(horizon=3, num_samples=24, num_elites=6, num_iterations=2, num_policy_samples=4)
-CONFIG = Config(model=SIZES, planner=PLANNER, learning=LearningConfig(turned_share=0.5))
+SIZES = dataclasses.replace(small_agents.SIZES, turns=4)
+CONFIG = dataclasses.replace(small_agents.CONFIG, model=SIZES, learning=LearningConfig(turned_share=0.5))
 INFO = {"domain": "reacher", "task": "easy", "env_frames": 1, "discount": 0.9}
 MAKERS = {
     "planner": lambda model: PlanningAgent(model, CONFIG, 0.9),
@@ -30,12 +30,7 @@ MAKERS = {
 
 @pytest.fixture(scope="module")
 def model():
-    torch.manual_seed(0)
-    model = WorldModel(SIZES, action_dim=2, labels={"distance": 0.1})
-    with torch.no_grad():
-        for head in (model.reward_head, model.value_head, model.actor):
-            head.mlp.output.weight.normal_(std=0.3)
-    return model
+    return make_plain_model(SIZES, ("reward_head", "value_head", "actor"), {"distance": 0.1})
 
 
 @pytest.fixture(params=list(MAKERS))
@@ -52,12 +47,6 @@ def make(request):
             agent.close()
 
 
-@pytest.fixture
-def film():
-    """Five frames of three environments, (time, environment, 64, 64, 3)."""
-    return np.random.default_rng(0).integers(0, 256, (5, 3, 64, 64, 3), dtype=np.uint8)
-
-
 def test_act_returns_one_action_per_frame(make, model, film):
     agent = make(model)
     actions = np.stack([agent.act(frames) for frames in film])
@@ -68,7 +57,7 @@ def test_act_returns_one_action_per_frame(make, model, film):
 
 
 def without_turns(model):
-    """An actor with the same weights that sees frames as they are."""
+    """An actor with the same weights and without turns."""
     alone = copy.deepcopy(model)
     alone.config = dataclasses.replace(SIZES, turns=1)
     return ActorAgent(alone, CONFIG)
@@ -92,9 +81,8 @@ def test_action_is_the_mean_of_the_actions_of_all_turns(model, film):
     assert np.allclose(ActorAgent(model, CONFIG).act(film[0]), np.mean(sides, axis=0), atol=1e-5)
 
 
-@pytest.mark.parametrize(
-    "make", ["planner", "actor"], indirect=True
-)  # gated and background agents share searches or a threshold
+# Gated and background agents are left out, because the environments of a batch share a threshold or a search.
+@pytest.mark.parametrize("make", ["planner", "actor"], indirect=True)
 def test_act_gives_each_environment_of_a_batch_its_own_action(make, model, film):
     together, alone = make(model), make(model)
     for frames in film:
@@ -144,7 +132,7 @@ def test_exported_program_turns_its_frames_itself(model, film, tmp_path):
         assert np.allclose(action.detach().numpy(), agent.act(frames), atol=1e-4)
 
 
-def test_config_refuses_turns_when_no_turned_frames_are_learned_from():
+def test_config_refuses_turns_without_turned_frames_in_training():
     with pytest.raises(UserError, match="turned_share"):
         Config(model=SIZES)
     with pytest.raises(ValueError, match="turns must be 1 or 4"):

@@ -1,5 +1,8 @@
-"""An untrained agent for ten-decision episodes of cartpole, as the commands find it on disk."""
+"""An untrained agent for ten-decision episodes of cartpole on disk, and helpers that evaluate it."""
 
+import json
+
+import cv2
 import pytest
 import torch
 
@@ -12,6 +15,27 @@ CONFIG = Config(
     model=ModelConfig(deter_dim=8, hidden_dim=8, encoder_channels=(4, 4), decoder_channels=2, num_bins=5),
     planner=PlannerConfig(horizon=3, num_samples=8, num_elites=2, num_policy_samples=1, num_iterations=2),
 )
+
+
+def run_eval(checkpoint, *flags):
+    """The exit code of `latentplan eval` on the CPU."""
+    from latentplan.commands.main import main
+
+    return main(["eval", "--checkpoint", str(checkpoint), "--device", "cpu", *map(str, flags)])
+
+
+def result_of(tmp_path, checkpoint, *flags):
+    """The JSON result of `latentplan eval`."""
+    assert run_eval(checkpoint, "--json", tmp_path / "result.json", *flags) == 0
+    return json.loads((tmp_path / "result.json").read_text())
+
+
+def count_frames(film):
+    """The number of frames of a film, and their width in pixels."""
+    capture, count = cv2.VideoCapture(str(film)), 0
+    while capture.grab():
+        count += 1
+    return count, capture.get(cv2.CAP_PROP_FRAME_WIDTH)
 
 
 @pytest.fixture(scope="session")

@@ -1,4 +1,4 @@
-"""`latentplan eval` plays an agent, and prints, films and writes what it measured."""
+"""`latentplan eval` plays an agent, and prints, films and writes its results."""
 
 import json
 import os
@@ -10,35 +10,17 @@ import time
 from dataclasses import replace
 from pathlib import Path
 
-import cv2
 import numpy as np
 import pytest
 import torch
 
 from latentplan.agents.checkpoint import load_model, save_checkpoint
 from latentplan.agents.random import RandomAgent
-from latentplan.commands.main import main
 from latentplan.config import USER_DOMAIN
 from latentplan.envs import make_env
 from latentplan.evaluation import evaluate_agent
 from latentplan.models import WorldModel
-from tests.commands.conftest import CONFIG
-
-
-def run(checkpoint, *flags):
-    return main(["eval", "--checkpoint", str(checkpoint), "--device", "cpu", *map(str, flags)])
-
-
-def result_of(tmp_path, checkpoint, *flags):
-    assert run(checkpoint, "--json", tmp_path / "result.json", *flags) == 0
-    return json.loads((tmp_path / "result.json").read_text())
-
-
-def count_frames(film):
-    capture, count = cv2.VideoCapture(str(film)), 0
-    while capture.grab():
-        count += 1
-    return count, capture.get(cv2.CAP_PROP_FRAME_WIDTH)
+from tests.commands.conftest import CONFIG, count_frames, result_of, run_eval
 
 
 @pytest.fixture(scope="module")
@@ -48,10 +30,10 @@ def returns(checkpoint, tmp_path_factory):
 
 
 @pytest.mark.parametrize("mode", ["planner", "gated", "background", "actor", "random"])
-def test_eval_prints_and_writes_what_it_promises(tmp_path, checkpoint, mode, capsys):
+def test_eval_prints_and_writes_the_documented_results(tmp_path, checkpoint, mode, capsys):
     result = result_of(tmp_path, checkpoint, "--mode", mode, "--episodes", 2, "--seed", 5)
-    promised = {"domain", "task", "mode", "seed", "returns", "mean_return", "ci95", "decision_ms"}
-    assert {*promised, "env_frames_trained"} <= result.keys() and "surprised" not in result
+    documented = {"domain", "task", "mode", "seed", "returns", "mean_return", "ci95", "decision_ms"}
+    assert {*documented, "env_frames_trained"} <= result.keys() and "surprised" not in result
     printed = capsys.readouterr().out
     for words in ("mean return", "95 % interval", "p50", "p95", "p99", "cartpole-swingup", mode):
         assert words in printed
@@ -77,12 +59,12 @@ def test_returns_depend_on_seed_and_episode_alone(tmp_path, run_folder, returns)
     assert result_of(tmp_path, run_folder, *flags, "--video", film)["returns"] == returns[:1]
     assert result_of(tmp_path, run_folder, *flags, "--seed", 1)["returns"] != returns[:1]
     count, width = count_frames(film)
-    assert count == 11 and width >= 2 * 256  # ten decisions and the last frame, beside what the plan imagines
+    assert count == 11 and width >= 2 * 256  # ten decisions and the last frame, beside the decoded end of the plan
     assert sorted(path.name for path in tmp_path.iterdir()) == ["film.mp4", "result.json"]
 
 
 def test_film_of_an_agent_that_plans_nothing_holds_every_decision(tmp_path, checkpoint):
-    assert run(checkpoint, "--episodes", 1, "--mode", "random", "--video", tmp_path / "film.webm") == 0
+    assert run_eval(checkpoint, "--episodes", 1, "--mode", "random", "--video", tmp_path / "film.webm") == 0
     assert count_frames(tmp_path / "film.webm")[0] == 11
 
 
@@ -161,7 +143,7 @@ def test_eval_loads_settings_of_an_earlier_version_where_they_mean_the_same(
     (tmp_path / "old" / "info.json").write_text(json.dumps(info))
     flags = ["--episodes", "1", "--mode", "random"]
     if planner == {"start": "shifted"}:
-        assert run(tmp_path / "old", *flags) == 0
+        assert run_eval(tmp_path / "old", *flags) == 0
     else:
         reason = "unknown setting planner.horizons" if "horizons" in planner else "a search starts from the shifted"
         assert_refused(["eval", "--checkpoint", tmp_path / "old", *flags], "settings of another version", reason)
@@ -176,7 +158,7 @@ def test_eval_refuses_an_agent_of_the_users_own_environment(assert_refused, tmp_
 
 def test_eval_warns_when_a_search_finds_nothing_finite(capsys, checkpoint, monkeypatch):
     monkeypatch.setattr(WorldModel, "rollout", lambda self, state, actions: (actions[..., 0] * torch.nan, state))
-    assert run(checkpoint, "--episodes", "1") == 0
+    assert run_eval(checkpoint, "--episodes", "1") == 0
     assert "at 10 decisions the search found nothing finite" in capsys.readouterr().err
 
 
@@ -213,7 +195,7 @@ def test_eval_tries_outputs_before_it_plays(assert_refused, tmp_path, checkpoint
 
 def test_result_goes_where_a_link_leads(tmp_path, checkpoint):
     (tmp_path / "link.json").symlink_to("target.json")
-    assert run(checkpoint, "--episodes", 1, "--json", tmp_path / "link.json") == 0
+    assert run_eval(checkpoint, "--episodes", 1, "--json", tmp_path / "link.json") == 0
     assert (tmp_path / "link.json").is_symlink()
     assert json.loads((tmp_path / "target.json").read_text())["episodes"] == 1
 

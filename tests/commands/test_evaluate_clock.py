@@ -1,18 +1,8 @@
 """`scripts/eval.py` in a world that does not wait."""
 
-import json
-
-import cv2
 import pytest
 
-from latentplan.commands.main import main
-
-
-def result_of(tmp_path, checkpoint, *flags):
-    path = tmp_path / "result.json"
-    arguments = ["--checkpoint", checkpoint, "--device", "cpu", "--json", path, *flags]
-    assert main(["eval", *map(str, arguments)]) == 0
-    return json.loads(path.read_text())
+from tests.commands.conftest import count_frames, result_of
 
 
 @pytest.fixture
@@ -71,10 +61,7 @@ def test_film_of_a_world_that_does_not_wait_shows_every_period(tmp_path, checkpo
     latency.write_text("70\n")
     flags = ("--episodes", 1, "--control-hz", 20, "--latency", latency, "--video", path)
     assert result_of(tmp_path, checkpoint, *flags)["deadline_misses"] == 5
-    capture, count = cv2.VideoCapture(str(path)), 0
-    while capture.grab():
-        count += 1
-    assert count == 11
+    assert count_frames(path)[0] == 11
 
 
 @pytest.mark.parametrize(

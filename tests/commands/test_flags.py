@@ -1,5 +1,6 @@
 """Flags made of a dataclass: spellings, types, repeated flags, errors and help."""
 
+import dataclasses
 import importlib
 import random
 from dataclasses import dataclass
@@ -10,14 +11,14 @@ import pytest
 
 from latentplan.commands.flags import format_flags, list_flags, overrides, read_request
 from latentplan.commands.main import COMMANDS
-from latentplan.config import DistillConfig, PlannerConfig, UserError
+from latentplan.config import DistillConfig, GoalsConfig, PlannerConfig, UserError
 from latentplan.config.checks import at_least
 from latentplan.config.parsing import option
 
 
 @dataclass(frozen=True)
 class Request:
-    """What the tests ask for.
+    """The request of the tests.
 
     Attributes:
         checkpoint: Folder of something.
@@ -152,6 +153,18 @@ def test_every_flag_of_a_command_has_a_meaning(name):
     assert all(flag.setting.meaning for flag in flags)
     spellings = [spelling for flag in flags for spelling in flag.names]
     assert len(spellings) == len(set(spellings))
+
+
+@pytest.mark.parametrize(("name", "kind"), [("distill", DistillConfig), ("goals", GoalsConfig)])
+def test_command_has_a_flag_of_the_right_type_for_every_setting(name, kind):
+    fields = {field.name: field.default for field in dataclasses.fields(kind)}
+    values = dict.fromkeys(fields, "3") | ({"relabel_share": "1"} if name == "distill" else {})
+    argv = [word for setting, value in values.items() for word in (f"--{setting.replace('_', '-')}", value)]
+    request = importlib.import_module(COMMANDS[name].module).Request
+    settings = read_request(request, ["--checkpoint", "x", *argv]).settings
+    assert {setting: float(value) for setting, value in values.items()} == settings
+    for setting, default in fields.items():
+        assert type(settings[setting]) is type(1.0 if default is None else default)  # only minutes may be None
 
 
 def test_random_flags_never_end_in_a_traceback():

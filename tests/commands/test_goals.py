@@ -1,12 +1,6 @@
-"""`latentplan goals`: what its command line asks for, and errors of one line."""
-
-import dataclasses
+"""`latentplan goals`: errors of one line."""
 
 import pytest
-
-from latentplan.commands.flags import read_request
-from latentplan.commands.goals import Request
-from latentplan.config import GoalsConfig
 
 
 @pytest.mark.parametrize(
@@ -28,12 +22,3 @@ from latentplan.config import GoalsConfig
 )
 def test_goals_refuses_bad_flags_in_one_line(flags, words, assert_refused):
     assert_refused(["goals", *flags], *words)
-
-
-def test_goals_has_a_flag_for_every_setting():
-    fields = {field.name: field.default for field in dataclasses.fields(GoalsConfig)}
-    argv = [word for name in fields for word in (f"--{name.replace('_', '-')}", "1")]
-    settings = read_request(Request, ["--checkpoint", "x", *argv]).settings
-    assert settings.keys() == fields.keys()
-    for name, default in fields.items():
-        assert type(settings[name]) is type(default if default is not None else 1.0)

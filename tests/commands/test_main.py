@@ -109,7 +109,6 @@ def test_print_config_output_is_a_config_file_that_gives_the_same_settings(capsy
 
 @pytest.mark.parametrize("shell", SHELLS)
 def test_print_completion_names_every_command_and_flag(shell, capsys):
-    pytest.importorskip("shtab")
     assert main(["--print-completion", shell]) == main([f"--print-completion={shell}"]) == 0
     text = capsys.readouterr().out
     for word in (*COMMANDS, "--planner.horizon", "--run-dir", "--constraint", "background", "--help-all"):
@@ -118,7 +117,6 @@ def test_print_completion_names_every_command_and_flag(shell, capsys):
 
 @pytest.mark.skipif(sys.platform == "win32", reason="needs bash")
 def test_bash_completion_completes_commands_flags_and_values(capsys):
-    pytest.importorskip("shtab")
     assert main(["--print-completion", "bash"]) == 0
     cases = {
         "tr": "train",

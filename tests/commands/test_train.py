@@ -1,4 +1,4 @@
-"""The command line of a training run: which settings it gives, what it may change when a run resumes, and errors."""
+"""The command line of a training run: its settings, the changes that a resumed run accepts, and errors."""
 
 import pytest
 

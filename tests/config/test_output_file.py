@@ -24,7 +24,7 @@ def test_output_file_refuses_links_that_lead_nowhere(tmp_path, target):
         output_file(tmp_path / "link.json", "--json")
 
 
-def test_output_file_refuses_what_is_not_a_regular_file(tmp_path):
+def test_output_file_refuses_pipes(tmp_path):
     os.mkfifo(tmp_path / "pipe")
     with pytest.raises(UserError, match="is not a regular file"):
         output_file(tmp_path / "pipe", "--json")

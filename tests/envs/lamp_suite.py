@@ -1,4 +1,4 @@
-"""A suite of one domain, to show that a factory and an entry in the table are enough."""
+"""A suite with one domain: a factory, to be registered in the table of suites."""
 
 import gymnasium
 import numpy as np

@@ -1,4 +1,4 @@
-"""The table of environment suites: an entry is enough to train and evaluate in a new suite."""
+"""The table of environment suites: one entry is enough to train and evaluate in a new suite."""
 
 import csv
 import json
@@ -23,9 +23,8 @@ from latentplan.config import (
 from latentplan.config.files import compose
 from latentplan.config.suites import SUITES, Suite
 from latentplan.envs import default_task, make_env
-from latentplan.evaluation.clock import VirtualClock
+from latentplan.evaluation.clock import Latency, VirtualClock
 from latentplan.evaluation.goals import read_goals, score_env
-from latentplan.evaluation.latency import Latency
 from latentplan.evaluation.timed import iterate_timed_episodes
 from latentplan.training import train
 
@@ -56,7 +55,7 @@ def test_make_env_calls_the_factory_of_the_suite():
         ({"suite": ["lamps"]}, r"unknown suite \['lamps'\]"),
     ],
 )
-def test_unknown_names_are_refused_before_anything_is_made(config, message):
+def test_compose_refuses_unknown_suites_and_domains(config, message):
     with pytest.raises(UserError, match=message):
         compose({"env": config}, {}, "cpu")
 

@@ -1,4 +1,4 @@
-"""An objective whose value replaces the task's reward."""
+"""Rewards given by an objective in place of the task's reward."""
 
 import numpy as np
 import pytest
@@ -46,7 +46,7 @@ def test_score_of_return_sums_the_objective_reward():
 @pytest.mark.parametrize(
     "objective", ["return", "0.5 * (cart -> 0.5) + return", "goal:x.png", "carts > 0.5", "cart >", ""]
 )
-def test_make_env_refuses_objectives_that_are_no_function_of_quantities(objective):
+def test_make_env_refuses_objectives_that_are_not_functions_of_quantities(objective):
     with pytest.raises(UserError):
         make_env(config(objective))
 

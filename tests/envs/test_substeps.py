@@ -1,4 +1,4 @@
-"""Actions that change within a decision: the simulation is the same as with separate control steps."""
+"""Actions that change within a decision: the simulation equals a simulation with separate control steps."""
 
 import numpy as np
 import pytest

@@ -167,7 +167,7 @@ def test_exact_frame_equals_dm_controls_rendering():
 
 @pytest.mark.parametrize("domain", ["walker", "cheetah"])
 def test_endless_floor_changes_only_frames_behind_the_start(domain):
-    """The suite draws no floor behind the start: frames differ there, and ahead they are equal up to rounding."""
+    """The suite draws no floor behind the start: frames differ behind the start, and are equal ahead of it."""
     envs = [make_env(config(domain=domain, floor=floor), seed=0) for floor in ("suite", "endless")]
     differences = {}
     for place in (-8.0, 8.0):

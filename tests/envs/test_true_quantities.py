@@ -128,16 +128,3 @@ def test_step_reports_true_values_after_each_control_step_when_recorded():
     env.record_quantities = False
     assert "quantities" not in env.step(action)[-1]
     env.close()
-
-
-def test_documentation_lists_every_quantity_with_its_margin(root):
-    text = (root / "docs" / "reference" / "quantities.md").read_text()
-    quantities = [quantity for of_domain in QUANTITIES.values() for quantity in of_domain]
-    rows = []
-    for quantity in quantities:
-        if quantity.name.startswith(TASK_PREFIX):  # the tasks of a domain share a row
-            rows.append(f"`{quantity.name}`")
-        else:
-            unit = "" if quantity.unit == "1" else f"{quantity.unit} "
-            rows.append(f"| `{quantity.name}` | {unit}| {quantity.scale:g} | {quantity.meaning} |")
-    assert [row for row in rows if row not in text] == []

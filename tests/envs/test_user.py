@@ -1,4 +1,4 @@
-"""A user's environment becomes frames of 64 x 64 and actions in [-1, 1], or is refused with a reason."""
+"""A user's environment gets frames of 64 x 64 and actions in [-1, 1], or is refused with a reason."""
 
 import gymnasium
 import numpy as np
@@ -29,7 +29,7 @@ class Clock(gymnasium.Env):
 
     def step(self, action):
         self.actions.append(action)
-        self.picture += 1  # the same array every time, on purpose
+        self.picture += 1  # the same array at every step, so that the wrapper has to copy it
         return self.picture, action[0], bool(self.picture.max() == 7), False, {}
 
 
@@ -82,7 +82,7 @@ def test_decisions_per_episode_follows_from_a_wrapper_without_a_spec():
 
 
 def test_step_truncates_after_the_longest_episode_without_a_time_limit(monkeypatch):
-    monkeypatch.setattr(user, "LONGEST", 5)
+    monkeypatch.setattr(user, "MAX_DECISIONS", 5)
     env = wrap_user_env(Clock())
     for _ in range(2):
         env.reset()
@@ -140,7 +140,7 @@ def test_make_from_seeds_the_first_reset_only():
         (Box(0, 255, (64, 64), np.uint8), r"got shape \(64, 64\)"),
     ],
 )
-def test_wrap_user_env_refuses_observations_that_are_no_images(space, got):
+def test_wrap_user_env_refuses_observations_that_are_not_images(space, got):
     with pytest.raises(UserError, match=f"observations must be .*{got}"):
         wrap_user_env(Clock(observation_space=space))
 
@@ -155,7 +155,7 @@ def test_wrap_user_env_refuses_observations_that_are_no_images(space, got):
         (Box(np.finfo(np.float32).min, np.finfo(np.float32).max, (2,), np.float32), "got bounds"),
     ],
 )
-def test_wrap_user_env_refuses_actions_that_are_no_bounded_box(space, got):
+def test_wrap_user_env_refuses_actions_without_a_bounded_box(space, got):
     with pytest.raises(UserError, match=f"actions must be .*{got}"):
         wrap_user_env(Clock(action_space=space))
 

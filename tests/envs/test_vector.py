@@ -1,4 +1,4 @@
-"""A vector environment behaves as the same environments one by one."""
+"""A vector environment behaves like the same environments one by one."""
 
 import os
 

@@ -1,4 +1,4 @@
-"""The virtual clock and its executor, alone and with every kind of agent."""
+"""The virtual clock and the executor, alone and with every kind of agent."""
 
 import time
 
@@ -13,9 +13,8 @@ from latentplan.agents.planning import PlanningAgent
 from latentplan.agents.random import RandomAgent
 from latentplan.config import Config, EnvConfig, ModelConfig, PlannerConfig
 from latentplan.envs import make_env
-from latentplan.evaluation.clock import VirtualClock, VirtualExecutor
+from latentplan.evaluation.clock import Latency, VirtualClock, VirtualExecutor
 from latentplan.evaluation.episodes import run_episodes
-from latentplan.evaluation.latency import Latency
 from latentplan.evaluation.timed import iterate_timed_episodes, summarize_timed
 from latentplan.models import WorldModel
 
@@ -25,7 +24,7 @@ PLANNER = PlannerConfig(horizon=4, num_samples=8, num_elites=2, num_policy_sampl
 
 
 class Searcher:
-    """A planner whose plans are numbers that count its calls."""
+    """A planner that returns the number of its calls as the plan."""
 
     def __init__(self):
         self.count = 0
@@ -46,13 +45,13 @@ def executor_on(clock):
 STATE = torch.zeros(1, 2)
 
 
-def test_executor_hands_over_a_plan_when_its_duration_has_passed():
+def test_executor_returns_a_plan_when_its_duration_has_passed():
     clock = VirtualClock(50.0, constant(0, 30))
     executor = executor_on(clock)
     clock.advance(3)  # 60 ms
     assert executor.request(STATE, tick=7)
     assert not executor.is_idle and not executor.request(STATE, tick=8)
-    assert executor.asked_ms == {7: 60.0}
+    assert executor.requested_ms == {7: 60.0}
     clock.advance(4)
     assert executor.poll() is None  # 20 ms later
     clock.advance(5)
@@ -61,7 +60,7 @@ def test_executor_hands_over_a_plan_when_its_duration_has_passed():
 
 
 @pytest.mark.parametrize("control_hz", [30.0, 60.0, 70.0, 90.0, 144.0])
-def test_executor_hands_over_a_plan_of_one_period_at_the_end_of_the_period(control_hz):
+def test_executor_returns_a_plan_of_one_period_at_the_end_of_the_period(control_hz):
     clock = VirtualClock(control_hz, constant(0, 1000.0 / control_hz))
     executor = executor_on(clock)
     for tick in range(1000):
@@ -71,7 +70,7 @@ def test_executor_hands_over_a_plan_of_one_period_at_the_end_of_the_period(contr
         assert executor.poll() is not None
 
 
-def test_executor_hands_over_a_plan_at_once_when_it_takes_no_time():
+def test_executor_returns_a_plan_at_once_when_it_takes_no_time():
     for clock in (VirtualClock(50.0, constant(0, 0)), VirtualClock(None, Latency())):
         executor = executor_on(clock)
         executor.request(STATE, tick=0)
@@ -83,7 +82,7 @@ def test_executor_drops_the_pending_plan_when_an_episode_begins():
     executor = executor_on(clock)
     executor.request(STATE, tick=0)
     clock.restart(1)
-    assert executor.is_idle and executor.asked_ms == {}
+    assert executor.is_idle and executor.requested_ms == {}
     executor.request(STATE, tick=5)
     clock.advance(50)
     assert executor.poll() == (5, 2)

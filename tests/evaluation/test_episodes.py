@@ -1,4 +1,4 @@
-"""Closed-loop episodes: starts that depend on the seed alone, and what is counted on the way."""
+"""Closed-loop episodes: starts depend on the seed alone; rewards, frames and decision times are counted."""
 
 import math
 import time
@@ -28,20 +28,15 @@ class ClockEnv(gymnasium.Env):
     def step(self, action):
         self.time += 1
         over = self.time == self.length
-        return (
-            self._frame(),
-            float(action[0]),
-            over and self.terminates,
-            over and not self.terminates,
-            {"env_frames": 4},
-        )
+        terminated, truncated = over and self.terminates, over and not self.terminates
+        return self._frame(), float(action[0]), terminated, truncated, {"env_frames": 4}
 
     def _frame(self):
         return np.full((64, 64, 3), self.start + self.time, np.uint8)
 
 
 class NoisyAgent:
-    """Adds noise from its own stream to a constant, and keeps the times of the frames since the last reset."""
+    """Adds noise from its random stream to a constant, and keeps the times of the frames since the last reset."""
 
     def __init__(self, constant=0.0):
         self.constant, self.seen = constant, None
@@ -92,7 +87,7 @@ def test_run_episodes_plays_each_episode_independently_of_earlier_ones():
     assert together == alone[::-1]
 
 
-def test_run_episodes_seeds_the_agent_with_a_stream_of_its_own():
+def test_run_episodes_seeds_the_agent_with_another_seed_than_the_start():
     class Recorder(NoisyAgent):
         def seed(self, seed):
             self.given = seed
@@ -147,7 +142,7 @@ def test_decision_ms_excludes_simulator_and_callback():
             return super().step(action)
 
     (episode,) = run_episodes(SlowEnv(), NoisyAgent(), [0], on_step=lambda step: time.sleep(0.05))
-    assert np.median(episode.decision_ms) < 25.0  # with either sleep in it the median would be 50 ms
+    assert np.median(episode.decision_ms) < 25.0  # a decision time with one of the two sleeps would be 50 ms
 
 
 def test_iterate_episodes_gives_an_episode_before_the_next_begins():

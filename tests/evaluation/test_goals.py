@@ -1,4 +1,4 @@
-"""Goals named after training: scores come from the simulator, and planning agents pursue the goals."""
+"""Goals given after training: scores come from the simulator, and planning agents pursue the goals."""
 
 import functools
 import json
@@ -130,12 +130,12 @@ def test_scored_env_scores_each_episode_on_its_own(env):
 
 
 def test_scored_env_reports_each_change_of_the_objective(env):
-    told = []
+    changes = []
     goals = read_goals("cart > 0; 250: cart < 0; 260: upright", None, "cartpole")
-    scored = ScoredEnv(env, goals, lambda objective: told.append((len(scored.worth), objective.text)))
+    scored = ScoredEnv(env, goals, lambda objective: changes.append((len(scored.objective_scores), objective.text)))
     run_episodes(scored, RandomAgent(1), [5, 5])
-    # A decision holds for 100 control steps: at 300 the objective of 260 is in force, and that of 250 was never due.
-    assert told == [(0, "cart > 0"), (300, "upright")] * 2
+    # A decision lasts 100 control steps: at frame 300 the objective from 260 on replaces the objective from 250 on.
+    assert changes == [(0, "cart > 0"), (300, "upright")] * 2
 
 
 def test_scored_env_scores_goal_images_by_the_cameras_frame(env, tmp_path):
@@ -146,11 +146,11 @@ def test_scored_env_scores_goal_images_by_the_cameras_frame(env, tmp_path):
     scored = ScoredEnv(env, read_goals(f"goal:{tmp_path}/goal0.png", None, "cartpole"))
     scored.reset(seed=3)
     scored.step(np.zeros(1))
-    assert 0.0 < min(scored.worth) and max(scored.worth) <= 1.0
+    assert 0.0 < min(scored.objective_scores) and max(scored.objective_scores) <= 1.0
     other = ScoredEnv(env, read_goals(f"goal:{tmp_path}/goal40.png", None, "cartpole"))
     other.reset(seed=3)
     other.step(np.zeros(1))
-    assert max(other.worth) < min(scored.worth)
+    assert max(other.objective_scores) < min(scored.objective_scores)
 
 
 @pytest.mark.parametrize("mode", ["planner", "gated", "background", "actor", "random"])
@@ -203,12 +203,11 @@ def test_evaluate_explains_bad_goals_in_one_line(capsys, checkpoint, flags, reas
 def test_evaluate_scores_an_agent_without_quantities_but_refuses_to_plan(capsys, tmp_path, old_checkpoint):
     error = error_of(capsys, "--checkpoint", old_checkpoint, "--objective", "cart > 1", "--device", "cpu")
     assert "trained without named quantities" in error
-    assert (
-        evaluate_agent(old_checkpoint, tmp_path, "--objective", "cart > 1", "--mode", "actor")["objective_return"] > 0
-    )
+    result = evaluate_agent(old_checkpoint, tmp_path, "--objective", "cart > 1", "--mode", "actor")
+    assert result["objective_return"] > 0
 
 
-def test_score_env_refuses_a_later_objective_before_anything_is_played(env):
+def test_score_env_refuses_a_later_objective_before_the_first_episode(env):
     agent = PlanningAgent(WorldModel(MODEL, 1, {"cart": 0.5}), CONFIG, 0.9)
     with pytest.raises(UserError, match="upright"):
         score_env(env, read_goals("cart > 1; 500: upright > 0", None, "cartpole"), agent)

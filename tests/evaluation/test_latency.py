@@ -1,11 +1,11 @@
-"""Latencies: files of durations, and what is charged for decisions and plans."""
+"""Latencies: files of durations, and the charges of decisions and plans."""
 
 import json
 
 import pytest
 
 from latentplan.config import UserError
-from latentplan.evaluation.latency import Latency, read_latency
+from latentplan.evaluation.clock import Latency, read_latency
 
 
 def read(tmp_path, text):

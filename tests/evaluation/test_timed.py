@@ -6,9 +6,8 @@ import gymnasium
 import numpy as np
 import pytest
 
-from latentplan.evaluation.clock import VirtualClock
+from latentplan.evaluation.clock import Latency, VirtualClock
 from latentplan.evaluation.episodes import run_episodes
-from latentplan.evaluation.latency import Latency
 from latentplan.evaluation.timed import iterate_timed_episodes, summarize_timed
 
 SUBSTEPS = 10
@@ -40,7 +39,7 @@ class TapeEnv:
 
 
 class CountingAgent:
-    """Acts 1, 2, 3 and so on, and keeps the periods that it saw."""
+    """Returns the actions 1, 2, 3 and so on, and keeps the periods of the frames."""
 
     def seed(self, seed):
         pass
@@ -58,7 +57,7 @@ def constant(milliseconds):
 
 
 def play(milliseconds, control_hz=20.0, length=4, on_step=None, env=None):
-    """One episode in which every decision takes as many milliseconds; a period is 50 by default."""
+    """One episode with decisions of the given duration; a period lasts 50 ms by default."""
     env, agent = env or TapeEnv(length), CountingAgent()
     clock = VirtualClock(control_hz, constant(milliseconds))
     (episode,) = iterate_timed_episodes(env, agent, [0], clock, on_step=on_step)
@@ -124,7 +123,7 @@ def test_zeros_clamped_into_the_bounds_hold_before_the_first_decision():
     assert tape[0][:3] == [0.25] * 3
 
 
-def test_action_comes_more_substeps_late_when_the_period_is_shorter():
+def test_action_is_delayed_by_more_substeps_when_the_period_is_shorter():
     slow, fast = (play(10.0, control_hz)[0][0] for control_hz in (10.0, 50.0))
     assert (slow.count(0.0), fast.count(0.0)) == (1, 5)
 

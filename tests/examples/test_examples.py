@@ -1,4 +1,4 @@
-"""Every example runs, and what it prints and draws is what it promises."""
+"""Every example runs, prints the expected numbers and draws its picture."""
 
 import ast
 import re
@@ -31,7 +31,7 @@ def run_example(root, run_python, tmp_path):
 
 
 def assert_is_drawn(path):
-    """The picture can be read, is of a size to look at, and is not blank."""
+    """The picture can be read, has at least 300 x 300 pixels, and is not blank."""
     picture = cv2.imread(str(path))
     assert picture.shape[0] >= 300 and picture.shape[1] >= 300
     assert picture.std() > 10.0
@@ -45,6 +45,7 @@ def test_planning_in_own_dynamics_swings_the_pendulum_up(run_example, tmp_path):
     assert_is_drawn(tmp_path / "own_dynamics.png")
 
 
+@pytest.mark.slow
 def test_planning_in_a_learned_network_beats_random_actions(run_example):
     numbers = run_example("plan_learned_mlp")
     assert numbers["random actions"][0] < -900.0
@@ -61,6 +62,7 @@ def test_closed_corridor_sends_the_plan_around(run_example, tmp_path):
     assert_is_drawn(tmp_path / "corridor.png")
 
 
+@pytest.mark.slow
 def test_trained_agent_reaches_a_new_goal(run_example, tmp_path):
     numbers = run_example("trained_agent_new_goal")
     (task_cart, task_upright), (goal_cart, goal_upright) = numbers["trained task"], numbers["new goal"]
@@ -69,6 +71,7 @@ def test_trained_agent_reaches_a_new_goal(run_example, tmp_path):
     assert_is_drawn(tmp_path / "new_goal.png")
 
 
+@pytest.mark.slow
 def test_own_environment_is_learned_within_seconds(run_example, tmp_path):
     numbers = run_example("own_environment")
     assert numbers["planner"][0] > 14.0 > 12.0 > numbers["random"][0]

@@ -84,14 +84,14 @@ def test_block_of_a_trained_agent_runs(blocks, root, monkeypatch):
     assert abs(names["action"]).max() <= 1.0
 
 
-def test_block_of_a_model_of_ones_own_runs(blocks):
+def test_block_of_an_own_model_runs(blocks):
     names = {}
     exec(blocks["Bring your own model"], names)
     assert names["action"].shape == (1, 1)
-    assert names["action"].item() < 0.0  # towards the origin, from the right of it
+    assert names["action"].item() < 0.0  # towards the origin from the right side
 
 
-def test_block_of_training_hands_over_the_config_and_the_environment(blocks, monkeypatch):
+def test_block_of_training_passes_the_config_and_the_environment(blocks, monkeypatch):
     calls = []
     signature = inspect.signature(latentplan.training.train)
     monkeypatch.setattr(latentplan.training, "train", lambda *given, **named: calls.append((given, named)))

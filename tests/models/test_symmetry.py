@@ -1,4 +1,4 @@
-"""Beliefs of a frame and its three quarter turns."""
+"""Beliefs about a frame and its three quarter turns."""
 
 import pickle
 
@@ -11,6 +11,7 @@ from latentplan.models.symmetry import QUARTERS, TurnedModel, first_turn, flat, 
 from latentplan.planning import CEMPlanner
 from latentplan.planning.check import check_model
 from latentplan.planning.objectives import learned_return, risk, terminal_value
+from latentplan.planning.search.scorer import Scorer
 
 SIZES = ModelConfig(deter_dim=16, hidden_dim=16, encoder_channels=(8, 8), decoder_channels=2, num_bins=15)
 
@@ -26,7 +27,7 @@ def model():
 
 @pytest.fixture
 def beliefs():
-    """Beliefs of three environments, four turns each."""
+    """Beliefs about three environments, four turns each."""
     generator = torch.Generator().manual_seed(1)
     return State(*(torch.randn(3, QUARTERS, size, generator=generator) for size in (16, 32)))
 
@@ -56,10 +57,10 @@ def test_folded_and_flat_are_inverse(beliefs):
 
 @pytest.mark.parametrize("method", ["value", "continues", "policy"])
 def test_turned_model_returns_the_mean_over_turns(method, model, beliefs):
-    seen = TurnedModel(model)
+    wrapped = TurnedModel(model)
     each = torch.stack([getattr(model, method)(State(*(part[:, turn] for part in beliefs))) for turn in range(4)])
-    assert torch.allclose(getattr(seen, method)(beliefs), each.mean(0), atol=1e-2)  # a trunk in bfloat16
-    assert torch.allclose(getattr(seen, method)(flat(beliefs)), getattr(model, method)(flat(beliefs)), atol=1e-2)
+    assert torch.allclose(getattr(wrapped, method)(beliefs), each.mean(0), atol=1e-2)  # a trunk in bfloat16
+    assert torch.allclose(getattr(wrapped, method)(flat(beliefs)), getattr(model, method)(flat(beliefs)), atol=1e-2)
 
 
 @pytest.mark.parametrize("method", ["step", "fast_step"])
@@ -75,21 +76,21 @@ def test_turned_model_step_advances_every_turn(method, model, beliefs):
 
 @pytest.mark.parametrize("num", [1, 3, 6])
 def test_turned_model_proposes_the_mode_of_all_turns_then_of_each_turn(num, model, beliefs):
-    seen, streams = TurnedModel(model), [torch.Generator().manual_seed(seed) for seed in range(3)]
-    proposals = seen.propose(beliefs, num, 5, streams)
+    wrapped, streams = TurnedModel(model), [torch.Generator().manual_seed(seed) for seed in range(3)]
+    proposals = wrapped.propose(beliefs, num, 5, streams)
     assert proposals.shape == (3 * num, 5, 2)
-    modes = torch.cat([seen.policy(beliefs)[:, None], model.policy(flat(beliefs)).unflatten(0, (3, QUARTERS))], 1)
+    modes = torch.cat([wrapped.policy(beliefs)[:, None], model.policy(flat(beliefs)).unflatten(0, (3, QUARTERS))], 1)
     first = proposals.unflatten(0, (3, num))[:, :, 0]
     assert torch.allclose(first[:, :5].float(), modes[:, :num].float(), atol=0.05)  # a trunk in bfloat16
-    state, _ = seen.step(beliefs, proposals[::num, 0])
-    assert torch.allclose(proposals[::num, 1].float(), seen.policy(state).float(), atol=0.05)
+    state, _ = wrapped.step(beliefs, proposals[::num, 0])
+    assert torch.allclose(proposals[::num, 1].float(), wrapped.policy(state).float(), atol=0.05)
 
 
 def test_turned_model_scores_equal_turns_like_a_single_belief(model, beliefs):
     alike = State(*(part[:, :1].expand(-1, QUARTERS, -1).contiguous() for part in beliefs))
     actions = torch.rand(3, 24, 3, 2) * 2 - 1
     one, all_turns = (
-        scores(seen, state, actions) for seen, state in ((model, first_turn(alike)), (TurnedModel(model), alike))
+        scores(wrapped, state, actions) for wrapped, state in ((model, first_turn(alike)), (TurnedModel(model), alike))
     )
     assert torch.allclose(one, all_turns, atol=2e-2) and one.std() > 0.1
 
@@ -104,31 +105,29 @@ def test_turned_model_scores_a_candidate_by_the_mean_over_turns(model, beliefs):
 
 def scores(model, state, actions):
     """Returns of candidates, (batch, sample)."""
-    from latentplan.planning.search.scorer import Scorer
-
     discounts = 0.9 ** torch.arange(actions.shape[2] + 1)
     scorer = Scorer.build(model, None, (), discounts, terminal_value=None, use_continues=False, penalty=None)
     return scorer.score(scorer.start_rows(state, actions.shape[1]), actions).returns
 
 
 def test_plan_with_turned_model_does_not_depend_on_other_environments(model, beliefs):
-    seen = TurnedModel(model)
-    plan = plan_for(seen, beliefs)
-    alone = plan_for(seen, State(*(part[1:2] for part in beliefs)))
+    wrapped = TurnedModel(model)
+    plan = plan_for(wrapped, beliefs)
+    alone = plan_for(wrapped, State(*(part[1:2] for part in beliefs)))
     assert plan.actions.shape == (3, 3, 2)
     assert torch.allclose(plan.actions[1], alone.actions[0], atol=0.1)
-    assert plan_for(seen, beliefs, previous=plan).actions.shape == (3, 3, 2)
+    assert plan_for(wrapped, beliefs, previous=plan).actions.shape == (3, 3, 2)
 
 
 def test_turned_model_particles_repeat_its_turns(model, beliefs):
-    seen = TurnedModel(model)
-    assert torch.equal(seen.particles(beliefs, 6).stoch[4:6], beliefs.stoch[0, :2])
+    wrapped = TurnedModel(model)
+    assert torch.equal(wrapped.particles(beliefs, 6).stoch[4:6], beliefs.stoch[0, :2])
     worst = risk(learned_return() + terminal_value(), measure="worst", num_particles=QUARTERS)
-    assert torch.isfinite(plan_for(seen, beliefs, objective=worst).actions).all()
+    assert torch.isfinite(plan_for(wrapped, beliefs, objective=worst).actions).all()
 
 
 def test_turned_model_can_be_pickled(model, beliefs):
-    seen = pickle.loads(pickle.dumps(TurnedModel(model)))
-    assert torch.allclose(seen.value(beliefs), TurnedModel(model).value(beliefs))
-    assert seen.label_names == ("height",)
-    check_model(seen, beliefs, 2)
+    wrapped = pickle.loads(pickle.dumps(TurnedModel(model)))
+    assert torch.allclose(wrapped.value(beliefs), TurnedModel(model).value(beliefs))
+    assert wrapped.label_names == ("height",)
+    check_model(wrapped, beliefs, 2)

@@ -1,4 +1,4 @@
-"""Boxes are recognised in expressions, and the degree of a box is the value of its expression."""
+"""Boxes are recognised in expressions, and the degree of a box equals the value of its expression."""
 
 import math
 

@@ -1,4 +1,4 @@
-"""The planner maximises expressions over predicted quantities and keeps constraints with a distance."""
+"""The planner maximises expressions over predicted quantities, and keeps a distance from constraints."""
 
 from typing import NamedTuple
 
@@ -10,9 +10,9 @@ from torch import Tensor
 from latentplan.config import EnvConfig, UserError
 from latentplan.objectives.box import planning_degree
 from latentplan.objectives.objective import (
-    plan_constraint,
-    plan_goals,
-    plan_objective,
+    build_constraint,
+    build_goals,
+    build_objective,
     read_goal_image,
     require_labels,
 )
@@ -52,7 +52,7 @@ class Cart:
 
 def objective(text, frames_per_step=1, encode_goal=None, guide=None):
     learned = predicted_return(Cart(), None)
-    return plan_objective(parse_objective(text, SCALES), frames_per_step, learned, guide, encode_goal)
+    return build_objective(parse_objective(text, SCALES), frames_per_step, learned, guide, encode_goal)
 
 
 def plan_cart(text=None, constraints=(), start=(0.0, 0.0), **options):
@@ -80,7 +80,7 @@ def rollout_of(features, rewards=None, discount=0.5):
     return Rollout(Cart(), 1, 1, torch.zeros(rows, steps, 1), rewards, weights, states[0], states[-1], states)
 
 
-def test_plan_objective_sums_discounted_degrees_of_a_rollout():
+def test_build_objective_sums_discounted_degrees_of_a_rollout():
     carts = torch.tensor([[0.0, 1.0], [0.5, 1.0], [1.0, 1.0]])[..., None]
     rollout = rollout_of(torch.cat([carts, torch.zeros_like(carts)], dim=-1))
     half, none = planning_degree(torch.tensor([1.0, 2.0])).tolist()
@@ -96,7 +96,7 @@ def test_planning_degree_rises_wherever_a_clause_does_not_hold():
     assert bool(planning_degree(torch.tensor(float("nan"))).isnan())
 
 
-def test_plan_objective_weights_the_learned_return():
+def test_build_objective_weights_the_learned_return():
     features = torch.tensor([[[1.0, 0.0]], [[2.0, 0.0]]])
     rollout = rollout_of(features, rewards=torch.tensor([[3.0, 4.0]]))
     learned = 3.0 + 0.5 * 4.0 + 0.25 * -20.0
@@ -104,12 +104,12 @@ def test_plan_objective_weights_the_learned_return():
     assert objective("0.5 * return + 2 * (cart > 0)")(rollout).item() == pytest.approx(0.5 * learned + 2 * 1.5)
 
 
-def test_plan_objective_needs_a_value_only_for_the_learned_return():
+def test_build_objective_needs_a_value_only_for_the_learned_return():
     assert "value" not in objective("cart > 0.3").needs
     assert "value" in objective("return + cart").needs
 
 
-def test_plan_objective_adds_the_guide_when_expression_has_no_return():
+def test_build_objective_adds_the_guide_when_expression_has_no_return():
     rollout = rollout_of(torch.tensor([[[1.0, 0.0]], [[2.0, 0.0]]]), rewards=torch.tensor([[3.0, 4.0]]))
     guide = 0.1 * terminal_value()
     assert objective("cart > 0", guide=guide)(rollout).item() == pytest.approx(1.5 + 0.1 * 0.25 * -20.0)
@@ -118,14 +118,14 @@ def test_plan_objective_adds_the_guide_when_expression_has_no_return():
 
 
 @pytest.mark.parametrize(("use_value", "needs"), [(None, True), (True, True), (False, False)])
-def test_plan_goals_uses_the_terminal_value_when_the_planner_may(use_value, needs):
+def test_build_goals_uses_the_terminal_value_if_the_planner_allows_it(use_value, needs):
     model = Cart()
     model.labels = SCALES
     goals = {"model": model, "env": EnvConfig(domain="cartpole", task="swingup"), "encode_goal": None}
     goals["planner"] = CEMPlanner(action_dim=1, horizon=3, discount=0.9, terminal_value=use_value)
-    pursued, _ = plan_goals("cart > 0.3", (), **goals)
+    pursued, _ = build_goals("cart > 0.3", (), **goals)
     assert ("value" in pursued.needs) == needs
-    assert plan_goals("return", (), **goals)[0] is None
+    assert build_goals("return", (), **goals)[0] is None
 
 
 @pytest.mark.parametrize(("horizon", "discount"), [(2, 0.9), (20, 0.99)])
@@ -134,14 +134,14 @@ def test_guide_is_a_quarter_of_the_return_at_the_rate_of_the_value(horizon, disc
     model.labels = SCALES
     planner = CEMPlanner(action_dim=1, horizon=3, goal_horizon=horizon, discount=discount)
     env = EnvConfig(domain="cartpole", task="swingup")
-    pursued, _ = plan_goals("0 * cart", (), model=model, env=env, planner=planner, encode_goal=None)
-    end = [-0.1 / (1.0 - discount), 0.0]  # its value is that of a reward of one in every future step
+    pursued, _ = build_goals("0 * cart", (), model=model, env=env, planner=planner, encode_goal=None)
+    end = [-0.1 / (1.0 - discount), 0.0]  # the value equals a reward of one in every future step
     rollout = rollout_of(torch.tensor([[[0.0, 0.0]], [end]]))
     beyond = terminal_value()(rollout).item() * (1.0 - discount)  # with the discount of this rollout at its end
     assert pursued(rollout).item() == pytest.approx(0.25 * horizon * beyond)
 
 
-def test_plan_objective_rewards_latents_near_the_goal_image():
+def test_build_objective_rewards_latents_near_the_goal_image():
     features = torch.tensor([[[0.0, 0.0], [0.9, 0.0]]])
     score = objective("2 * goal:end.png", encode_goal=lambda path: torch.tensor([len(path) / 7.0]))
     far, near = score(rollout_of(features)).tolist()
@@ -163,21 +163,21 @@ def test_planner_reaches_the_quantities_of_an_expression(text, cart, speed):
 
 def test_planner_keeps_a_constraint_when_the_objective_conflicts():
     free, _ = plan_cart("cart_speed -> 2.0")
-    kept, _ = plan_cart("cart_speed -> 2.0", [plan_constraint(parse_constraints("cart < 0.5", SCALES))])
+    kept, _ = plan_cart("cart_speed -> 2.0", [build_constraint(parse_constraints("cart < 0.5", SCALES))])
     assert free.max() > 0.9
     assert kept.max() < 0.5
 
 
 def test_planner_maximises_the_learned_return_when_only_constraints_are_given():
     free, _ = plan_cart()
-    kept, _ = plan_cart(constraints=[plan_constraint(parse_constraints("cart > -0.5", SCALES))])
+    kept, _ = plan_cart(constraints=[build_constraint(parse_constraints("cart > -0.5", SCALES))])
     assert free[-1] < -1.0
     assert -0.5 < kept[-1] < -0.2
 
 
-def test_plan_constraint_sums_violations_in_margins_with_a_distance():
+def test_build_constraint_sums_violations_in_margins_with_a_distance():
     features = torch.tensor([[[0.2, 0.0], [0.49, 0.0]], [[0.2, 0.0], [1.0, 0.0]]])
-    constraint = plan_constraint(parse_constraints("cart < 0.5; cart_speed < 1", SCALES))
+    constraint = build_constraint(parse_constraints("cart < 0.5; cart_speed < 1", SCALES))
     assert constraint(rollout_of(features)).tolist() == pytest.approx([0.0, (0.1 - 0.02) + (0.1 + 1.0)])
 
 
@@ -190,24 +190,24 @@ def test_require_labels_refuses_quantities_that_the_model_does_not_predict():
         require_labels(nodes, ())
 
 
-def test_plan_objective_needs_no_probe_when_expression_is_constant():
+def test_build_objective_needs_no_probe_when_expression_is_constant():
     constant = objective("3")
     rollout = rollout_of(torch.tensor([[[1.0, 0.0]], [[2.0, 0.0]]]))
     rollout.model.probe = rollout.model.label_names = None
     assert constant.needs == () and constant(rollout).shape == (1,)
 
 
-def test_plan_objective_can_be_added_to_the_learned_return():
+def test_build_objective_can_be_added_to_the_learned_return():
     mixed = objective("cart > 0.3") + 0.1 * learned_return()
     assert isinstance(mixed, Objective) and mixed.needs_states
 
 
 @pytest.mark.parametrize(("objective", "constraints"), [(5, ()), (None, ["cart < 0.5"]), (None, ("cart < 0.5", "a"))])
-def test_plan_goals_refuses_values_that_are_not_text_or_functions(objective, constraints):
+def test_build_goals_refuses_values_that_are_not_text_or_functions(objective, constraints):
     model = Cart()
     model.labels = SCALES
     with pytest.raises(UserError, match="functions? of rollouts"):
-        plan_goals(
+        build_goals(
             objective,
             constraints,
             model=model,
@@ -225,7 +225,7 @@ def test_read_goal_image_names_the_file_when_it_cannot_be_read(tmp_path, name, r
         read_goal_image(str(tmp_path / name))
 
 
-def test_read_goal_image_tells_the_reason_of_opencv_when_image_is_too_large(tmp_path, monkeypatch):
+def test_read_goal_image_gives_opencvs_reason_when_the_image_is_too_large(tmp_path, monkeypatch):
     (tmp_path / "large.png").touch()
 
     def refuse(path, flags):

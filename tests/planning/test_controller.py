@@ -1,4 +1,4 @@
-"""Receding-horizon control: the plan that is kept between steps, and the calls that forget it."""
+"""Receding-horizon control: the plan that the controller keeps between steps, and the calls that drop it."""
 
 import itertools
 

@@ -12,8 +12,8 @@ PAGE = (Path(__file__).parents[2] / "docs" / "guides" / "planning.md").read_text
 EXAMPLES = re.findall(r"```python\n(.*?)```", PAGE, flags=re.DOTALL)
 
 
-def test_planning_page_has_eight_examples():
-    assert len(EXAMPLES) == 8
+def test_planning_page_has_five_examples():
+    assert len(EXAMPLES) == 5
 
 
 @pytest.mark.parametrize("index", range(len(EXAMPLES)))

@@ -18,7 +18,7 @@ def linear_problem(num_states, generator):
 
 
 def riccati(dynamics, control, state_cost, action_cost, horizon):
-    """Cost-to-go matrix with `horizon` steps left, and the cost after the last, by Riccati's recursion."""
+    """Matrix of the cost of `horizon` steps and of the last state, by Riccati's recursion."""
     cost = state_cost
     for _ in range(horizon):
         gain = torch.linalg.solve(action_cost + control.T @ cost @ control, control.T @ cost @ dynamics)
@@ -90,7 +90,7 @@ def test_icem_swings_up_a_pendulum_with_its_true_dynamics():
 
 
 def test_elites_are_the_same_for_bfloat16_and_float32_trunks_at_a_value_of_1000():
-    """Only the trunk's products are in bfloat16; a return of 1000 summed there would step by 4."""
+    """Only products of the trunk are in bfloat16, in which neighbouring numbers near 1000 differ by 4."""
     generator = torch.Generator().manual_seed(0)
     hidden, output = torch.randn(16, 64, generator=generator) / 4, torch.randn(64, 16, generator=generator) / 8
     heads = torch.randn(16, 2, generator=generator)

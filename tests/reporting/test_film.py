@@ -77,7 +77,7 @@ def test_filming_shows_the_imagined_frame_until_the_episode_is_over(tmp_path):
 
 
 class Goals:
-    worth, clauses = (0.5,), (("height > 1.2", True),)
+    objective_scores, clauses = (0.5,), (("height > 1.2", True),)
 
 
 def test_filming_adds_a_strip_when_goals_are_scored(tmp_path):

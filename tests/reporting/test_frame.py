@@ -1,4 +1,4 @@
-"""Frames of a film: two pictures, text, and the strip about the goals."""
+"""Frames of a film: two pictures, text, and the strip with the goals."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""Video files hold what was written to them, or do not appear."""
+"""Video files hold all written frames, or are not created."""
 
 import cv2
 import numpy as np

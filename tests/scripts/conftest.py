@@ -75,7 +75,7 @@ def config():
 
 @pytest.fixture(scope="session")
 def save_agent(config):
-    """Save an untrained agent in a folder, with changes of its environment; returns the folder."""
+    """A function that saves an untrained agent, with changes of its environment, and returns the folder."""
 
     def save(folder, **changes):
         torch.manual_seed(0)

@@ -3,6 +3,7 @@
 import csv
 import importlib
 import json
+import sys
 from dataclasses import replace
 
 import benchmark
@@ -12,10 +13,10 @@ import torch
 from bench.ablate import compare_arms
 from bench.ablation_arms import NAMES, Arm, Outcome, parse_arms
 from bench.decide import measure_decisions
+from bench.estimates import interquartile_estimate, interquartile_mean, paired_difference
 from bench.machine import product_limits
 from bench.render import measure_qualities
-from bench.report import format_table, interval, number
-from bench.statistics import interquartile_estimate, interquartile_mean, paired_difference
+from bench.report import format_interval, format_number, format_table
 from bench.train_update import PARTS, measure_graph, measure_update
 
 from latentplan.agents.actor import ActorAgent
@@ -69,6 +70,11 @@ def test_main_refuses_bad_flags_in_one_line_that_names_the_flag(capsys, argument
     assert named in captured.err
 
 
+def test_benchmark_modules_do_not_shadow_the_standard_library(root):
+    names = {path.stem for path in (root / "scripts" / "bench").iterdir()}
+    assert not names & sys.stdlib_module_names
+
+
 def test_help_lists_every_command_and_every_flag(capsys):
     assert benchmark.main([]) == 0
     overview = capsys.readouterr().out
@@ -97,10 +103,10 @@ def test_every_flag_of_the_benchmarks_keeps_its_default():
 
 
 def test_format_table_aligns_columns_and_marks_missing_values():
-    table = format_table(["arm", "return"], [["a", number(12.345)], ["longer", number(None)]])
+    table = format_table(["arm", "return"], [["a", format_number(12.345)], ["longer", format_number(None)]])
     assert table.splitlines() == ["arm     return", "------  ------", "a         12.3", "longer       -"]
-    assert interval((None, None)) == "-"
-    assert interval((-1.0, 2.0), sign=True) == "-1.0 to +2.0"
+    assert format_interval((None, None)) == "-"
+    assert format_interval((-1.0, 2.0), sign=True) == "-1.0 to +2.0"
 
 
 def test_parse_arms_puts_the_full_planner_first():

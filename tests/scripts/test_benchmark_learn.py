@@ -7,10 +7,10 @@ from dataclasses import replace
 import benchmark
 import numpy as np
 import pytest
-from bench.anchors import METHODS, published
+from bench.anchors import METHODS, published_returns_of
+from bench.estimates import interquartile_estimate, mean_estimate
 from bench.learn import check_same, compare, first_reaching, read_run, run_facts
 from bench.learn_plot import MARKERS, Curve, Point
-from bench.statistics import interquartile_estimate, mean_estimate
 
 from latentplan.config import Config, EnvConfig, PlannerConfig, RunConfig, UserError
 from latentplan.config.files import dump_config
@@ -42,7 +42,7 @@ def test_compare_sets_runs_beside_published_returns_at_the_same_frames():
     assert own["frames_to"] == {"600": 100_500, "800": None}
     assert (other["returns"][100_000], other["frames_to"]) == (605, {"600": 100_000, "800": 200_000})
     assert rows["ResAct (own repeat)"]["returns"] == {100_000: 772}
-    assert len(MARKERS) == len(METHODS) and set(published("walker-walk")) == set(METHODS)
+    assert len(MARKERS) == len(METHODS) and set(published_returns_of("walker-walk")) == set(METHODS)
     assert list(compare("fish-swim", [curves[0]._replace(task="fish-swim")], [600])) == ["latentplan"]
 
 
@@ -108,7 +108,7 @@ def test_read_run_names_the_folder_when_results_are_damaged(tmp_path, name, text
         read_run("walker-walk", 0, tmp_path, "planner")
 
 
-def test_interquartile_estimate_covers_the_truth_at_its_level_for_few_runs():
+def test_interquartile_estimate_covers_the_mean_at_its_confidence_level_for_few_runs():
     rng, held = np.random.default_rng(0), 0
     for _ in range(400):
         low, high = interquartile_estimate([rng.normal(size=2), rng.normal(size=3)])[1:]

@@ -1,12 +1,9 @@
+"""`benchmark.py paths`: every fast path is timed beside its reference."""
+
 import json
-import sys
-from pathlib import Path
 
+import benchmark
 import pytest
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "scripts"))
-
-import benchmark  # noqa: E402
 
 SIZES = {
     "model.deter_dim": 32,

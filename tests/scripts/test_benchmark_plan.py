@@ -1,4 +1,4 @@
-"""`benchmark.py plan`: our planner beside those of other libraries."""
+"""`benchmark.py plan`: the project's planner beside planners of other libraries."""
 
 import json
 import sys
@@ -14,7 +14,7 @@ from bench.peers.install import PEERS, Peer, PeerError, last_line
 from bench.peers.problem import Problem, as_state, build_model, next_features, rewards_at, start_state
 from bench.plan import OURS, PLAIN, PRODUCTS, compare, summarise
 from bench.plan_scaling import scaling_table
-from bench.plan_searches import matrix_products, our_search, plain_search, product_shapes
+from bench.plan_searches import matrix_products, plain_search, planner_search, product_shapes
 from torch.utils.flop_counter import FlopCounterMode
 
 from latentplan.config import ModelConfig, to_dict
@@ -77,16 +77,16 @@ def test_build_model_rewards_differ_between_states():
     assert returns.std() > 0.01
 
 
-def test_matrix_products_are_those_of_a_search_except_the_std_of_the_prior():
+def test_matrix_products_equal_a_search_without_the_std_of_the_prior():
     products = counted_flop(matrix_products(PROBLEM, "float32"))
     assert products == PROBLEM.iterations * sum(2 * m * k * n for m, k, n in product_shapes(PROBLEM))
     std = 2 * PROBLEM.iterations * PROBLEM.horizon * PROBLEM.samples * MODEL.hidden_dim * MODEL.latent_dim
     assert counted_flop(plain_search(PROBLEM)) == products + std
-    assert products <= counted_flop(our_search(PROBLEM, "float32")) <= products + std
+    assert products <= counted_flop(planner_search(PROBLEM, "float32")) <= products + std
 
 
-def test_our_search_multiplies_its_operations_by_the_batch():
-    assert counted_flop(our_search(PROBLEM, "float32", 3)) == 3 * counted_flop(our_search(PROBLEM, "float32"))
+def test_planner_search_multiplies_its_operations_by_the_batch():
+    assert counted_flop(planner_search(PROBLEM, "float32", 3)) == 3 * counted_flop(planner_search(PROBLEM, "float32"))
 
 
 def test_searches_find_actions_of_high_reward():
@@ -95,7 +95,7 @@ def test_searches_find_actions_of_high_reward():
     random = torch.rand(1000, 2, generator=torch.Generator().manual_seed(0)) * 2 - 1
     with torch.no_grad():
         torch.manual_seed(0)
-        found = torch.stack([plain_search(problem)(), our_search(problem, "float32")().action[0]])
+        found = torch.stack([plain_search(problem)(), planner_search(problem, "float32")().action[0]])
         actions = torch.cat([found.clamp(-1, 1), random])
         _, rewards = model.step(as_state(model, start.features.expand(len(actions), -1)), actions)
     assert rewards[:2].min() > rewards[2:].quantile(0.95)

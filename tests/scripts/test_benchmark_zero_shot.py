@@ -1,4 +1,4 @@
-"""`benchmark.py zero-shot`: goals that an agent was not trained for, played by every agent."""
+"""`benchmark.py zero-shot`: goals that the agent was not trained for, played by every player."""
 
 import json
 from pathlib import Path
@@ -10,7 +10,7 @@ import torch
 from bench.zero_shot import (
     CONSTRAINT_PLAYERS,
     OBJECTIVE_PLAYERS,
-    PURSUERS,
+    PLANNING_PLAYERS,
     PUSH_PROBABILITY,
     Conditions,
     Job,
@@ -116,5 +116,7 @@ def test_zero_shot_refuses_bad_goals_in_one_line(capsys, checkpoint, flags, reas
 
 def test_planning_players_share_their_search_settings(checkpoint):
     changes = {"horizon": 2}
-    searches = [load_zero_shot_agent(player, str(checkpoint), "cpu", changes).controller.planner for player in PURSUERS]
+    searches = [
+        load_zero_shot_agent(player, str(checkpoint), "cpu", changes).controller.planner for player in PLANNING_PLAYERS
+    ]
     assert {(search.horizon, search.goal_horizon) for search in searches} == {(2, None)}

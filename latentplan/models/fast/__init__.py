@@ -1,6 +1,6 @@
 """Backends that compute a world model faster than plain torch, with the same results up to rounding.
 
-`accelerate` gives a model the backend for its device. Everything else in this package is only called by backends.
+`accelerate` gives a model the backend for its device. The backends are the only callers of the other modules.
 """
 
 from __future__ import annotations
@@ -15,13 +15,13 @@ __all__ = ["CpuBackend", "GpuBackend", "accelerate"]
 
 
 def accelerate(model: WorldModel) -> WorldModel:
-    """Give a model the fastest backend that can compute it where its parameters are now.
+    """Gives a model the fastest backend that can compute it on the device of its parameters.
 
-    A model whose dynamics no fast backend knows keeps the reference, with products in the precision that is fastest on
-    its device. Call it again after the model has moved to another device.
+    A model whose dynamics no fast backend knows gets the reference, with products in the precision that is fastest on
+    the device. Call this function again after the model has moved to another device.
 
     Returns:
-        The model itself.
+        The model.
     """
     kind = model.device.type
     fast = CpuBackend if kind == "cpu" else GpuBackend if kind == "cuda" else None

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Hashable, Sequence
+from functools import partial
 from operator import attrgetter
-from typing import Any
+from typing import Any, cast
 
 import torch
 from torch import Tensor, nn
 
-from latentplan.models.backend import Backend
+from latentplan.models.backend import Backend, FrameFunctions
 from latentplan.models.dynamics import Gaussian, Rssm, State
 from latentplan.models.fast import compiled, one_frame, pointwise, unroll
 from latentplan.models.fast import frames as sliced_frames
@@ -22,14 +23,14 @@ _version_of = attrgetter("_version")  # a count of writes in place
 
 
 class ConvertedWeights:
-    """A converted copy of some weights, made again when one of them was replaced or written to in place.
+    """A conversion of some weights, made again when one of these weights was replaced or changed in place.
 
-    Writes through `parameter.data` go unnoticed. A copy or a pickle of this object starts empty, because converted
+    Changes in place of `parameter.data` go unnoticed. A copy or a pickle of this object starts empty, because converted
     weights can hold pointers.
 
     Args:
         parts: Names of the model's modules whose weights are converted.
-        convert: Makes the converted weights of a model, with products in a dtype.
+        convert: `convert(model, dtype)` returns the conversion for matrix products in this dtype.
     """
 
     def __init__(self, parts: tuple[str, ...], convert: Callable[[WorldModel, torch.dtype], Any]) -> None:
@@ -41,7 +42,7 @@ class ConvertedWeights:
         return {**self.__dict__, "_places": None, "_kept": None}
 
     def of(self, model: WorldModel, dtype: torch.dtype) -> Any:
-        """The converted weights of a model as they are now."""
+        """The conversion of the model's present weights, for matrix products in a dtype."""
         parameters = self._parameters(model)
         if parameters[0].is_inference():  # torch does not count writes to such tensors
             return self._convert(model, dtype)
@@ -53,7 +54,10 @@ class ConvertedWeights:
         return kept[1]
 
     def _parameters(self, model: WorldModel) -> list[Tensor]:
-        """The parameters of the parts; where they are is kept, because a walk through modules outlasts a step."""
+        """The parameters of the parts.
+
+        The dictionary and name of each parameter are kept, because a walk through all modules takes longer than a step.
+        """
         parts, places = tuple(map(model._modules.get, self._parts)), self._places
         if places is None or places[0] != parts:
             owners = [module._parameters for part in parts if part is not None for module in part.modules()]
@@ -63,12 +67,12 @@ class ConvertedWeights:
 
 
 class _ConvertingBackend(Backend):
-    """Rollouts and single frames with weights that are converted once, for dynamics of the class `Rssm`."""
+    """Rollouts and single frames with weights that are converted once, for dynamics of class `Rssm`."""
 
     def __init__(self, trunk_dtype: torch.dtype) -> None:
         super().__init__(trunk_dtype)
         self._rollout_weights = ConvertedWeights(ROLLOUT_PARTS, _convert_for_rollouts)
-        self._frame_weights = ConvertedWeights(FRAME_PARTS, _convert_for_frames)
+        self._frame_functions = ConvertedWeights(FRAME_PARTS, _convert_for_frames)
 
     @staticmethod
     def can_compute(model: WorldModel) -> bool:
@@ -83,17 +87,10 @@ class _ConvertingBackend(Backend):
         """See `Backend.propose`; gradients do not reach the weights."""
         return rollouts.propose(self._weights(model), state, noise)
 
-    def advance(self, model: WorldModel, state: State, action: Tensor) -> Tensor:
-        """See `Backend.advance`."""
-        return one_frame.advance(self._frame_weights.of(model, torch.float32), state, action)
-
-    def see(self, model: WorldModel, deter: Tensor, frames: Tensor) -> State:
-        """See `Backend.see`."""
-        return one_frame.see(self._frame_weights.of(model, torch.float32), deter, frames)
-
-    def act(self, model: WorldModel, state: State) -> tuple[Tensor, Tensor]:
-        """See `Backend.act`."""
-        return one_frame.act(self._frame_weights.of(model, torch.float32), state)
+    def frame_functions(self, model: WorldModel) -> FrameFunctions:
+        """See `Backend.frame_functions`."""
+        functions: FrameFunctions = self._frame_functions.of(model, torch.float32)
+        return functions
 
     def _weights(self, model: WorldModel) -> rollouts.Weights:
         kind = model.device.type
@@ -104,7 +101,7 @@ class _ConvertingBackend(Backend):
 
 
 class CpuBackend(_ConvertingBackend):
-    """Rollouts, steps and values in one compiled call each, where the processor multiplies bfloat16; else torch.
+    """One compiled call for each rollout, step and value if the processor multiplies bfloat16; else calls of torch.
 
     Augmented frames are copied slice by slice.
     """
@@ -140,8 +137,8 @@ class CpuBackend(_ConvertingBackend):
 class GpuBackend(_ConvertingBackend):
     """Fewer kernels per step: the gradients of the recurrence are written out, and elementwise work is compiled.
 
-    The trunk is float32, because converting operands takes longer than products of this size save. Where the tensors
-    are on a CPU the same arithmetic runs uncompiled.
+    The trunk is float32, because converting operands takes longer than products of this size save. For tensors on a CPU
+    the same arithmetic runs uncompiled.
     """
 
     def __init__(self) -> None:
@@ -151,17 +148,17 @@ class GpuBackend(_ConvertingBackend):
         self, model: WorldModel, embeddings: Tensor, actions: Tensor, deter: Tensor, noise: Tensor
     ) -> tuple[State, Gaussian]:
         """See `Backend.observe`."""
-        return unroll.observe(model.dynamics, embeddings, actions, deter, noise)
+        return unroll.observe(_rssm(model), embeddings, actions, deter, noise)
 
     def predict(self, model: WorldModel, start: State, actions: Tensor) -> tuple[Tensor, Gaussian]:
         """See `Backend.predict`."""
-        return unroll.predict(model.dynamics, start, actions)
+        return unroll.predict(_rssm(model), start, actions)
 
     def imagine(
         self, model: WorldModel, start: State, action_noise: Tensor, noise: Tensor, decay: float
     ) -> tuple[Tensor, Tensor]:
         """See `Backend.imagine`; the weights of the dynamics get no gradient."""
-        return unroll.imagine(model.dynamics, model.actor, start, action_noise, noise, decay)
+        return unroll.imagine(_rssm(model), model.actor, start, action_noise, noise, decay)
 
     def call(self, function: Callable[..., Any], *arguments: Any) -> Any:
         """See `Backend.call`."""
@@ -175,9 +172,16 @@ class GpuBackend(_ConvertingBackend):
         torch._foreach_add_(list(slow), steps)
 
 
+def _rssm(model: WorldModel) -> Rssm:
+    return cast(Rssm, model.dynamics)  # by `can_compute`
+
+
 def _convert_for_rollouts(model: WorldModel, dtype: torch.dtype) -> rollouts.Weights:
-    return rollouts.convert_weights(model.dynamics, model.reward_head, model.value_head, model.actor, dtype)
+    return rollouts.convert_weights(_rssm(model), model.reward_head, model.value_head, model.actor, dtype)
 
 
-def _convert_for_frames(model: WorldModel, dtype: torch.dtype) -> one_frame.FrameWeights:
-    return one_frame.convert_weights(model)
+def _convert_for_frames(model: WorldModel, dtype: torch.dtype) -> FrameFunctions:
+    weights = one_frame.convert_weights(model)
+    return FrameFunctions(
+        partial(one_frame.advance, weights), partial(one_frame.see, weights), partial(one_frame.act, weights)
+    )

@@ -1,7 +1,7 @@
 """Rollouts in one call of compiled C, on processors with bfloat16 products (AVX-512 or AMX).
 
-This module arranges the weights as `imagine.c` reads them. Sums and elementwise work are float32, so rollouts differ
-from torch's only where torch rounds intermediate results.
+This module arranges the weights in the layout that `imagine.c` reads. Sums and elementwise work are float32, so results
+differ from those of torch only where torch rounds intermediate results.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ class _Model(ctypes.Structure):
 
 
 class Packed(NamedTuple):
-    """The struct that compiled calls read, and the tensors that keep its pointers valid."""
+    """The struct that compiled calls read, and the tensors to which its pointers point."""
 
     model: _Model
     tensors: tuple[Tensor, ...]
@@ -59,28 +59,28 @@ def pack(weights: Weights, critic: tuple[Trunk, Tensor, Tensor]) -> Packed | Non
     if library is None or not (known and fit and library.can_imagine()):
         return None
 
-    def rotated(matrix: Tensor, first: int) -> Tensor:
-        """The rows from `first` on, then the first rows: compiled calls store stoch before deter."""
+    def rotate(matrix: Tensor, first: int) -> Tensor:
+        """The rows from `first` on, then the rows before: compiled calls store stoch before deter."""
         return torch.cat([matrix[first:], matrix[:first]])
 
-    def output(matrix: Tensor, shift: Tensor) -> tuple[Tensor, None, Tensor]:
+    def split_output(matrix: Tensor, shift: Tensor) -> tuple[Tensor, None, Tensor]:
         """A float32 product as two bfloat16 products: of the rounded weights, and of the rounding errors."""
-        matrix, shift = _padded(matrix, 1), _padded(shift, 0)
+        matrix, shift = _pad(matrix, 1), _pad(shift, 0)
         rounded = matrix.bfloat16()
         return torch.cat([rounded, (matrix - rounded.float()).bfloat16()], 1), None, shift
 
-    def mlp(trunk: Trunk, matrix: Tensor, shift: Tensor) -> list[tuple[Tensor, Tensor | None, Tensor]]:
+    def pack_mlp(trunk: Trunk, matrix: Tensor, shift: Tensor) -> list[tuple[Tensor, Tensor | None, Tensor]]:
         (first, first_norm), (second, second_norm) = trunk
-        return [(rotated(first, deter), *first_norm), (second, *second_norm), output(matrix, shift)]
+        return [(rotate(first, deter), *first_norm), (second, *second_norm), split_output(matrix, shift)]
 
     layers = [
-        (torch.cat([_padded(weights.action, 0), weights.stoch]), *weights.input_norm),
-        (rotated(weights.gates, hidden), *weights.gates_norm),
+        (torch.cat([_pad(weights.action, 0), weights.stoch]), *weights.input_norm),
+        (rotate(weights.gates, hidden), *weights.gates_norm),
         (weights.prior, *weights.prior_norm),
         (weights.mean, None, weights.mean_shift.float()),
-        *mlp(weights.head, weights.logits, weights.logits_shift),
-        *mlp(weights.actor, weights.actor_output, weights.actor_shift),
-        *mlp(*critic),
+        *pack_mlp(weights.head, weights.logits, weights.logits_shift),
+        *pack_mlp(weights.actor, weights.actor_output, weights.actor_shift),
+        *pack_mlp(*critic),
     ]
     return _to_tiles(layers, weights.values, (action, latent, deter, hidden))
 
@@ -88,26 +88,26 @@ def pack(weights: Weights, critic: tuple[Trunk, Tensor, Tensor]) -> Packed | Non
 def rollout(packed: Packed, deter: Tensor, stoch: Tensor, actions: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Rewards (rows, time) along actions (rows, time, action), and the last deter and stoch, all float32."""
     rewards = torch.empty(actions.shape[:2])
-    deter, stoch, actions = _own(deter), _own(stoch), actions.float().contiguous()
+    deter, stoch, actions = _copy(deter), _copy(stoch), actions.float().contiguous()
     _call(packed, deter, stoch, actions, rewards)
     return rewards, deter, stoch
 
 
 def propose(packed: Packed, deter: Tensor, stoch: Tensor, noise: Tensor) -> Tensor:
     """The actor's actions, float32 (rows, time, action), for standard normal draws of the same shape."""
-    actions = _own(noise)
-    _call(packed, _own(deter), _own(stoch), actions)
+    actions = _copy(noise)
+    _call(packed, _copy(deter), _copy(stoch), actions)
     return actions
 
 
 def value(packed: Packed, deter: Tensor, stoch: Tensor) -> Tensor:
     """The value of states, float32 (rows,)."""
     values = torch.empty(len(deter))
-    _call(packed, _own(deter), _own(stoch), torch.empty(len(deter), 0, 0), values=values)
+    _call(packed, _copy(deter), _copy(stoch), torch.empty(len(deter), 0, 0), values=values)
     return values
 
 
-def _own(tensor: Tensor) -> Tensor:
+def _copy(tensor: Tensor) -> Tensor:
     """A contiguous float32 copy, which the compiled call overwrites."""
     return tensor.to(torch.float32, memory_format=torch.contiguous_format, copy=True)
 
@@ -122,16 +122,17 @@ def _call(
 ) -> None:
     library, model, (rows, time) = load(), packed.model, actions.shape[:2]
     assert library is not None
-    wanted = ((rows, model.deter), (rows, model.latent))
-    if (deter.shape, stoch.shape) != wanted or (time and actions.shape[2] != model.action):
-        given = ", ".join(str(tuple(tensor.shape)) for tensor in (deter, stoch, actions))
-        raise ValueError(f"deter, stoch and actions have shapes {given}; the model has {wanted} and {model.action}")
-    written = [None if tensor is None else tensor.data_ptr() for tensor in (deter, stoch, actions, rewards, values)]
-    if library.imagine(ctypes.addressof(packed.model), *written, rows, time, torch.get_num_threads()):
-        raise MemoryError("no memory for an imagined rollout")
+    expected = ((rows, model.deter), (rows, model.latent))
+    if (deter.shape, stoch.shape) != expected or (time and actions.shape[2] != model.action):
+        shapes = ", ".join(str(tuple(tensor.shape)) for tensor in (deter, stoch, actions))
+        wanted = f"{expected[0]}, {expected[1]}, ({rows}, {time}, {model.action})"
+        raise ValueError(f"deter, stoch and actions have shapes {shapes}; the model needs {wanted}")
+    places = [None if tensor is None else tensor.data_ptr() for tensor in (deter, stoch, actions, rewards, values)]
+    if library.imagine(ctypes.addressof(packed.model), *places, rows, time, torch.get_num_threads()):
+        raise MemoryError(f"not enough memory for a rollout of {rows} rows")
 
 
-def _padded(matrix: Tensor, dim: int) -> Tensor:
+def _pad(matrix: Tensor, dim: int) -> Tensor:
     """The matrix with zeros after the last row or column, up to a multiple of `MULTIPLE`."""
     missing = -matrix.shape[dim] % MULTIPLE
     return functional.pad(matrix, [0, 0] * (matrix.dim() - 1 - dim) + [0, missing])

@@ -1,5 +1,5 @@
-// Rollouts along the mean of the prior, 32 rows at a time over all steps, so that everything but the weights stays in a
-// core's cache. Products are bfloat16 with float32 sums; elementwise work is float32.
+// Rollouts along the mean of the prior. A thread computes all steps of 32 rows before the next 32, so that its working
+// memory stays in the core's cache. Products are bfloat16 with float32 sums; elementwise work is float32.
 
 #include <stddef.h>
 
@@ -48,7 +48,7 @@ typedef struct {
 #if defined(__AMX_BF16__) && defined(__linux__)
 #include <sys/syscall.h>
 #include <unistd.h>
-#define ASK_FOR_TILES 0x1023
+#define ASK_FOR_TILES 0x1023  // ARCH_REQ_XCOMP_PERM of arch_prctl(2)
 #define TILE_DATA 18
 
 int can_imagine(void) { return syscall(SYS_arch_prctl, ASK_FOR_TILES, TILE_DATA) == 0; }
@@ -124,7 +124,7 @@ static void multiply(Workspace *work, const bfloat16 *rows, const Layer *layer) 
 #endif
 
 // One hidden layer of every row, written to `hidden`.
-static void layer_of(Workspace *work, const bfloat16 *from, const Layer *layer) {
+static void apply_layer(Workspace *work, const bfloat16 *from, const Layer *layer) {
     multiply(work, from, layer);
     for (long r = 0; r < work->count; r++) {
         const float *row = work->product + r * layer->outputs;
@@ -133,11 +133,11 @@ static void layer_of(Workspace *work, const bfloat16 *from, const Layer *layer) 
 }
 
 // The output of an Mlp at every row. Its weights are two bfloat16 matrices side by side, whose products are added.
-static void output_of(Workspace *work, const Mlp *mlp) {
+static void apply_mlp(Workspace *work, const Mlp *mlp) {
     const Layer *output = &mlp->output;
     long half = output->outputs / 2;
-    layer_of(work, work->stoch, &mlp->first);
-    layer_of(work, work->hidden, &mlp->second);
+    apply_layer(work, work->stoch, &mlp->first);
+    apply_layer(work, work->hidden, &mlp->second);
     multiply(work, work->hidden, output);
     for (long r = 0; r < work->count; r++) {
         float *row = work->product + r * output->outputs;
@@ -146,14 +146,14 @@ static void output_of(Workspace *work, const Mlp *mlp) {
 }
 
 static void advance(Workspace *work, const Model *model) {
-    layer_of(work, work->rows, &model->input);
+    apply_layer(work, work->rows, &model->input);
     multiply(work, work->rounded, &model->gates);
     for (long r = 0; r < work->count; r++) {
         const float *row = work->product + r * model->gates.outputs;
         float *deter = work->deter + r * model->deter;
         gate_row(deter, work->rounded + r * work->width, row, model->gates.scale, model->gates.shift, model->deter);
     }
-    layer_of(work, work->rounded, &model->prior);
+    apply_layer(work, work->rounded, &model->prior);
     multiply(work, work->hidden, &model->mean);
     for (long r = 0; r < work->count; r++) {
         const float *row = work->product + r * model->latent;
@@ -164,7 +164,7 @@ static void advance(Workspace *work, const Model *model) {
 
 // The scalar of a head at every row, written with a stride of `apart`.
 static void read_bins(Workspace *work, const Model *model, const Mlp *head, float *scalars, long apart) {
-    output_of(work, head);
+    apply_mlp(work, head);
     for (long r = 0; r < work->count; r++)
         scalars[r * apart] = wide_expected(work->product + r * head->output.outputs, model->bin_values, model->bins);
 }
@@ -181,12 +181,12 @@ static size_t workspace_floats(const Model *model) {
     return (size_t)(BLOCK * (width / 2 + model->deter + widest));
 }
 
-static float *open_workspace(const Model *model) {
+static float *allocate_workspace(const Model *model) {
     set_up();
     return aligned_alloc(ALIGNMENT, (workspace_floats(model) * sizeof(float) + ALIGNMENT - 1) / ALIGNMENT * ALIGNMENT);
 }
 
-static void close_workspace(float *memory) {
+static void free_workspace(float *memory) {
     free(memory);
     tear_down();
 }
@@ -217,7 +217,7 @@ static void set_actions(Workspace *work, const Model *model, const float *action
 
 // Replaces standard normal draws by the actor's actions: the mean plus std times the draw, clamped to [-1, 1].
 static void sample_actions(Workspace *work, const Model *model, float *actions, long time) {
-    output_of(work, &model->actor);
+    apply_mlp(work, &model->actor);
     for (long r = 0; r < work->count; r++) {
         const float *raw = work->product + r * model->actor.output.outputs;
         float *action = actions + r * time * model->action;
@@ -239,7 +239,7 @@ int imagine(const Model *model, float *deter, float *stoch, float *actions, floa
     if (blocks == 0) return failed;
 #pragma omp parallel num_threads(threads < blocks ? threads : (int)blocks) reduction(| : failed)
     {
-        float *memory = open_workspace(model);
+        float *memory = allocate_workspace(model);
         failed = memory == NULL;
 #pragma omp for schedule(static)
         for (long block = 0; block < blocks; block++) {
@@ -260,7 +260,7 @@ int imagine(const Model *model, float *deter, float *stoch, float *actions, floa
                 for (long i = 0; i < model->latent; i++)
                     stochs[r * model->latent + i] = read_bfloat16(work.stoch[r * work.width + i]);
         }
-        close_workspace(memory);
+        free_workspace(memory);
     }
     return failed;
 }

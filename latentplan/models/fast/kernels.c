@@ -10,7 +10,7 @@
 #define READ_ROW(READ)                                                                                         \
     float row[LONGEST_ROW];                                                                                    \
     VECTOR() for (long i = 0; i < length; i++) row[i] = READ(place[i]);                                        \
-    Norm norm = norm_of(row, scale, shift, length);
+    Norm norm = compute_norm(row, scale, shift, length);
 
 #define NORM_SILU(NAME, TYPE, READ, WRITE)                                                                     \
     void NAME(TYPE *product, const float *scale, const float *shift, long rows, long length, int threads) {    \

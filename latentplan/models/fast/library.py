@@ -1,8 +1,8 @@
 """Compiled C code: kernels for the elementwise parts of a rollout, one pass over each row instead of many.
 
-The machine's own compiler builds the C sources beside this file when they are first needed (about a second); the result
-is kept in the user's cache. Torch computes the same where there is no compiler, on other devices than the CPU, where
-gradients are required, and if `LATENTPLAN_KERNELS=0`.
+The machine's C compiler builds the sources beside this file at the first use, in about a second, and the user's cache
+keeps the library. Torch computes the same if there is no compiler, if a tensor is not on the CPU, if gradients are
+required, and if `LATENTPLAN_KERNELS=0`.
 """
 
 from __future__ import annotations
@@ -35,14 +35,14 @@ Norm = tuple[Tensor, Tensor]  # scale and shift
 
 
 def norm_silu(product: Tensor, norm: Norm) -> Tensor:
-    """SiLU of the layer norm of rows (..., size), in the product's dtype; in place if no gradient is required."""
+    """The SiLU of the layer norm of rows (..., size), in the product's dtype; in place if no gradient is required."""
     scale, shift = norm
     library = _library_for(product, scale, shift)
     if library is None:
         return pointwise.norm_silu(product, scale, shift)
     rows, size = product.numel() // product.shape[-1], product.shape[-1]
     kernel = getattr(library, f"norm_silu_{DTYPES[product.dtype]}")
-    kernel(*_places(product, scale, shift), rows, size, torch.get_num_threads())
+    kernel(*_pointers(product, scale, shift), rows, size, torch.get_num_threads())
     return product
 
 
@@ -55,7 +55,7 @@ def gates(product: Tensor, norm: Norm, deter: Tensor) -> tuple[Tensor, Tensor]:
         deter: The previous state, float32 (rows, deter).
 
     Returns:
-        The state, float32 (rows, deter), and the same in the product's dtype.
+        The state, float32 (rows, deter), and its copy in the product's dtype.
     """
     scale, shift = norm
     library = _library_for(product, scale, shift, deter)
@@ -65,7 +65,7 @@ def gates(product: Tensor, norm: Norm, deter: Tensor) -> tuple[Tensor, Tensor]:
     deter = deter.contiguous()
     following, rounded = torch.empty_like(deter), torch.empty_like(deter, dtype=product.dtype)
     kernel = getattr(library, f"gates_{DTYPES[product.dtype]}")
-    kernel(*_places(product, scale, shift, deter, following, rounded), *deter.shape, torch.get_num_threads())
+    kernel(*_pointers(product, scale, shift, deter, following, rounded), *deter.shape, torch.get_num_threads())
     return following, rounded
 
 
@@ -75,7 +75,7 @@ def expectation(logits: Tensor, values: Tensor) -> Tensor:
     if library is None:
         return logits.softmax(-1) @ values
     means = logits.new_empty(len(logits))
-    library.expectation(*_places(logits, values, means), *logits.shape, torch.get_num_threads())
+    library.expectation(*_pointers(logits, values, means), *logits.shape, torch.get_num_threads())
     return means
 
 
@@ -89,7 +89,7 @@ def _library_for(rows: Tensor, *others: Tensor) -> ctypes.CDLL | None:
     return load() if known and fit else None
 
 
-def _places(*tensors: Tensor) -> list[int]:
+def _pointers(*tensors: Tensor) -> list[int]:
     return [tensor.data_ptr() for tensor in tensors]
 
 
@@ -99,7 +99,7 @@ def load() -> ctypes.CDLL | None:
     if os.environ.get("LATENTPLAN_KERNELS") == "0":
         return None
     try:
-        library = ctypes.CDLL(str(_compiled()))
+        library = ctypes.CDLL(str(_compile()))
     except (OSError, RuntimeError, subprocess.SubprocessError):
         return None
     place, count, threads = ctypes.c_void_p, ctypes.c_long, ctypes.c_int
@@ -111,8 +111,8 @@ def load() -> ctypes.CDLL | None:
     return library
 
 
-def _compiled() -> Path:
-    """The path of the compiled library, which is built if this machine has not done so before.
+def _compile() -> Path:
+    """The path of the compiled library, which is built if it is not in the cache.
 
     Raises:
         OSError: There is no compiler, or the cache cannot be written.
@@ -125,19 +125,19 @@ def _compiled() -> Path:
     wide = [WIDE] if platform.machine() in ("x86_64", "AMD64") else []
     command = [*compiler.split(), *FLAGS, *wide, *(str(source) for source in SOURCES if source.suffix == ".c")]
     texts = [source.read_text() for source in SOURCES]
-    key = hashlib.sha256("\n".join([*command, _processor(), *texts]).encode()).hexdigest()[:16]
+    key = hashlib.sha256("\n".join([*command, _describe_processor(), *texts]).encode()).hexdigest()[:16]
     home = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "latentplan"
     library = home / f"kernels-{key}.so"
     if not library.exists():
         home.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryDirectory(dir=home) as folder:  # another process may build too: the last one wins
+        with tempfile.TemporaryDirectory(dir=home) as folder:  # another process may build at once
             fresh = Path(folder) / library.name
             subprocess.run([*command, "-o", str(fresh)], check=True, capture_output=True, timeout=COMPILE_SECONDS)
             os.replace(fresh, library)
     return library
 
 
-def _processor() -> str:
+def _describe_processor() -> str:
     """The features of this processor, on which compiled code depends."""
     try:
         lines = Path("/proc/cpuinfo").read_text().splitlines()

@@ -1,20 +1,20 @@
 """Belief update and actor for one frame or a few, in float32.
 
 The result equals `WorldModel.infer` followed by the actor, up to rounding. For one row the overhead of calls costs more
-than the arithmetic. So the weights are collected once, convolutions are matrix products of patches (torch spends most
-of a small convolution on its preparation), and the std of the posterior is not computed. The functions take plain
+than the arithmetic. The weights are therefore collected once, convolutions are matrix products of patches (torch spends
+most of a small convolution on its preparation), and the std of the posterior is not computed. The functions take plain
 tensors, so that `latentplan.agents.export` can trace them into a program.
 """
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import NamedTuple, cast
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from latentplan.models.dynamics import State
+from latentplan.models.dynamics import Rssm, State
 from latentplan.models.encoder import FRAME_SIZE, PATCH
 from latentplan.models.fast import pointwise
 from latentplan.models.heads import NormedLinear, action_distribution
@@ -28,7 +28,7 @@ Hidden = tuple[Tensor, Norm]  # weight (out, in) and the norm behind it
 
 
 class FrameWeights(NamedTuple):
-    """The weights that belief update and actor need.
+    """The weights of belief update and actor.
 
     Attributes:
         patches: First layer of the encoder, on pixels in [-0.5, 0.5].
@@ -57,24 +57,25 @@ class FrameWeights(NamedTuple):
 
 @torch.no_grad()
 def convert_weights(model: WorldModel) -> FrameWeights:
-    """The weights of a world model.
+    """The weights of a world model, whose dynamics are an `Rssm`, for the functions of this module.
 
-    On the CPU the weights share the model's memory. For this the model's convolutions are converted to the memory
-    format `channels_last`; their values stay the same. On other devices the convolutions' weights are copies.
+    On the CPU the weights share the model's memory. For this purpose the model's convolutions are converted to the
+    memory format `channels_last`, which changes no value. On other devices the weights of convolutions are copies.
     """
-    encoder, dynamics, latent = model.encoder, model.dynamics, model.dynamics.latent_dim
+    encoder, dynamics = model.encoder, cast(Rssm, model.dynamics)
+    latent = dynamics.latent_dim
     output = dynamics.posterior_output
     return FrameWeights(
-        patches=_affine(encoder.patches),
-        convolutions=tuple(_convolution(layer) for layer in encoder.convolutions if isinstance(layer, nn.Conv2d)),
-        embedding=_affine(encoder.linear),
-        input=_hidden(dynamics.input),
-        gates=(dynamics.gates.weight.detach(), _norm(dynamics.gates_norm)),
+        patches=_get_affine(encoder.patches),
+        convolutions=tuple(_get_convolution(layer) for layer in encoder.convolutions if isinstance(layer, nn.Conv2d)),
+        embedding=_get_affine(encoder.linear),
+        input=_get_hidden(dynamics.input),
+        gates=(dynamics.gates.weight.detach(), _get_norm(dynamics.gates_norm)),
         posterior_deter=dynamics.posterior_deter.weight.detach(),
-        posterior_norm=_norm(dynamics.posterior_norm),
+        posterior_norm=_get_norm(dynamics.posterior_norm),
         posterior_mean=(output.weight.detach()[:latent], output.bias.detach()[:latent]),
-        actor=tuple(_hidden(layer) for layer in model.actor.mlp.trunk if isinstance(layer, NormedLinear)),
-        action=_affine(model.actor.mlp.output),
+        actor=tuple(_get_hidden(layer) for layer in model.actor.mlp.trunk if isinstance(layer, NormedLinear)),
+        action=_get_affine(model.actor.mlp.output),
     )
 
 
@@ -88,7 +89,7 @@ def see(weights: FrameWeights, deter: Tensor, frames: Tensor) -> State:
 
 def advance(weights: FrameWeights, state: State, action: Tensor) -> Tensor:
     """The deterministic state (rows, deter) after action (rows, action) in [-1, 1]."""
-    hidden = _layer(torch.cat([state.stoch, action], -1), weights.input)
+    hidden = _apply_layer(torch.cat([state.stoch, action], -1), weights.input)
     weight, norm = weights.gates
     product = functional.linear(torch.cat([hidden, state.deter], -1), weight)
     return pointwise.update_deter(product, *norm, state.deter)
@@ -98,30 +99,30 @@ def act(weights: FrameWeights, state: State) -> tuple[Tensor, Tensor]:
     """Mean in [-1, 1] and std of the actor's action, (rows, action) each."""
     hidden = state.features
     for layer in weights.actor:
-        hidden = _layer(hidden, layer)
+        hidden = _apply_layer(hidden, layer)
     return action_distribution(functional.linear(hidden, *weights.action))
 
 
 def _embed(weights: FrameWeights, frames: Tensor) -> Tensor:
     """Embeddings (rows, embedding) of uint8 frames (rows, 64, 64, 3)."""
-    # Sizes come from `shape`: `len` would build the number of rows into an exported program.
+    # The size comes from `shape`, because `len` would build the number of rows into an exported program.
     rows, side = frames.shape[0], FRAME_SIZE // PATCH
     patches = frames.reshape(rows, side, PATCH, side, 3 * PATCH).transpose(2, 3).reshape(rows, side * side, -1)
     pixels = patches.to(weights.patches[0].dtype).mul_(1.0 / 255.0).sub_(0.5)
     tokens = functional.silu(functional.linear(pixels, *weights.patches))
     for weight, shift in weights.convolutions:
-        windows = _windows(tokens.reshape(rows, side, side, -1))
+        windows = _cut_windows(tokens.reshape(rows, side, side, -1))
         tokens, side = functional.silu(functional.linear(windows, weight, shift)), side // STRIDE
     return functional.linear(tokens.reshape(rows, -1), *weights.embedding)
 
 
-def _windows(picture: Tensor) -> Tensor:
+def _cut_windows(picture: Tensor) -> Tensor:
     """The input patch of each output of a convolution, (rows, output, y x channel), for (rows, side, side, channel)."""
     rows, side, _, channels = picture.shape
     padded = functional.pad(picture, (0, 0, PADDING, PADDING, PADDING, PADDING))
     wide, outputs = side + 2 * PADDING, side // STRIDE
     line = wide * channels
-    # A line of a window is contiguous in memory, so that a window is four contiguous pieces.
+    # Each line of a window is contiguous in memory, so a window is copied in four pieces.
     windows = padded.as_strided(
         (rows, outputs, outputs, KERNEL, KERNEL * channels),
         (wide * line, STRIDE * line, STRIDE * channels, line, 1),
@@ -129,25 +130,25 @@ def _windows(picture: Tensor) -> Tensor:
     return windows.reshape(rows, outputs * outputs, KERNEL * KERNEL * channels)
 
 
-def _layer(features: Tensor, layer: Hidden) -> Tensor:
+def _apply_layer(features: Tensor, layer: Hidden) -> Tensor:
     weight, norm = layer
     return pointwise.norm_silu(functional.linear(features, weight), *norm)
 
 
-def _convolution(layer: nn.Conv2d) -> Affine:
+def _get_convolution(layer: nn.Conv2d) -> Affine:
     assert layer.bias is not None
     if layer.weight.device.type == "cpu":
         layer.weight.data = layer.weight.data.contiguous(memory_format=torch.channels_last)
     return layer.weight.detach().permute(0, 2, 3, 1).flatten(1), layer.bias.detach()
 
 
-def _affine(layer: nn.Linear) -> Affine:
+def _get_affine(layer: nn.Linear) -> Affine:
     return layer.weight.detach(), layer.bias.detach()
 
 
-def _norm(layer: nn.LayerNorm) -> Norm:
+def _get_norm(layer: nn.LayerNorm) -> Norm:
     return layer.weight.detach(), layer.bias.detach()
 
 
-def _hidden(layer: NormedLinear) -> Hidden:
-    return layer.linear.weight.detach(), _norm(layer.norm)
+def _get_hidden(layer: NormedLinear) -> Hidden:
+    return layer.linear.weight.detach(), _get_norm(layer.norm)

@@ -33,7 +33,10 @@ def _compiled(function: Callable[..., Any]) -> Callable[..., Any]:
 
 @functools.cache
 def can_compile(device: str) -> bool:
-    """Whether torch can compile for a device, tried once: it needs a C compiler and a GPU that Triton supports."""
+    """Whether torch can compile for a device, which takes a C compiler and a GPU that Triton supports.
+
+    The first call for a device compiles a small function, and warns if that fails.
+    """
     import torch._dynamo
 
     torch._dynamo.config.recompile_limit = max(torch._dynamo.config.recompile_limit, MOST_SHAPES)
@@ -47,7 +50,7 @@ def can_compile(device: str) -> bool:
 
 
 def norm_silu(product: Tensor, scale: Tensor, shift: Tensor) -> Tensor:
-    """SiLU of the layer norm of rows (rows, size)."""
+    """The SiLU of the layer norm of rows (rows, size)."""
     return functional.silu(functional.layer_norm(product, product.shape[-1:], scale, shift, NORM_EPS))
 
 
@@ -76,7 +79,7 @@ def update_deter_back(
     by_latent: Tensor,
     by_others: Tensor | None,
     directly: Tensor | None,
-    beside: Tensor | None,
+    gate_inputs: Tensor | None,
     decay: float,
     product: Tensor,
     scale: Tensor,
@@ -88,17 +91,17 @@ def update_deter_back(
     Args:
         by_latent: Gradient of the next deter through the latent of the same step.
         by_others: Gradient of the next deter through other readers, such as losses.
-        directly: Gradient through the following step, without its product.
-        beside: Gradient of the input of the following step's product, whose last columns belong to deter.
-        decay: Share of `directly` and `beside` that passes.
+        directly: Gradient of the next deter through the following step, without the part through its product.
+        gate_inputs: Gradient of the inputs of the following step's product, whose last columns belong to deter.
+        decay: Share of `directly` and `gate_inputs` that passes.
         product: Product of the gates, as `update_deter` takes it.
         scale: Scale of the norm.
         shift: Shift of the norm.
         deter: The previous deter.
     """
     gradient = by_latent if by_others is None else by_latent + by_others
-    if directly is not None and beside is not None:
-        gradient = gradient + decay * (directly + beside[:, -deter.shape[-1] :])
+    if directly is not None and gate_inputs is not None:
+        gradient = gradient + decay * (directly + gate_inputs[:, -deter.shape[-1] :])
     centred, rstd = _centred(product)
     normed = centred * rstd
     reset, candidate, update = (normed * scale + shift).chunk(3, -1)
@@ -126,15 +129,18 @@ def sample_latent_back(
     stoch: Tensor | None,
     mean: Tensor | None,
     std: Tensor | None,
-    joined: Tensor | None,
+    inputs: Tensor | None,
     decay: float,
 ) -> Tensor:
-    """Gradient of raw, given those of stoch, mean and std, and that of stoch in the first columns of `joined`."""
+    """Gradient of `raw`, given the gradients of stoch, mean and std.
+
+    The first columns of `inputs` are the gradient of stoch through the following step; the share `decay` of it passes.
+    """
     latent = raw.shape[-1] // 2
     gate = torch.sigmoid(raw[:, latent:] / 2.0)
     of_stoch = torch.zeros_like(gate) if stoch is None else stoch
-    if joined is not None:
-        of_stoch = of_stoch + decay * joined[:, :latent]
+    if inputs is not None:
+        of_stoch = of_stoch + decay * inputs[:, :latent]
     of_mean = of_stoch if mean is None else of_stoch + mean
     of_std = torch.zeros_like(gate) if noise is None else of_stoch * noise
     of_std = of_std if std is None else of_std + std

@@ -1,9 +1,9 @@
 """Rollouts of many action sequences along the mean of the prior, with weights that are converted once.
 
 The result equals repeated calls of `Backend.step` up to rounding. Weights are transposed and cast once, the prior's std
-is not computed, and rows are processed in blocks that fit the cache. Processors with bfloat16 products run one compiled
-call (`compiled`); others run torch with compiled kernels for the elementwise parts (`library`). If gradients are
-required nothing is written in place.
+is not computed, and rows are processed in blocks that fit the cache. A processor with bfloat16 products runs one
+compiled call (`compiled`); any other runs torch with compiled kernels for the elementwise parts (`library`). If
+gradients are required, no tensor is changed in place.
 """
 
 from __future__ import annotations
@@ -22,12 +22,31 @@ from latentplan.models.heads import Actor, Mlp, NormedLinear, ScalarHead, action
 ROWS_PER_THREAD = 1024  # results of one step for more rows do not fit a core's cache
 BIN_MULTIPLE = 16  # float32 products with other numbers of columns take 1.5 times as long
 
-
-Trunk = tuple[tuple[Tensor, Norm], ...]  # of an Mlp: weight and norm of each hidden layer
+Trunk = tuple[tuple[Tensor, Norm], ...]  # weight and norm of each hidden layer of an Mlp
 
 
 class Weights(NamedTuple):
-    """Weights of dynamics, reward head and actor, transposed to (in, out)."""
+    """Weights of dynamics, reward head and actor, transposed to (in, out).
+
+    Attributes:
+        action: Columns of the GRU's input layer for the action.
+        stoch: Columns of the GRU's input layer for the latent.
+        input_norm: Norm of the GRU's input layer.
+        gates: Gates of the GRU.
+        gates_norm: Norm of the gates.
+        prior: Hidden layer of the prior.
+        prior_norm: Norm of the prior's hidden layer.
+        mean: From the prior's hidden layer to the mean of the latent.
+        mean_shift: Shift of the latent's mean.
+        head: Hidden layers of the reward head.
+        logits: From the reward head's hidden layers to the logits of the bins, float32.
+        logits_shift: Shift of the logits; minus infinity for padded bins.
+        values: Value of each bin.
+        actor: Hidden layers of the actor.
+        actor_output: From the actor's hidden layers to mean and raw std of the action, float32.
+        actor_shift: Shift of the actor's output.
+        packed: All weights and the value head's in the layout of compiled calls; None if torch has to compute.
+    """
 
     action: Tensor
     stoch: Tensor
@@ -50,7 +69,7 @@ class Weights(NamedTuple):
 
 @torch.no_grad()
 def convert_weights(dynamics: Rssm, head: ScalarHead, critic: ScalarHead, actor: Actor, dtype: torch.dtype) -> Weights:
-    """Converted weights, with products in `dtype`; the norm of the gates and the outputs of heads are float32.
+    """Converted weights for products in `dtype`; the norm of the gates and the outputs of heads are float32.
 
     Args:
         dynamics: The dynamics of the rollouts.
@@ -60,18 +79,17 @@ def convert_weights(dynamics: Rssm, head: ScalarHead, critic: ScalarHead, actor:
         dtype: Precision of the products.
     """
 
-    def turn(weight: Tensor) -> Tensor:
+    def transpose(weight: Tensor) -> Tensor:
         return weight.to(dtype).t().contiguous()
 
     def norm(layer: nn.LayerNorm) -> Norm:
-        kind = (
-            torch.float32 if layer.weight.device.type == "cpu" else dtype
-        )  # on other devices product and norm must have the same dtype
-        return layer.weight.to(kind), layer.bias.to(kind)
+        # On devices other than the CPU, product and norm must have the same dtype.
+        norm_dtype = torch.float32 if layer.weight.device.type == "cpu" else dtype
+        return layer.weight.to(norm_dtype), layer.bias.to(norm_dtype)
 
     def trunk(mlp: Mlp) -> Trunk:
         layers = [layer for layer in mlp.trunk if isinstance(layer, NormedLinear)]
-        return tuple((turn(layer.linear.weight), norm(layer.norm)) for layer in layers)
+        return tuple((transpose(layer.linear.weight), norm(layer.norm)) for layer in layers)
 
     def logits(head: ScalarHead) -> tuple[Tensor, Tensor]:
         output, padding = head.mlp.output, (0, -len(head.values) % BIN_MULTIPLE)
@@ -80,14 +98,14 @@ def convert_weights(dynamics: Rssm, head: ScalarHead, critic: ScalarHead, actor:
     latent, input_weight = dynamics.latent_dim, dynamics.input.linear.weight
     reward_logits, reward_shift = logits(head)
     weights = Weights(
-        action=turn(input_weight[:, latent:]),
-        stoch=turn(input_weight[:, :latent]),
+        action=transpose(input_weight[:, latent:]),
+        stoch=transpose(input_weight[:, :latent]),
         input_norm=norm(dynamics.input.norm),
-        gates=turn(dynamics.gates.weight),
+        gates=transpose(dynamics.gates.weight),
         gates_norm=(dynamics.gates_norm.weight.float(), dynamics.gates_norm.bias.float()),
-        prior=turn(dynamics.prior_hidden.linear.weight),
+        prior=transpose(dynamics.prior_hidden.linear.weight),
         prior_norm=norm(dynamics.prior_hidden.norm),
-        mean=turn(dynamics.prior_output.weight[:latent]),
+        mean=transpose(dynamics.prior_output.weight[:latent]),
         mean_shift=dynamics.prior_output.bias[:latent].to(dtype),
         head=trunk(head.mlp),
         logits=reward_logits,
@@ -125,7 +143,7 @@ def propose(weights: Weights, state: State, noise: Tensor) -> Tensor:
     Args:
         weights: Converted weights from `convert_weights`.
         state: Start of every sequence, (rows, ...).
-        noise: Standard normal draws for its samples, zeros for its mode, (rows, time, action).
+        noise: Standard normal draws for samples, zeros for the mode, (rows, time, action).
     """
     if weights.packed is not None and not requires_gradients(*state, noise):
         return compiled.propose(weights.packed, *state, noise)
@@ -135,11 +153,11 @@ def propose(weights: Weights, state: State, noise: Tensor) -> Tensor:
         for draw in noise.unbind(1):
             hidden = torch.cat([rounded, stoch], -1)
             for weight, norm in weights.actor:
-                hidden = _layer(hidden, weight, norm)
+                hidden = _apply_layer(hidden, weight, norm)
             mean, std = action_distribution(torch.addmm(weights.actor_shift, hidden.float(), weights.actor_output))
             actions.append(torch.addcmul(mean, std, draw).clamp(-1.0, 1.0))
-            push = actions[-1].to(stoch.dtype) @ weights.action
-            deter, rounded, stoch = _step(weights, deter, rounded, stoch, push)
+            by_action = actions[-1].to(stoch.dtype) @ weights.action
+            deter, rounded, stoch = _step(weights, deter, rounded, stoch, by_action)
     return torch.stack(actions, 1)
 
 
@@ -152,43 +170,46 @@ def _imagine_block(weights: Weights, deter: Tensor, stoch: Tensor, actions: Tens
     dtype = weights.gates.dtype
     # For few rows the reward head reads many steps at once: a product of 1000 rows costs as much as two of 100.
     steps_at_once = max(1, ROWS_PER_THREAD * torch.get_num_threads() // len(actions))
-    pushes = actions.transpose(0, 1).to(dtype).contiguous() @ weights.action  # (time, rows, hidden)
+    products = actions.transpose(0, 1).to(dtype).contiguous() @ weights.action  # (time, rows, hidden)
     deter, rounded, stoch = deter.float(), deter.to(dtype), stoch.to(dtype)
     features, rewards = [], []
-    for push in pushes:
-        deter, rounded, stoch = _step(weights, deter, rounded, stoch, push)
+    for by_action in products:
+        deter, rounded, stoch = _step(weights, deter, rounded, stoch, by_action)
         features.append(torch.cat([rounded, stoch], -1))
         if len(features) == steps_at_once:
-            rewards.append(_rewards(weights, features))
+            rewards.append(_predict_rewards(weights, features))
             features = []
     if features:
-        rewards.append(_rewards(weights, features))
+        rewards.append(_predict_rewards(weights, features))
     return torch.cat(rewards, 1), deter, stoch.float()
 
 
 def _step(
-    weights: Weights, deter: Tensor, rounded: Tensor, stoch: Tensor, push: Tensor
+    weights: Weights, deter: Tensor, rounded: Tensor, stoch: Tensor, by_action: Tensor
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """The next deter, its copy in the products' dtype, and the mean of the prior."""
-    deter, rounded = _advance(weights, deter, rounded, stoch, push)
-    hidden = _layer(rounded, weights.prior, weights.prior_norm)
+    """The next deter in float32 and in the products' dtype, and the mean of the prior.
+
+    Args:
+        weights: Converted weights.
+        deter: Deterministic state in float32, (rows, deter).
+        rounded: Deterministic state in the products' dtype, (rows, deter).
+        stoch: Latent in the products' dtype, (rows, latent).
+        by_action: Product of the action with its weights, (rows, hidden).
+    """
+    hidden = norm_silu(torch.addmm(by_action, stoch, weights.stoch), weights.input_norm)
+    deter, rounded = gates(torch.cat([hidden, rounded], -1) @ weights.gates, weights.gates_norm, deter)
+    hidden = _apply_layer(rounded, weights.prior, weights.prior_norm)
     return deter, rounded, torch.addmm(weights.mean_shift, hidden, weights.mean)
 
 
-def _advance(weights: Weights, deter: Tensor, rounded: Tensor, stoch: Tensor, push: Tensor) -> tuple[Tensor, Tensor]:
-    """The next deter in float32 and in the products' dtype; `push` (rows, hidden) is the product of the action."""
-    hidden = norm_silu(torch.addmm(push, stoch, weights.stoch), weights.input_norm)
-    return gates(torch.cat([hidden, rounded], -1) @ weights.gates, weights.gates_norm, deter)
-
-
-def _rewards(weights: Weights, per_step: list[Tensor]) -> Tensor:
+def _predict_rewards(weights: Weights, per_step: list[Tensor]) -> Tensor:
     """Rewards (rows, step) at the features of some steps, (rows, feature) each."""
     features = torch.cat(per_step)
     for weight, norm in weights.head:
-        features = _layer(features, weight, norm)
+        features = _apply_layer(features, weight, norm)
     logits = torch.addmm(weights.logits_shift, features.float(), weights.logits)
     return expectation(logits, weights.values).unflatten(0, (len(per_step), -1)).t()
 
 
-def _layer(features: Tensor, weight: Tensor, norm: Norm) -> Tensor:
+def _apply_layer(features: Tensor, weight: Tensor, norm: Norm) -> Tensor:
     return norm_silu(features @ weight, norm)

@@ -58,7 +58,7 @@ typedef struct {
     float mean, factor;
 } Norm;
 
-static inline Norm norm_of(const float *row, const float *scale, const float *shift, long length) {
+static inline Norm compute_norm(const float *row, const float *scale, const float *shift, long length) {
     float sum = 0.0f, squares = 0.0f;
     VECTOR(reduction(+ : sum)) for (long i = 0; i < length; i++) sum += row[i];
     float mean = sum / (float)length;

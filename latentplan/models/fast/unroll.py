@@ -1,8 +1,8 @@
-"""The GRU over whole sequences with written-out gradients, for GPUs, where the number of kernels sets the time.
+"""The RSSM over whole sequences with written-out gradients, for GPUs, whose time is set by the number of kernels.
 
 Autograd runs a kernel for every elementary function of every step, forwards and backwards, and accumulates the gradient
-of each weight step by step. Here the work between two matrix products is one function (`pointwise`), and the gradients
-of weights are computed once over all steps. A whole update then needs two fifths of the kernels.
+of each weight step by step. This module has one function for all work between two matrix products (`pointwise`), and
+computes the gradients of weights once over all steps. A whole update then needs two fifths of the kernels.
 """
 
 from __future__ import annotations
@@ -44,25 +44,26 @@ class Weights(NamedTuple):
 def observe(
     dynamics: Rssm, embeddings: Tensor, actions: Tensor, deter: Tensor, noise: Tensor
 ) -> tuple[State, Gaussian]:
-    """`Rssm.observe`; gradients reach the weights and the embeddings."""
-    deter, *latent = _Unrolled.apply(embeddings, actions, deter, None, noise, *_weights(dynamics, prior=False))
+    """The same as `Rssm.observe`; gradients reach the weights and the embeddings."""
+    deter, *latent = _Unrolled.apply(embeddings, actions, deter, None, noise, *_collect_weights(dynamics, prior=False))
     return State(deter, latent[0]), Gaussian(*latent[1:])
 
 
 def predict(dynamics: Rssm, start: State, actions: Tensor) -> tuple[Tensor, Gaussian]:
-    """`Rssm.predict`; gradients reach the weights alone."""
-    deter, _, *prior = _Unrolled.apply(None, actions, start.deter, start.stoch, None, *_weights(dynamics, prior=True))
+    """The same as `Rssm.predict`; gradients reach the weights alone."""
+    weights = _collect_weights(dynamics, prior=True)
+    deter, _, *prior = _Unrolled.apply(None, actions, start.deter, start.stoch, None, *weights)
     return deter, Gaussian(*prior)
 
 
 def imagine(
     dynamics: Rssm, actor: Actor, start: State, action_noise: Tensor, noise: Tensor, decay: float
 ) -> tuple[Tensor, Tensor]:
-    """`Dynamics.imagine` with an actor as the policy; gradients reach the actor through the dynamics.
+    """The same as `Dynamics.imagine` with an actor as the policy; gradients reach the actor through the dynamics.
 
     Args:
         dynamics: The dynamics; their weights get no gradient.
-        actor: The policy; it reads its states without a gradient.
+        actor: The policy, which reads states without a gradient.
         start: States, (rows, ...) each, without a gradient.
         action_noise: Standard normal draws for the actions, (horizon, rows, action).
         noise: Standard normal draws for the latents, (horizon, rows, latent).
@@ -71,28 +72,28 @@ def imagine(
     Returns:
         Features, the start first, (horizon + 1, rows, feature); std of the actions, (horizon, rows, action).
     """
-    steps, deter, stoch, features = _Steps(_weights(dynamics, prior=True)), *start, [start.features]
+    steps, deter, stoch, features = _Steps(_collect_weights(dynamics, prior=True)), *start, [start.features]
     with torch.no_grad():
         for action_draws, draws in zip(action_noise.unbind(), noise.unbind(), strict=True):
-            joined = run(pointwise.append_action, _outputs(actor.mlp, features[-1]), action_draws, stoch)
-            deter = steps.advance(joined, deter)
-            stoch, seen = run(pointwise.sample_features, steps.read(deter, None), draws, deter)
-            features.append(seen)
+            inputs = run(pointwise.append_action, _apply_mlp(actor.mlp, features[-1]), action_draws, stoch)
+            deter = steps.advance(inputs, deter)
+            stoch, sampled = run(pointwise.sample_features, steps.read(deter, None), draws, deter)
+            features.append(sampled)
         stacked = torch.stack(features)
-    # The actor's own gradient needs no recurrence: the actor runs once more, on all states at once.
+    # The actor runs once more on all states at once, because its gradient needs no recurrence.
     mean, std = actor(stacked[:-1])
     actions = sample_action(mean, std, action_noise)
     return _Imagined.apply(actions, stacked, steps, noise, decay), std
 
 
-def _outputs(mlp: Mlp, features: Tensor) -> Tensor:
+def _apply_mlp(mlp: Mlp, features: Tensor) -> Tensor:
     for part in mlp.trunk:
         assert isinstance(part, NormedLinear)
         features = run(pointwise.norm_silu, features @ part.linear.weight.T, part.norm.weight, part.norm.bias)
     return torch.addmm(mlp.output.bias, features, mlp.output.weight.T)
 
 
-def _weights(dynamics: Rssm, *, prior: bool) -> Weights:
+def _collect_weights(dynamics: Rssm, *, prior: bool) -> Weights:
     first, gates, norm = dynamics.input, dynamics.gates, dynamics.gates_norm
     advance = (first.linear.weight, first.norm.weight, first.norm.bias, gates.weight, norm.weight, norm.bias)
     hidden, norm, output = dynamics.posterior_deter, dynamics.posterior_norm, dynamics.posterior_output
@@ -106,25 +107,25 @@ class _Steps:
 
     def __init__(self, weights: Weights) -> None:
         self.weights = weights
-        self.joined: list[Tensor] = []  # latent and action, concatenated
-        self.first: list[Tensor] = []  # product of `joined` with the input weights
-        self.beside: list[Tensor] = []  # hidden layer of the input, concatenated with deter
-        self.gates: list[Tensor] = []  # product of `beside` with the weights of the gates
+        self.inputs: list[Tensor] = []  # latent and action, concatenated
+        self.first: list[Tensor] = []  # product of `inputs` with the input weights
+        self.gate_inputs: list[Tensor] = []  # hidden layer of the input, concatenated with deter
+        self.gates: list[Tensor] = []  # product of `gate_inputs` with the weights of the gates
         self.before: list[Tensor] = []  # deter before the step
         self.after: list[Tensor] = []  # deter after the step
         self.second: list[Tensor] = []  # product of `after` with the hidden weights
         self.hidden: list[Tensor] = []  # hidden layer between deter and latent
         self.raw: list[Tensor] = []  # raw mean and std of the latent
 
-    def advance(self, joined: Tensor, deter: Tensor) -> Tensor:
+    def advance(self, inputs: Tensor, deter: Tensor) -> Tensor:
         """The next deter, for latent and action concatenated."""
         weights = self.weights
-        first = joined @ weights.input.T
-        beside = run(pointwise.norm_silu_with_deter, first, weights.input_scale, weights.input_shift, deter)
-        gates = beside @ weights.gates.T
-        self.joined.append(joined)
+        first = inputs @ weights.input.T
+        gate_inputs = run(pointwise.norm_silu_with_deter, first, weights.input_scale, weights.input_shift, deter)
+        gates = gate_inputs @ weights.gates.T
+        self.inputs.append(inputs)
         self.first.append(first)
-        self.beside.append(beside)
+        self.gate_inputs.append(gate_inputs)
         self.gates.append(gates)
         self.before.append(deter)
         return run(pointwise.update_deter, gates, weights.gates_scale, weights.gates_shift, deter)
@@ -146,21 +147,19 @@ class _Gradients:
 
     def __init__(self, steps: _Steps, noise: Parts, decay: float = 1.0) -> None:
         self.steps, self.noise, self.decay = steps, noise, decay
-        self.later: tuple[Tensor, Tensor] | tuple[None, None] = (
-            None,
-            None,
-        )  # gradients of deter through the following step
-        self.joined: list[Tensor] = []
+        # Gradients of deter through the following step, which the backward pass visits first.
+        self.later: tuple[Tensor, Tensor] | tuple[None, None] = (None, None)
+        self.inputs: list[Tensor] = []
         self.first: list[tuple[Tensor, Tensor]] = []  # of the product, and of the scaled norm
         self.gates: list[tuple[Tensor, Tensor]] = []
         self.second: list[tuple[Tensor, Tensor]] = []
         self.raw: list[Tensor] = []
 
     def read(self, time: int, stoch: Tensor | None, mean: Tensor | None, std: Tensor | None) -> Tensor:
-        """The gradient of a step's deter through its latent, given outer gradients of stoch, mean and std."""
+        """The gradient of a step's deter through its latent, given the losses' gradients of stoch, mean and std."""
         steps, weights = self.steps, self.steps.weights
-        joined = self.joined[-1] if self.joined else None
-        raw = run(pointwise.sample_latent_back, steps.raw[time], self.noise[time], stoch, mean, std, joined, self.decay)
+        inputs = self.inputs[-1] if self.inputs else None
+        raw = run(pointwise.sample_latent_back, steps.raw[time], self.noise[time], stoch, mean, std, inputs, self.decay)
         second = run(
             pointwise.norm_silu_back,
             raw @ weights.output,
@@ -173,7 +172,13 @@ class _Gradients:
         return second[0] @ weights.hidden
 
     def advance(self, index: int, by_latent: Tensor, deter: Tensor | None) -> None:
-        """Backward through a step's GRU, given gradients of its deter through its latent and through other readers."""
+        """Computes the gradients of a step's GRU.
+
+        Args:
+            index: The step, counted from the first action.
+            by_latent: Gradient of the next deter through the latent of the same step.
+            deter: Gradient of the next deter through other readers, such as losses.
+        """
         steps, weights = self.steps, self.steps.weights
         gates, normed, directly = run(
             pointwise.update_deter_back,
@@ -186,26 +191,26 @@ class _Gradients:
             weights.gates_shift,
             steps.before[index],
         )
-        beside = gates @ weights.gates
-        first = run(pointwise.norm_silu_back, beside, steps.first[index], weights.input_scale, weights.input_shift)
-        self.later = directly, beside
+        gate_inputs = gates @ weights.gates
+        first = run(pointwise.norm_silu_back, gate_inputs, steps.first[index], weights.input_scale, weights.input_shift)
+        self.later = directly, gate_inputs
         self.gates.append((gates, normed))
         self.first.append(first)
-        self.joined.append(first[0] @ weights.input)
+        self.inputs.append(first[0] @ weights.input)
 
-    def of_weights(self) -> tuple[Tensor, ...]:
+    def collect(self) -> tuple[Tensor, ...]:
         """Gradients of all parameters, in the order of `Weights`, over all steps at once."""
         steps = self.steps
         return (
-            *_through_norm(self.first, steps.joined, steps.first),
-            *_through_norm(self.gates, steps.beside, steps.gates),
-            *_through_norm(self.second, steps.after, steps.second),
+            *_collect_gradients(self.first, steps.inputs, steps.first),
+            *_collect_gradients(self.gates, steps.gate_inputs, steps.gates),
+            *_collect_gradients(self.second, steps.after, steps.second),
             (raw := torch.cat(self.raw[::-1])).T @ torch.cat(steps.hidden),
             raw.sum(0),
         )
 
 
-def _through_norm(
+def _collect_gradients(
     gradients: list[tuple[Tensor, Tensor]], inputs: list[Tensor], products: list[Tensor]
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Gradients of a layer's weight, and of its norm's scale and shift."""
@@ -216,7 +221,8 @@ def _through_norm(
 class _Unrolled(torch.autograd.Function):
     """deter, stoch, mean and std of each step, (rows, time, ...) each.
 
-    With embeddings the first step only reads its frame; without them it begins with an action, from deter and stoch.
+    With embeddings, the first step has a frame and no action. Without embeddings, the first step takes an action from
+    deter and stoch.
     """
 
     @staticmethod
@@ -231,30 +237,32 @@ class _Unrolled(torch.autograd.Function):
     ) -> tuple[Tensor, ...]:
         steps, has_frames = _Steps(Weights(*parameters)), embeddings is not None
         length = actions.shape[1] + has_frames
-        seen, draws = _slices(embeddings, length), _slices(noise, length)
-        acts = [*actions.unbind(1), None][1 - has_frames :]
-        joined = None if stoch is None else torch.cat([stoch, actions[:, 0]], -1)
-        read = []
+        frames, draws = _split_time(embeddings, length), _split_time(noise, length)
+        following = [*actions.unbind(1), None][1 - has_frames :]
+        inputs = None if stoch is None else torch.cat([stoch, actions[:, 0]], -1)
+        latents = []
         for time in range(length):
-            if joined is not None:
-                deter = steps.advance(joined, deter)
-            *latent, joined = run(pointwise.sample_latent, steps.read(deter, seen[time]), draws[time], acts[time])
-            read.append(latent)
+            if inputs is not None:
+                deter = steps.advance(inputs, deter)
+            *latent, inputs = run(
+                pointwise.sample_latent, steps.read(deter, frames[time]), draws[time], following[time]
+            )
+            latents.append(latent)
         ctx.steps, ctx.draws, ctx.has_frames = steps, draws, has_frames
         ctx.set_materialize_grads(False)
-        return torch.stack(steps.after, 1), *(torch.stack(part, 1) for part in zip(*read, strict=True))
+        return torch.stack(steps.after, 1), *(torch.stack(part, 1) for part in zip(*latents, strict=True))
 
     @staticmethod
     def backward(ctx: Any, *outer: Tensor | None) -> tuple[Tensor | None, ...]:
         length = len(ctx.steps.raw)
         gradients = _Gradients(ctx.steps, ctx.draws)
-        of_deter, *of_latent = (_slices(part, length) for part in outer)
+        of_deter, *of_latent = (_split_time(part, length) for part in outer)
         for time in reversed(range(length)):
             by_latent = gradients.read(time, *(part[time] for part in of_latent))
             if time >= ctx.has_frames:
                 gradients.advance(time - ctx.has_frames, by_latent, of_deter[time])
-        seen = torch.stack([product for product, _ in gradients.second[::-1]], 1) if ctx.has_frames else None
-        return (seen, None, None, None, None, *gradients.of_weights())
+        of_frames = torch.stack([product for product, _ in gradients.second[::-1]], 1) if ctx.has_frames else None
+        return (of_frames, None, None, None, None, *gradients.collect())
 
 
 class _Imagined(torch.autograd.Function):
@@ -273,9 +281,9 @@ class _Imagined(torch.autograd.Function):
         deter, stoch = (part.unbind() for part in outer[1:].split(sizes, -1))
         for time in reversed(range(len(steps.raw))):
             gradients.advance(time, gradients.read(time, stoch[time], None, None), deter[time])
-        actions = torch.stack([joined[:, sizes[1] :] for joined in gradients.joined[::-1]])
+        actions = torch.stack([inputs[:, sizes[1] :] for inputs in gradients.inputs[::-1]])
         return actions, None, None, None, None
 
 
-def _slices(part: Tensor | None, length: int) -> Parts:
+def _split_time(part: Tensor | None, length: int) -> Parts:
     return [None] * length if part is None else part.unbind(1)

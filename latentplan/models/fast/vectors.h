@@ -15,8 +15,8 @@ typedef struct {
     const float *row, *scale, *shift;
 } WideNorm;
 
-static inline WideNorm wide_norm_of(const float *row, const float *scale, const float *shift, long length) {
-    Norm norm = norm_of(row, scale, shift, length);
+static inline WideNorm compute_wide_norm(const float *row, const float *scale, const float *shift, long length) {
+    Norm norm = compute_norm(row, scale, shift, length);
     return (WideNorm){_mm512_set1_ps(norm.mean), _mm512_set1_ps(norm.factor), row, scale, shift};
 }
 
@@ -57,7 +57,7 @@ static inline void store_rounded(bfloat16 *place, __m512 values) {
 
 // SiLU of the layer norm of a row.
 static inline void silu_row(bfloat16 *to, const float *row, const float *scale, const float *shift, long length) {
-    WideNorm norm = wide_norm_of(row, scale, shift, length);
+    WideNorm norm = compute_wide_norm(row, scale, shift, length);
     for (long i = 0; i < length; i += WIDTH) {
         __m512 x = wide_normed(&norm, i);
         store_rounded(to + i, _mm512_mul_ps(x, wide_sigmoid(x)));
@@ -67,7 +67,7 @@ static inline void silu_row(bfloat16 *to, const float *row, const float *scale, 
 // The next state of the GRU, and its bfloat16 copy; a row holds reset, candidate and update gates.
 static inline void gate_row(float *deter, bfloat16 *rounded, const float *row, const float *scale, const float *shift,
                             long size) {
-    WideNorm norm = wide_norm_of(row, scale, shift, 3 * size);
+    WideNorm norm = compute_wide_norm(row, scale, shift, 3 * size);
     for (long i = 0; i < size; i += WIDTH) {
         __m512 reset = wide_sigmoid(wide_normed(&norm, i));
         __m512 candidate = wide_tanh(_mm512_mul_ps(reset, wide_normed(&norm, size + i)));

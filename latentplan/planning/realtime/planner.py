@@ -25,7 +25,7 @@ from latentplan.planning.realtime.worker import (
     drive_process,
     drive_search,
     dump,
-    end,
+    end_worker,
     start_process,
 )
 from latentplan.planning.search.registry import SupportsPlan
@@ -43,7 +43,7 @@ class PlanBuffer:
         beyond, up to max_age       "tail": the next plan is late;
         beyond max_age or horizon   none: the plan is stale and dropped.
 
-    A plan that is not due yet waits, and the plan before it is used until then.
+    Until the first tick of a plan, the plan before is used.
 
     Attributes:
         max_age: Largest age at which a plan is used; None uses a plan to its end.
@@ -124,8 +124,8 @@ class BackgroundPlanner:
     the program.
 
     Args:
-        planner: The planner, of which only `plan` is called.
-        model: The model in which it searches; a process works with a copy, made now.
+        planner: The planner; only its method `plan` is called.
+        model: The model in which the planner searches; a process works with a copy, made by this call.
         objective: See `CEMPlanner.plan`.
         constraints: See `CEMPlanner.plan`.
         worker: `process` or `thread`.
@@ -153,17 +153,17 @@ class BackgroundPlanner:
         self._requests: SimpleQueue[Request | None] = SimpleQueue()
         self._answers: SimpleQueue[Answer] = SimpleQueue()
         self.process: SpawnProcess | None = None
-        ends = (self._requests, self._answers, self._ready)
+        channels = (self._requests, self._answers, self._ready)
         if worker == "process":
             self.process, connection = start_process()
-            arguments: tuple[Any, ...] = (connection, dump(problem), *ends)
+            arguments: tuple[Any, ...] = (connection, dump(problem), *channels)
         else:
-            arguments = (problem, *ends)
+            arguments = (problem, *channels)
         target = drive_process if worker == "process" else drive_search
         self._thread = threading.Thread(target=target, args=arguments, name="latentplan-plan", daemon=True)
         self._thread.start()
         # The thread holds no reference to this object, so the finalizer runs when the object is dropped or at exit.
-        self._close = weakref.finalize(self, end, os.getpid(), self._requests, self._thread, self.process)
+        self._close = weakref.finalize(self, end_worker, os.getpid(), self._requests, self._thread, self.process)
 
     @property
     def is_idle(self) -> bool:
@@ -171,7 +171,7 @@ class BackgroundPlanner:
         return self._is_idle and not self._is_closed
 
     def wait_until_ready(self, seconds: float) -> bool:
-        """Waits up to `seconds` until the worker is ready; returns whether it is (or has failed to start)."""
+        """Waits up to `seconds` for the worker; returns whether the worker is ready or has failed to start."""
         return self._ready.wait(seconds)
 
     def set_objective(self, objective: Term | None = None, constraints: Sequence[Constraint] = ()) -> None:
@@ -188,30 +188,20 @@ class BackgroundPlanner:
         self._goals = goals if self.process is None else dump(goals)
 
     def request(self, state: State, tick: int, previous: Plan | None = None, seed: int | None = None) -> bool:
-        """Starts the search of a plan whose first action is due at `tick`.
-
-        Args:
-            state: The state predicted for `tick`, rows (batch,).
-            tick: Returned with the plan.
-            previous: Previous plan for a warm start, with `elapsed` set for `tick`.
-            seed: Seed of the search's random stream; None takes torch's default.
-
-        Returns:
-            Whether the request was accepted; a planner that is not idle ignores it.
-        """
+        """Starts the search of a plan whose first action is due at `tick`; see `PlanExecutor.request`."""
         if not self.is_idle:
             return False
         self._is_idle = False
         goals, self._goals = self._goals, None
-        own = tree_map(lambda leaf: leaf.detach().clone(), state)
-        self._requests.put(Request(own, tick, previous, seed, goals))
+        copied = tree_map(lambda leaf: leaf.detach().clone(), state)
+        self._requests.put(Request(copied, tick, previous, seed, goals))
         return True
 
     def poll(self) -> tuple[int, Plan] | None:
         """Returns the finished plan with the tick of its request, once; None if no plan is finished.
 
         Raises:
-            Exception: The exception that the search raised, with its own type and message; its traceback is the cause.
+            Exception: The exception that the search raised, with its type and message; the cause has its traceback.
             RuntimeError: The process has ended unexpectedly, and no more plans will come.
         """
         try:
@@ -225,14 +215,14 @@ class BackgroundPlanner:
             self.process.join(CLOSING_SECONDS)
             self.close()
             code = self.process.exitcode
-            hint = '; a script that starts one needs `if __name__ == "__main__":`' if code == 1 else ""
+            hint = '; a script that plans in a process needs `if __name__ == "__main__":`' if code == 1 else ""
             raise RuntimeError(f"the process that plans has ended unexpectedly (exit code {code}){hint}")
         self._is_idle = True
         if kind == "error":
-            error, where = value
-            raise error from RuntimeError(f"in the worker that plans:\n{where}")
-        found: tuple[int, Plan] = value
-        return found
+            error, traceback = value
+            raise error from RuntimeError(f"in the worker that plans:\n{traceback}")
+        finished: tuple[int, Plan] = value
+        return finished
 
     def close(self) -> None:
         """Ends the worker, even during a search; may be called again."""

@@ -20,7 +20,7 @@ from latentplan.planning.model import (
     supports,
     take_step,
 )
-from latentplan.planning.objectives import Constraint, Term, seen_for
+from latentplan.planning.objectives import Constraint, Term, apply_view
 from latentplan.planning.plan import Plan
 from latentplan.planning.realtime.planner import PlanBuffer
 from latentplan.planning.search.registry import Planner
@@ -46,7 +46,7 @@ class PlanExecutor(Protocol):
             seed: Seed of the search's random stream; None takes torch's default.
 
         Returns:
-            Whether the request was accepted; an executor that is not idle ignores it.
+            Whether the request was accepted; an executor that is not idle ignores requests.
         """
         ...
 
@@ -64,7 +64,13 @@ class PlanExecutor(Protocol):
 
 
 class Decision(NamedTuple):
-    """The decision of a tick: `action` (batch, action), its `source` ("plan", "tail" or "actor"), the plan's `age`."""
+    """The decision of a tick.
+
+    Attributes:
+        action: The action of each environment, (batch, action).
+        source: Source of the action: "plan", "tail" (the plan after the next one was expected) or "actor".
+        age: Age of the plan in ticks; None for an action of the actor.
+    """
 
     action: Tensor
     source: str
@@ -85,8 +91,9 @@ class PlanScheduler:
            that state, warm-started from the last plan shifted to the same tick.
 
     The predicted latency is the upper quartile of the last 16 latencies. A latency is the number of ticks from the
-    request to the decision that finds the plan; the first one is left out, because it includes lazy initialisation. A
-    plan that arrives early waits until its tick; of a plan that arrives late, the first actions are skipped.
+    request to the decision that finds the plan. The first latency does not count, because it includes lazy
+    initialisation. A plan that arrives early waits until its tick; of a plan that arrives late, the first actions are
+    skipped.
 
     `BackgroundPlanner` is an executor in real time. An executor on a virtual clock computes the plan in `request` and
     measures the duration; its `poll` returns the plan once the virtual time has reached the time of the request plus
@@ -114,11 +121,12 @@ class PlanScheduler:
         self.planner, self.model, self.executor, self.generator = planner, model, executor, generator
         self._acting: Any = model  # the model, or the view of a learned goal, with the policy that acts
         self.buffer = PlanBuffer(max_age, 1 if fresh_ticks is None else fresh_ticks)
-        self.tick = 0  # of the next decision; not reset, so that a late plan cannot be taken for a newer one
+        self.tick = 0  # of the next decision; never reset, so that a late plan is not mistaken for a newer plan
         self._follows_latency = fresh_ticks is None
         self._latencies: deque[int] = deque(maxlen=NUM_LATENCIES)
         self._is_warmed_up = False
-        self._asked: tuple[int, int, State] | None = None  # running request: its tick, and the plan's tick and state
+        # Of the running request: the tick at which it was made, and tick and state of the plan's start.
+        self._requested: tuple[int, int, State] | None = None
         self._nominals: dict[int, NominalTrajectory] = {}  # by the tick of the plan's first action
         self._last: tuple[int, Plan] | None = None
         self._batch: int | None = None
@@ -151,7 +159,7 @@ class PlanScheduler:
         else:
             action = self._act_by_plan(state, self.tick, age)
         if self.executor.is_idle:
-            self._ask(state, action)
+            self._request(state, action)
         self.tick += 1
         return Decision(action, source, age)
 
@@ -161,46 +169,46 @@ class PlanScheduler:
         For a learned goal (`conditioned`) the goal's policy acts where there is no plan.
         """
         self.executor.set_objective(objective, constraints)
-        self._acting, _ = seen_for(self.model, objective)
+        self._acting, _ = apply_view(self.model, objective)
 
     def reset(self) -> None:
         """Drops all plans, and the plan of the running request when it arrives."""
         self.buffer.clear()
         self._nominals = {}
-        self._asked = self._last = None
+        self._requested = self._last = None
 
     def _collect(self) -> None:
+        """Puts a finished plan, if there is one, into the buffer."""
         try:
             finished = self.executor.poll()
         except Exception:
-            self._asked = None
+            self._requested = None
             raise
         if finished is None:
             return
-        asked, self._asked = self._asked, None
+        requested, self._requested = self._requested, None
         tick, plan = finished
-        if self._is_warmed_up and asked is not None:
-            self._latencies.append(self.tick - asked[0])
+        if self._is_warmed_up and requested is not None:
+            self._latencies.append(self.tick - requested[0])
         self._is_warmed_up = True
-        if asked is None or asked[1] != tick:  # requested before a reset
+        if requested is None or requested[1] != tick:  # the request was made before a reset
             return
         plan.warn_of_failures()
-        if bool(
-            plan.info["is_fallback"].all()
-        ):  # the policy at the tick itself knows the real state, this plan does not
+        if bool(plan.info["is_fallback"].all()):  # without a search, the policy in the real state is the better choice
             return
         self.buffer.submit(plan.actions, tick)
         now, nominals = self.tick, self._nominals.items()
         self._nominals = {first: nominal for first, nominal in nominals if now - first < nominal.actions.shape[1]}
-        self._nominals[tick] = NominalTrajectory(self.model, asked[2], plan.actions)
+        self._nominals[tick] = NominalTrajectory(self.model, requested[2], plan.actions)
         self._last = finished
         if self._follows_latency:
             self.buffer.fresh_ticks = self.latency_ticks
 
-    def _ask(self, state: State, action: Tensor) -> None:
+    def _request(self, state: State, action: Tensor) -> None:
+        """Requests the next plan, given the state and the action of this tick."""
         due = self.tick + self.latency_ticks
         if self._last is not None:
-            due = max(due, self._last[0] + 1)  # the last plan already covers its own first tick
+            due = max(due, self._last[0] + 1)  # each plan starts at a later tick than the last
         for tick in range(self.tick + 1, due + 1):
             state, _ = take_step(self.model, state, action)
             if tick < due:
@@ -211,7 +219,7 @@ class PlanScheduler:
             device = self.generator.device
             seed = int(torch.randint(2**62, (1,), generator=self.generator, device=device))
         if self.executor.request(state, due, self._warm_start(due), seed):
-            self._asked = (self.tick, due, state)
+            self._requested = (self.tick, due, state)
 
     def _warm_start(self, due: int) -> Plan | None:
         if self._last is None or due - self._last[0] >= self._last[1].mean.shape[1]:
@@ -227,6 +235,7 @@ class PlanScheduler:
         return nominal.correct(age, state, self._act_by_policy).clamp(*self._bounds(state))
 
     def _act_by_policy(self, state: State) -> Tensor:
+        """Returns the policy's mode, or zeros without a policy, within the bounds, (batch, action)."""
         low, high = self._bounds(state)
         if not supports(self._acting, "policy"):
             return torch.zeros(count_rows(state), len(low), device=low.device, dtype=low.dtype).clamp(low, high)
@@ -240,13 +249,12 @@ class PlanScheduler:
 
 
 class NominalTrajectory:
-    """The states that a plan predicts, imagined as far as they are needed.
+    """The states that a plan predicts; the model computes each of them at its first use.
 
-    A plan is made for a predicted state and executed in another one. The policy is a feedback law: its action in the
-    real state minus its action in the predicted state, added to the planned action, answers what the plan could not
-    foresee, and is 0 where the model was right. The form is `u = u_plan + pi(x) - pi(x_plan)` of optimal control, there
-    with a linear law (Tassa et al. 2012, "Synthesis and stabilization of complex behaviors through online trajectory
-    optimization", equation 8).
+    A plan is made for a predicted state and executed in the real state. The policy corrects the planned action by
+    feedback: `u = u_plan + pi(x) - pi(x_plan)`, with the real state x and the predicted state x_plan. The correction is
+    0 where the prediction was right. In optimal control the feedback law pi is linear (Tassa et al. 2012, "Synthesis
+    and stabilization of complex behaviors through online trajectory optimization", equation 8).
 
     Args:
         model: The model that predicts the states.
@@ -270,14 +278,13 @@ class NominalTrajectory:
 
         Args:
             age: Index of the action in the plan.
-            state: Believed state of each environment, rows (batch,).
+            state: Real state of each environment, as believed, rows (batch,).
             policy: Returns the policy's mode (rows, action).
 
         Returns:
             Actions, which the caller clamps into the bounds; the plan's own where the policy is not finite.
         """
-        both = tree_map(lambda here, there: torch.cat([here, there]), state, self.state_at(age))
-        here, there = policy(both).chunk(2)
-        answer = here - there
-        planned = self.actions[:, age]
-        return planned + torch.where(torch.isfinite(answer), answer, 0.0)
+        both = tree_map(lambda real, predicted: torch.cat([real, predicted]), state, self.state_at(age))
+        in_real, in_predicted = policy(both).chunk(2)
+        correction = in_real - in_predicted
+        return self.actions[:, age] + torch.where(torch.isfinite(correction), correction, 0.0)

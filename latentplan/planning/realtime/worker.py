@@ -28,13 +28,21 @@ CLOSING_SECONDS = 2.0
 # MCL_CURRENT | MCL_ONFAULT of mlockall(2); without MCL_FUTURE, under which a limit would let later memory fail.
 LOCK_ON_USE = 1 | 4
 
-Answer = tuple[str, Any]  # "ready", "plan" with (tick, plan), "error" with (error, where), or "ended"
+Answer = tuple[str, Any]  # "ready", "plan" with (tick, plan), "error" with (error, traceback), or "ended"
 Problem = tuple[Any, ...]  # planner, model, objective, constraints
 Goals = tuple[Any, Any]  # objective, constraints
 
 
 class Request(NamedTuple):
-    """A search request; `goals`, pickled or not, replace objective and constraints from now on; None keeps them."""
+    """A search request.
+
+    Attributes:
+        state: The state predicted for `tick`, rows (batch,).
+        tick: Tick of the plan's first action.
+        previous: Previous plan for a warm start.
+        seed: Seed of the search's random stream; None takes torch's default.
+        goals: Objective and constraints from this request on, pickled or not; None keeps the present ones.
+    """
 
     state: State
     tick: int
@@ -51,7 +59,7 @@ def settle() -> bool:
     the present memory pages once they have been used, if the system allows that.
 
     Returns:
-        Whether the system allows to lock memory: on Linux, by capability or by the limit for locked memory.
+        Whether memory was locked; Linux allows this by a capability or by the limit for locked memory.
     """
     gc.collect()
     gc.freeze()
@@ -64,15 +72,17 @@ def start_process() -> tuple[SpawnProcess, Connection]:
     context = multiprocessing.get_context("spawn")
     ours, theirs = context.Pipe()
     process = context.Process(target=_serve, args=(theirs,), name="latentplan-plan", daemon=True)
-    resource_tracker.ensure_running()  # its own start would unblock the signal before the child inherits the mask
-    with _interrupts_held():  # the child inherits the blocked signal, and unblocks it once it ignores interrupts
+    resource_tracker.ensure_running()  # started by the process, the tracker would unblock the signal too early
+    with _blocked_interrupts():  # the child inherits the blocked signal, and unblocks it once it ignores interrupts
         process.start()
     theirs.close()
     return process, ours
 
 
 def dump(problem: Problem) -> bytes:
-    """Returns a problem or goals as bytes, with copies of tensors: memory that torch shares would outlive a crash.
+    """Returns a problem or goals as bytes that hold copies of all tensors.
+
+    Torch would otherwise share the memory of tensors between processes, and this memory would outlive a crash.
 
     Raises:
         TypeError: The problem cannot be pickled.
@@ -93,7 +103,7 @@ def drive_process(
     answers: SimpleQueue[Answer],
     ready: threading.Event,
 ) -> None:
-    """Exchanges messages with the process, in a thread, so that the loop never waits for the pipe."""
+    """Exchanges messages with the process; runs in a thread, so that the control loop never waits for the pipe."""
     try:
         connection.send_bytes(problem)
         started = pickle.loads(connection.recv_bytes())
@@ -112,22 +122,22 @@ def drive_process(
 def drive_search(
     problem: Problem, requests: SimpleQueue[Request | None], answers: SimpleQueue[Answer], ready: threading.Event
 ) -> None:
-    """Answers search requests in a thread of the loop's process."""
+    """Answers search requests in a thread of the control loop's process."""
     ready.set()
     search = _Search(problem)
     while (request := requests.get()) is not None:
         try:
             answers.put(search(request))
-        except BaseException as error:  # such as SystemExit, which would end the thread without a message
-            answers.put(("error", _portable(RuntimeError(f"{type(error).__name__}: {error}"))))
+        except BaseException as error:  # SystemExit, for example, would end the thread without a message
+            answers.put(("error", _make_portable(RuntimeError(f"{type(error).__name__}: {error}"))))
 
 
-def end(
+def end_worker(
     owner: int, requests: SimpleQueue[Request | None], thread: threading.Thread, process: SpawnProcess | None
 ) -> None:
-    """Ends a worker, even during a search. A thread that hangs is left behind as a daemon.
+    """Ends a worker, even during a search. A thread that hangs goes on as a daemon.
 
-    In a fork of the loop's process the function does nothing, because the worker belongs to the parent.
+    In a fork of the control loop's process this function does nothing, because the worker belongs to the parent.
     """
     if os.getpid() != owner:
         return
@@ -138,7 +148,7 @@ def end(
         if process.is_alive():
             process.kill()
             process.join()
-    if thread is not threading.current_thread():  # garbage is collected in any thread
+    if thread is not threading.current_thread():  # a finalizer may run in any thread
         thread.join(CLOSING_SECONDS)
 
 
@@ -146,18 +156,19 @@ def _exchange(connection: Connection, request: Request) -> Answer:
     try:
         message = pickle.dumps(request)
     except Exception as error:
-        return "error", _portable(error)
+        return "error", _make_portable(error)
     connection.send_bytes(message)
     received = connection.recv_bytes()
     try:
         answer: Answer = pickle.loads(received)
     except Exception as error:
-        return "error", _portable(error)
+        return "error", _make_portable(error)
     return answer
 
 
 @contextlib.contextmanager
-def _interrupts_held() -> Iterator[None]:
+def _blocked_interrupts() -> Iterator[None]:
+    """Blocks the signal of Ctrl-C inside the `with` block."""
     if not hasattr(signal, "pthread_sigmask"):
         yield
         return
@@ -178,12 +189,9 @@ def _serve(connection: Connection) -> None:
     try:
         try:
             problem = pickle.loads(connection.recv_bytes())
-        except (
-            AttributeError,
-            ImportError,
-            pickle.UnpicklingError,
-        ) as error:  # defined in a module that this process cannot import
-            connection.send_bytes(pickle.dumps(("error", _portable(error))))
+        except (AttributeError, ImportError, pickle.UnpicklingError) as error:
+            # The problem uses a definition of a module that this process cannot import.
+            connection.send_bytes(pickle.dumps(("error", _make_portable(error))))
             return
         search = _Search(problem)
         settle()
@@ -195,7 +203,7 @@ def _serve(connection: Connection) -> None:
 
 
 class _Search:
-    """Answers requests one after another, each with the latest goals."""
+    """Answers requests one after another, with the goals of the last request that had any."""
 
     def __init__(self, problem: Problem) -> None:
         self._planner, self._model, *goals = problem
@@ -219,15 +227,15 @@ class _Search:
                 generator=generator,
             )
         except Exception as error:
-            return "error", _portable(error)
+            return "error", _make_portable(error)
         return "plan", (request.tick, plan)
 
 
-def _portable(error: Exception) -> tuple[Exception, str]:
+def _make_portable(error: Exception) -> tuple[Exception, str]:
     """Returns an exception that can be pickled, and its traceback as text."""
-    where = traceback.format_exc()
+    text = traceback.format_exc()
     try:
         pickle.loads(pickle.dumps(error))
     except Exception:
         error = RuntimeError(f"{type(error).__name__}: {error}")
-    return error.with_traceback(None), where
+    return error.with_traceback(None), text

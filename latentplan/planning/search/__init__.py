@@ -1,1 +1,1 @@
-"""The search over action sequences: its options, the loop, the planners by name, and the parts of the loop."""
+"""The search over action sequences: the loop, its parts, and the planners by name; `config.search` has its options."""

@@ -10,13 +10,12 @@ from typing import Any
 
 import torch
 
-from latentplan.config.search import WIDEST_STD, check_whole
+from latentplan.config.search import WIDEST_STD, SearchOptions, check_whole
 from latentplan.planning.model import Bound, Model, State, per_dimension
 from latentplan.planning.objectives import Constraint, Term
 from latentplan.planning.plan import Plan
 from latentplan.planning.search.deadline import Pace
 from latentplan.planning.search.loop import Problem, Search
-from latentplan.planning.search.options import SearchOptions
 from latentplan.planning.search.sampling import Generators
 
 
@@ -25,7 +24,7 @@ class CEMPlanner(SearchOptions):
     """Searches action sequences by refitting a Gaussian to its best samples, inside a model.
 
     All options of `SearchOptions` are arguments too. A planner keeps no plan: the previous plan is passed to `plan`.
-    The one thing that a planner remembers is how long its searches took, for deadlines.
+    A planner keeps only the durations of its searches, for deadlines.
 
     Attributes:
         action_dim: Numbers in an action.
@@ -49,7 +48,7 @@ class CEMPlanner(SearchOptions):
 
     @cached_property
     def pace(self) -> Pace:
-        """Durations of earlier searches, from which a search with a deadline predicts what fits."""
+        """Durations of earlier searches, from which a search with a deadline predicts the parts that fit."""
         return Pace()
 
     def plan(
@@ -69,8 +68,8 @@ class CEMPlanner(SearchOptions):
             model: The model in which action sequences are imagined; see `latentplan.planning.model`.
             state: Start of the plans, rows (batch,).
             previous: The previous plan, for a warm start.
-            objective: Maximised, `objective(rollout) -> (rows,)`; None is the discounted reward, completed by the
-                terminal value as the option says.
+            objective: Maximised, `objective(rollout) -> (rows,)`; None is the discounted reward, plus the value of the
+                last state if the option `terminal_value` says so.
             constraints: Each returns the violation of every rollout, (rows,), 0 where the constraint is satisfied.
             generator: One generator for all environments, which then draw the same noise, or a list with one generator
                 per environment; None takes torch's default. An environment's plan does not depend on the others.
@@ -79,12 +78,19 @@ class CEMPlanner(SearchOptions):
                 earlier durations at this problem size (see `Pace`).
 
         Returns:
-            The plan. Its `info` holds `elite_return` and `std`, (batch, iteration); `iterations` and `num_nonfinite`,
-            (batch,); `is_fallback` (batch,): no candidate had a finite return, or no iteration fitted the deadline, and
-            the tail of the previous plan or zeros stand in; `is_policy` (batch,): the deadline was too short for an
-            iteration and the policy's sequence stands in (only if the policy makes proposals, and neither constraints
-            nor an objective that the policy was not trained for are given); `violation` (batch,) of the chosen
-            sequence, if there are constraints; and `stopped`, the reason the search ended: "iterations" or "deadline".
+            The plan. Its `info` holds:
+
+            * `elite_return`: mean return of the elites after each refit, (batch, iteration);
+            * `std`: mean standard deviation of the samples after each refit, (batch, iteration);
+            * `iterations`: number of refits, (batch,);
+            * `num_nonfinite`: number of candidates whose return was not finite, (batch,);
+            * `is_fallback`: whether no candidate had a finite return or no iteration fitted the deadline, so that the
+              actions are the tail of the previous plan, zeros, or the policy's, (batch,);
+            * `is_policy`: whether no iteration fitted the deadline and the actions are the policy's, (batch,); false
+              unless the policy makes proposals, and false with constraints or an objective for which the policy was not
+              trained;
+            * `violation`: violation of the chosen sequence, only with constraints, (batch,);
+            * `stopped`: the reason the search ended, "iterations" or "deadline".
 
         Raises:
             ValueError: The model lacks a method that an option needs, a method of the model returned a wrong shape, or
@@ -95,7 +101,7 @@ class CEMPlanner(SearchOptions):
         deadline_ms = self.deadline_ms if deadline_ms is None else deadline_ms
         if deadline_ms is not None and not deadline_ms >= 0.0:
             raise ValueError(f"deadline_ms must be at least 0, got {deadline_ms}")
-        # Leaving inference mode keeps the plan usable as a training target, and lets gradient steps work.
+        # A plan made in inference mode could not be a training target, and gradient steps would fail.
         with torch.inference_mode(False), torch.no_grad():
             low, high = (self._per_dimension(name) for name in ("action_low", "action_high"))
             init_std = None if self.init_std is None else self._per_dimension("init_std")

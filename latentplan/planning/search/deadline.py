@@ -9,20 +9,10 @@ from dataclasses import dataclass, field
 
 import torch
 
-NUM_DURATIONS = 32
-QUANTILE = 0.9
-PATIENCE = 10
-ROUNDING = 1.0 + 1e-9  # durations whose sum equals the budget still fit, whatever their rounding
-
-
-@dataclass
-class _Durations:
-    """Seconds that one part of a search took, without the first time, and the number of refusals since."""
-
-    recent: deque[float] = field(default_factory=lambda: deque(maxlen=NUM_DURATIONS))
-    fastest: float = math.inf
-    is_warmed_up: bool = False
-    num_refusals: int = 0
+NUM_DURATIONS = 32  # durations of a part that count
+QUANTILE = 0.9  # of these durations, the expected one
+PATIENCE = 10  # refusals in a row after which the fastest duration is expected
+ROUNDING = 1.0 + 1e-9  # factor by which a sum of durations may exceed the budget, because sums are rounded
 
 
 class Pace:
@@ -30,7 +20,7 @@ class Pace:
 
     The expected duration of a part is the 0.9 quantile of its last 32 durations, and 0 without any. The first duration
     never counts, because it includes lazy initialisation. After 10 refusals in a row the fastest duration is expected,
-    so that a single slow one does not refuse a part for ever.
+    so that one slow search does not exclude a part for ever.
 
     A copy starts without durations, because the copy may run on another machine.
     """
@@ -106,7 +96,7 @@ class Budget:
     def lap(self, part: str | None = None) -> None:
         """Records the time since the last lap as the duration of a part; None only starts the next lap."""
         if self._is_asynchronous and self._seconds is None:
-            return  # without a limit the durations are not needed, and reading them would wait for the device
+            return  # without a limit no duration is needed, and measuring one would wait for the device
         now = self._now()
         if part is not None:
             self._pace.record((part, self._size), now - self._lap_started)
@@ -116,3 +106,13 @@ class Budget:
         if self._is_asynchronous:
             torch.cuda.synchronize(self._device)
         return self._clock()
+
+
+@dataclass
+class _Durations:
+    """Durations of one part of a search in seconds, without the first one, and the number of refusals since."""
+
+    recent: deque[float] = field(default_factory=lambda: deque(maxlen=NUM_DURATIONS))
+    fastest: float = math.inf
+    is_warmed_up: bool = False
+    num_refusals: int = 0

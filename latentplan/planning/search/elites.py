@@ -73,7 +73,7 @@ def refit(
 
     Mean and population variance (1/K) of the elites are blended with the old ones: `smoothing * elite + (1 - smoothing)
     * old`. A candidate whose return is NaN or infinite is never an elite. If fewer than `num_elites` candidates have a
-    finite return, only these are elites; if none has, mean and variance stay.
+    finite return, only these candidates are elites. Without any, mean and variance stay.
 
     Args:
         candidates: Action sequences, (sample, horizon, action) or (batch, sample, horizon, action).
@@ -110,7 +110,7 @@ def refit(
 
 
 def select_elites(candidates: Tensor, scores: Scores, *, num_elites: int, temperature: float | None) -> Elites:
-    """Returns the best candidates: by return, or if violations rank, by violation first and by return second.
+    """Returns the best candidates: by return, or by violation first and by return second if `scores.is_ranked`.
 
     Args:
         candidates: (batch, sample, horizon, action).
@@ -138,7 +138,7 @@ def select_elites(candidates: Tensor, scores: Scores, *, num_elites: int, temper
         weights = weights * torch.softmax(exponents / temperature, dim=1)
     weights = weights / weights.sum(dim=1, keepdim=True).clamp_min(torch.finfo(weights.dtype).tiny)
     chosen = torch.take_along_dim(candidates, index[:, :, None, None], dim=1)
-    # An action that is NaN would make the weighted mean NaN, even with weight 0.
+    # A NaN action would make the weighted mean NaN, even with weight 0.
     chosen = torch.where(is_valid[:, :, None, None], chosen, 0.0)
     return Elites(chosen, Scores(best, violation, is_ranked), weights)
 
@@ -146,15 +146,23 @@ def select_elites(candidates: Tensor, scores: Scores, *, num_elites: int, temper
 def move_towards(
     elites: Elites, mean: Tensor, var: Tensor, *, smoothing: float, adapt_std: bool = True
 ) -> tuple[Tensor, Tensor]:
-    """Returns mean and variance, (batch, horizon, action), blended with the elites'; unchanged without elites."""
+    """Returns mean and variance, (batch, horizon, action), moved towards the elites'; unchanged without elites.
+
+    Args:
+        elites: Elites of the present iteration.
+        mean: Mean of the search distribution, (batch, horizon, action).
+        var: Variance of the search distribution, (batch, horizon, action).
+        smoothing: Weight of the elites' statistics, in (0, 1].
+        adapt_std: Whether the variance moves too.
+    """
     weights = rearrange(elites.weights, "batch elite -> batch elite 1 1")
-    found = elites.weights.sum(dim=1)[:, None, None] > 0
+    has_elites = elites.weights.sum(dim=1)[:, None, None] > 0
     elite_mean = (weights * elites.actions).sum(dim=1)
-    new_mean = torch.where(found, torch.lerp(mean, elite_mean, smoothing), mean)
+    new_mean = torch.where(has_elites, torch.lerp(mean, elite_mean, smoothing), mean)
     if not adapt_std:
         return new_mean, var
     elite_var = (weights * (elites.actions - elite_mean[:, None]).square()).sum(dim=1)
-    return new_mean, torch.where(found, torch.lerp(var, elite_var, smoothing), var)
+    return new_mean, torch.where(has_elites, torch.lerp(var, elite_var, smoothing), var)
 
 
 def mean_return(elites: Elites) -> Tensor:

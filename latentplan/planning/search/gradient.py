@@ -19,10 +19,12 @@ def ascend(
     step_size: float,
     bounds: tuple[Tensor, Tensor],
 ) -> tuple[Tensor, Tensor, Tensor | None]:
-    """Returns sequences improved by gradient ascent on their return; a step without gain is undone and halved.
+    """Returns sequences improved by gradient ascent on their return.
+
+    A step that does not raise the return, or raises the violation, is undone, and the step size is halved.
 
     Args:
-        scorer: Gives sequences their returns.
+        scorer: Scores sequences.
         state: Start of the plans, rows (batch,).
         actions: Sequences, (batch, horizon, action).
         num_steps: Number of gradient steps.
@@ -65,8 +67,7 @@ def _measure(scorer: Scorer, rows: State, actions: Tensor) -> tuple[Tensor, Tens
     if not returns.requires_grad:
         raise ValueError("gradient_steps above 0 needs a model that is differentiable in the action")
     (gradient,) = torch.autograd.grad(returns.sum(), leaf)
-    gradient = torch.nan_to_num(gradient, posinf=0.0, neginf=0.0)  # a row that is not finite stays where it is
+    gradient = torch.nan_to_num(gradient, posinf=0.0, neginf=0.0)  # such a row is not moved
     slope = gradient / gradient.abs().amax(dim=(1, 2), keepdim=True).clamp_min(torch.finfo(gradient.dtype).tiny)
-    none = torch.zeros_like(returns)
-    violation = none if scores.violations is None else scores.violations[:, 0]
+    violation = torch.zeros_like(returns) if scores.violations is None else scores.violations[:, 0]
     return returns.detach(), violation.detach(), slope

@@ -1,4 +1,17 @@
-"""One search, from the first candidates to the plan: the loop that every planner of the family runs."""
+"""One search, from the first candidates to the plan: the loop that CEM, iCEM and MPPI run.
+
+`Search.run` makes a plan in these steps:
+
+1.  shift the previous plan to the present; its actions are the start of the search distribution;
+2.  let the model's policy propose action sequences;
+3.  repeat: sample candidates from the distribution, score them in the model, select the elites, and move mean and
+    variance towards the elites;
+4.  choose the sequence to execute: the mean, the best candidate, or the better of the mean and the policy's sequence;
+5.  if asked, refine this sequence by gradient ascent.
+
+A search with a deadline skips the parts that would end too late (`deadline`). Scores come from `scorer`, and the
+equations of step 3 from `elites`.
+"""
 
 from __future__ import annotations
 
@@ -10,13 +23,13 @@ import torch
 from torch import Tensor
 from torch.utils._pytree import tree_map
 
+from latentplan.config.search import SearchOptions
 from latentplan.planning.model import Model, State, action_dtype, count_rows, state_device, supports
-from latentplan.planning.objectives import Constraint, Term, seen_for
+from latentplan.planning.objectives import Constraint, Term, apply_view
 from latentplan.planning.plan import Plan, WarmStart, shift_plan
 from latentplan.planning.search.deadline import Budget, Pace
 from latentplan.planning.search.elites import Elites, Scores, mean_return, move_towards, select_elites
 from latentplan.planning.search.gradient import ascend
-from latentplan.planning.search.options import SearchOptions
 from latentplan.planning.search.sampling import Generators, Streams
 from latentplan.planning.search.scorer import Scorer
 
@@ -29,7 +42,7 @@ Choice = tuple[Tensor, Tensor, Tensor | None]
 
 @dataclass(frozen=True)
 class Problem:
-    """What is searched for in one call.
+    """The problem that one search solves.
 
     Attributes:
         model: The model in which action sequences are imagined.
@@ -53,7 +66,7 @@ class Problem:
 
 
 class Progress(NamedTuple):
-    """The search between two refits; dim 0 of every tensor is the environment, so finished ones can be frozen.
+    """The state of a search between two refits. Dim 0 of every tensor is the environment, and a finished one is frozen.
 
     Attributes:
         mean: Mean of the search distribution, (batch, horizon, action).
@@ -62,7 +75,7 @@ class Progress(NamedTuple):
         expected_return: Mean return of the last elites, NaN before the first refit, (batch,).
         num_nonfinite: Number of candidates so far whose return was not finite, (batch,).
         iterations: Number of refits so far, (batch,).
-        is_found: Whether any candidate had a finite return, (batch,).
+        has_elites: Whether any candidate so far had a finite return, (batch,).
     """
 
     mean: Tensor
@@ -71,18 +84,18 @@ class Progress(NamedTuple):
     expected_return: Tensor
     num_nonfinite: Tensor
     iterations: Tensor
-    is_found: Tensor
+    has_elites: Tensor
 
     def updated(self, mask: Tensor, new: Progress) -> Progress:
         """Returns this progress, with the environments in mask (batch,) taken from `new`."""
 
-        def choose(fresh: Any, past: Any) -> Any:
-            if not isinstance(fresh, Tensor):
-                return fresh
-            return torch.where(mask.reshape(-1, *[1] * (fresh.ndim - 1)), fresh, past)
+        def select(newer: Any, older: Any) -> Any:
+            if not isinstance(newer, Tensor):
+                return newer
+            return torch.where(mask.reshape(-1, *[1] * (newer.ndim - 1)), newer, older)
 
-        chosen: Progress = tree_map(choose, new, self)
-        return chosen
+        selected: Progress = tree_map(select, new, self)
+        return selected
 
     def describe(self, history: Sequence[tuple[Tensor, Tensor]], stopped: str) -> dict[str, Any]:
         """Returns the diagnostics of a plan.
@@ -97,13 +110,13 @@ class Progress(NamedTuple):
             "std": torch.stack([std for _, std in history], dim=1) if history else none,
             "iterations": self.iterations,
             "num_nonfinite": self.num_nonfinite,
-            "is_fallback": ~self.is_found,
+            "is_fallback": ~self.has_elites,
             "stopped": stopped,
         }
 
 
 class Search:
-    """One search: a problem, and the options with which it is solved.
+    """One search for a problem, with the options of a planner.
 
     Args:
         options: Options of the search.
@@ -115,7 +128,7 @@ class Search:
     """
 
     def __init__(self, options: SearchOptions, problem: Problem, generator: Generators) -> None:
-        model, objective = seen_for(problem.model, problem.objective)
+        model, objective = apply_view(problem.model, problem.objective)
         self.options, self.model, self.state = options, model, problem.state
         self.batch, self.device = count_rows(self.state), state_device(self.state)
         self.dtype = action_dtype(self.state)
@@ -143,7 +156,7 @@ class Search:
 
     def budget(self, pace: Pace, clock: Callable[[], float], started: float, seconds: float | None) -> Budget:
         """Returns the time that this search may take; see `Budget`."""
-        # A wrapper such as `compile_rollout` is as fast as the model that it wraps, so both types are part of the size.
+        # The speed of a wrapper such as `compile_rollout` depends on the model inside, so both types are in the key.
         kind = type(self.model), type(getattr(self.model, "model", None))
         size = (kind, self.batch, self.horizon, self.scorer.num_particles, self.dtype, self.device)
         return Budget(pace, size, clock, started, seconds, self.device)
@@ -156,32 +169,25 @@ class Search:
             budget: The time that the search may take.
         """
         options = self.options
-        last = self._cold_start() if previous is None else self._shift(previous)
-        start = last if options.warm_start else self._cold_start()
+        shifted = self._cold_start() if previous is None else self._shift(previous)
+        start = shifted if options.warm_start else self._cold_start()
         if not budget.allows("propose", "iteration", "choose"):
-            return self._fall_back(last, budget)
+            return self._fall_back(shifted, budget)
         budget.lap()
         proposals = self._propose(budget) if self.num_proposals else None
         progress, history, stopped = self._iterate(start, proposals, budget)
         # Without a finite candidate the plan is the tail of the previous plan, or zeros clamped into the bounds.
-        mean = torch.where(progress.is_found[:, None, None], progress.mean, last.mean).clamp(self.low, self.high)
+        mean = torch.where(progress.has_elites[:, None, None], progress.mean, shifted.mean).clamp(self.low, self.high)
         mode = proposals[:, 0] if proposals is not None and self.may_use_policy else None
         actions, expected, violation = choose(options.final, self.scorer, self.state, progress, mean, mode)
         budget.lap("choose")
         if options.gradient_steps and not budget.allows("gradient"):
             stopped = "deadline"
         elif options.gradient_steps:
-            actions, refined, violation = ascend(
-                self.scorer,
-                self.state,
-                actions,
-                num_steps=options.gradient_steps,
-                step_size=options.gradient_step_size,
-                bounds=(self.low, self.high),
-            )
+            actions, refined, violation = self._refine(actions)
             expected = torch.where(torch.isfinite(refined), refined, expected)
             budget.lap("gradient")
-        info = {**progress.describe(history, stopped), "is_policy": torch.zeros_like(progress.is_found)}
+        info = {**progress.describe(history, stopped), "is_policy": torch.zeros_like(progress.has_elites)}
         if violation is not None:
             info["violation"] = violation
         kept = None
@@ -196,13 +202,14 @@ class Search:
         budget.lap("propose")
         return proposals
 
-    def _fall_back(self, last: WarmStart, budget: Budget) -> Plan:
-        """Returns a plan without a search, for want of time: the policy's sequence, else the shifted previous plan.
+    def _fall_back(self, shifted: WarmStart, budget: Budget) -> Plan:
+        """Returns a plan when the deadline is too short for a search.
 
-        The policy's sequence is its mode in imagination if the budget allows that, else its action now, held. Without a
-        policy and a previous plan the actions are zeros. Environments that would start cold stay cold.
+        The actions are the policy's sequence, else the shifted previous plan, else zeros. The policy's sequence is a
+        rollout of its mode if the budget allows a rollout, else its action in the present state, repeated. Environments
+        that would start cold stay cold.
         """
-        actions, is_policy = last.mean, torch.zeros(self.batch, dtype=torch.bool, device=self.device)
+        actions, is_policy = shifted.mean, torch.zeros(self.batch, dtype=torch.bool, device=self.device)
         if self.may_use_policy:
             budget.lap()
             if budget.allows("propose"):
@@ -211,12 +218,13 @@ class Search:
                 mode = self.scorer.act(self.state, (self.low, self.high))[:, None].expand_as(actions)
             is_policy = torch.isfinite(mode).flatten(1).all(1)
             actions = torch.where(is_policy[:, None, None], mode, actions)
-        progress = self._begin(last)
+        progress = self._begin(shifted)
         info = {**progress.describe([], "deadline"), "is_policy": is_policy}
         if self.scorer.constraints:
             info["violation"] = torch.full_like(progress.expected_return, float("nan"))
         ones = torch.ones(self.batch, dtype=torch.long)
-        return Plan(actions, last.mean, progress.var, progress.expected_return, info, last.elites, last.is_warm, ones)
+        elites, is_warm = shifted.elites, shifted.is_warm
+        return Plan(actions, shifted.mean, progress.var, progress.expected_return, info, elites, is_warm, ones)
 
     def _iterate(
         self, start: WarmStart, proposals: Tensor | None, budget: Budget
@@ -229,46 +237,48 @@ class Search:
         """
         options, num_fresh = self.options, self.options.num_samples - self.num_proposals
         progress = self._begin(start)
-        spread = self._sampling_std(progress.var)[:, None]
+        std = self._sampling_std(progress.var)[:, None]
         limit = torch.where(start.is_warm, options.num_warm_iterations, options.num_iterations)
         num_common = int(limit.min())
         known: list[Candidates] = []
         history, stopped = [], "iterations"
         for iteration in range(int(limit.max())):
-            if iteration and not budget.allows("iteration", "choose"):
+            is_first = iteration == 0
+            if not is_first and not budget.allows("iteration", "choose"):
                 stopped = "deadline"
                 break
-            fresh = self._sample(progress.mean[:, None], spread, num_fresh)
-            fresh[:, 0] = progress.mean.clamp(self.low, self.high) if iteration else start.mean
-            if iteration == 0:
+            fresh = self._sample(progress.mean[:, None], std, num_fresh)
+            fresh[:, 0] = start.mean if is_first else progress.mean.clamp(self.low, self.high)
+            if is_first:
                 self._place_elites(fresh, start)
                 fresh = fresh if proposals is None else torch.cat([fresh, proposals], dim=1)
-            if iteration <= 1:  # the proposals are scored once
+            if iteration <= 1:  # later iterations have as many candidates as the second, which has no new proposals
                 rows = self.scorer.start_rows(self.state, fresh.shape[1])
             scores = self.scorer.score(rows, fresh)
-            if iteration == 0:  # a policy may propose NaN, and a model may give NaN a finite return: not an elite
-                is_finite = torch.isfinite(fresh).flatten(2).all(dim=2)
-                scores = scores._replace(returns=scores.returns.masked_fill(~is_finite, float("nan")))
-            updated = self._refit(progress, [(fresh, scores), *known, *self._kept(progress, known)], scores.returns)
-            if iteration == 0:  # the policy's proposals and the shifted previous plan stay among the candidates
+            if is_first:
+                scores = _ignore_nan_actions(fresh, scores)
+            updated = self._refit(progress, [(fresh, scores), *known, *self._keep(progress, known)], scores.returns)
+            if is_first:  # the policy's proposals and the shifted previous plan stay candidates, with their scores
                 known = [(fresh[:, num_fresh:], scores.rest(num_fresh)), (fresh[:, :1], scores.first(1))]
-            elif iteration >= num_common:
+            elif iteration >= num_common:  # environments that have used up their iterations stay as they are
                 updated = progress.updated((limit > iteration).to(self.device), updated)
             progress = updated
-            spread = self._sampling_std(progress.var)[:, None]
-            history.append((progress.expected_return, spread.mean(dim=(1, 2, 3))))
+            std = self._sampling_std(progress.var)[:, None]
+            history.append((progress.expected_return, std.mean(dim=(1, 2, 3))))
             budget.lap("iteration")
         return progress, history, stopped
 
     def _begin(self, start: WarmStart) -> Progress:
-        nothing = torch.zeros(self.batch, dtype=torch.long, device=self.device)
+        """Returns the progress before the first refit."""
+        zeros = torch.zeros(self.batch, dtype=torch.long, device=self.device)
         unknown = torch.full((self.batch,), float("nan"), dtype=self.dtype, device=self.device)
         var = self.init_std.square().expand_as(start.mean)
-        return Progress(start.mean, var, None, unknown, nothing, nothing, nothing.bool())
+        return Progress(start.mean, var, None, unknown, zeros, zeros, zeros.bool())
 
-    def _sample(self, centre: Tensor, spread: Tensor, num: int) -> Tensor:
+    def _sample(self, mean: Tensor, std: Tensor, num: int) -> Tensor:
+        """Returns `num` sequences per environment within the bounds, (batch, num, horizon, action)."""
         noise = self.streams.noise(num, self.horizon, len(self.low), self.options.noise_beta, self.dtype)
-        samples = torch.addcmul(centre, spread, noise)
+        samples = torch.addcmul(mean, std, noise)
         return torch.minimum(torch.maximum(samples, self.low, out=samples), self.high, out=samples)
 
     def _place_elites(self, fresh: Tensor, start: WarmStart) -> None:
@@ -278,8 +288,11 @@ class Search:
             is_warm = start.is_warm.to(self.device)[:, None, None, None]
             fresh[:, 1:end] = torch.where(is_warm, start.elites[:, : end - 1], fresh[:, 1:end])
 
-    def _kept(self, progress: Progress, known: Sequence[Candidates]) -> list[Candidates]:
-        """Returns the best of the last elites, which stay candidates; `known` ones are not counted twice."""
+    def _keep(self, progress: Progress, known: Sequence[Candidates]) -> list[Candidates]:
+        """Returns the best elites of the last refit, which stay candidates.
+
+        Elites that are also among the `known` candidates get the return NaN, so that no sequence counts twice.
+        """
         needs_best = self.options.final == "best" or bool(self.scorer.constraints)
         num = max(self.options.num_kept, int(needs_best))
         if progress.elites is None or num == 0:
@@ -300,15 +313,25 @@ class Search:
         mean, var = move_towards(
             elites, progress.mean, progress.var, smoothing=options.smoothing, adapt_std=options.adapt_std
         )
-        is_found = elites.weights.sum(dim=1) > 0
+        has_elites = elites.weights.sum(dim=1) > 0
         return Progress(
             mean,
             var,
             elites,
-            torch.where(is_found, mean_return(elites), progress.expected_return),
+            torch.where(has_elites, mean_return(elites), progress.expected_return),
             progress.num_nonfinite + (~torch.isfinite(fresh_returns)).sum(dim=1),
             progress.iterations + 1,
-            progress.is_found | is_found,
+            progress.has_elites | has_elites,
+        )
+
+    def _refine(self, actions: Tensor) -> Choice:
+        return ascend(
+            self.scorer,
+            self.state,
+            actions,
+            num_steps=self.options.gradient_steps,
+            step_size=self.options.gradient_step_size,
+            bounds=(self.low, self.high),
         )
 
     def _cold_start(self) -> WarmStart:
@@ -319,8 +342,8 @@ class Search:
     def _shift(self, previous: Plan) -> WarmStart:
         (batch, _, dim), bounds = previous.mean.shape, (self.low, self.high)
         if (batch, dim) != (self.batch, len(self.low)):
-            ours = f"{self.batch} environments and actions of {len(self.low)}"
-            raise ValueError(f"the last plan is for {batch} environments and actions of {dim}, this search for {ours}")
+            sizes = f"{self.batch} environments and actions of {len(self.low)}"
+            raise ValueError(f"the last plan is for {batch} environments and actions of {dim}, this search for {sizes}")
         return shift_plan(
             previous,
             horizon=self.horizon,
@@ -342,13 +365,13 @@ def choose(
     """Returns the sequence of a finished search that is executed, its expected return and its violation.
 
     Args:
-        final: `mean`; `best`, the best candidate; or `better`, the mean or the policy's mode.
-        scorer: Gives sequences their returns.
+        final: `mean`; `best`, the best candidate; or `better`, the mean or the policy's mode sequence by return.
+        scorer: Scores sequences.
         state: Start of the plans, rows (batch,).
         progress: End of the search.
         mean: Mean of the final distribution, within the bounds, (batch, horizon, action).
-        policy_mode: The policy's mode sequence, (batch, horizon, action); None where the policy may not replace the
-            plan, and `better` is `mean`.
+        policy_mode: The policy's mode sequence, (batch, horizon, action); None if the policy may not replace the plan,
+            so that `better` is `mean`.
     """
     assert progress.elites is not None
     if progress.elites.scores.violations is not None:
@@ -366,7 +389,7 @@ def choose(
 def _choose_better(scorer: Scorer, state: State, progress: Progress, mean: Tensor, policy_mode: Tensor) -> Choice:
     """Returns the mean or the policy's mode, by predicted return; the mean where neither return is finite.
 
-    The mean of several good sequences is not one of them, and may have a lower return than the policy's mode.
+    The mean of several good sequences is another sequence, and may have a lower return than the policy's mode.
     """
     is_finite = torch.isfinite(policy_mode).flatten(1).all(1)  # a model may give an action that is NaN a finite return
     both = torch.stack([mean, torch.where(is_finite[:, None, None], policy_mode, mean)], dim=1)
@@ -380,9 +403,10 @@ def _choose_feasible(final: str, scorer: Scorer, state: State, progress: Progres
     """Returns the mean, or under constraints the best candidate where the mean violates them more."""
     assert progress.elites is not None
     best, scores = progress.elites.actions[:, 0], progress.elites.scores
-    own = scorer.score(scorer.start_rows(state, 1), mean[:, None])
-    assert own.violations is not None and scores.violations is not None
-    best_return, violation, best_violation = scores.returns[:, 0], own.violations[:, 0], scores.violations[:, 0]
+    mean_scores = scorer.score(scorer.start_rows(state, 1), mean[:, None])
+    assert mean_scores.violations is not None and scores.violations is not None
+    violation, best_violation = mean_scores.violations[:, 0], scores.violations[:, 0]
+    best_return = scores.returns[:, 0]
     is_best = torch.isfinite(best_return)
     if final != "best":  # the mean of feasible sequences may itself be infeasible
         is_safer = best_violation < violation.nan_to_num(float("inf"))
@@ -392,3 +416,12 @@ def _choose_feasible(final: str, scorer: Scorer, state: State, progress: Progres
         torch.where(is_best, best_return, progress.expected_return),
         torch.where(is_best, best_violation, violation),
     )
+
+
+def _ignore_nan_actions(candidates: Tensor, scores: Scores) -> Scores:
+    """Returns the scores with the return NaN where a candidate is not finite, so that it is never an elite.
+
+    A policy may propose NaN, and a model may give such a sequence a finite return.
+    """
+    is_finite = torch.isfinite(candidates).flatten(2).all(dim=2)
+    return scores._replace(returns=scores.returns.masked_fill(~is_finite, float("nan")))

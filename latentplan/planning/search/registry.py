@@ -1,4 +1,4 @@
-"""Planners by name, and what a controller asks of a planner.
+"""Planners by name, and the protocol of a planner.
 
 A new planner is one module with a class that satisfies `Planner`, and one line in `PLANNERS`.
 """
@@ -11,16 +11,16 @@ from collections.abc import Callable, Sequence
 from typing import Any, Protocol
 
 from latentplan.config import UserError
+from latentplan.config.search import SearchOptions
 from latentplan.planning.model import Bound, State
 from latentplan.planning.objectives import Constraint, Term
 from latentplan.planning.plan import Plan
 from latentplan.planning.search.cem import CEMPlanner, icem_planner, mppi_planner
-from latentplan.planning.search.options import SearchOptions
 from latentplan.planning.search.sampling import Generators
 
 
 class SupportsPlan(Protocol):
-    """An object that can search; see `Planner` for the attributes that a controller reads besides."""
+    """An object that searches plans, without the attributes that a `Planner` also has."""
 
     def plan(
         self,
@@ -33,12 +33,15 @@ class SupportsPlan(Protocol):
         generator: Generators = None,
         deadline_ms: float | None = None,
     ) -> Plan:
-        """Returns the best plan found from each state; see `CEMPlanner.plan`."""
+        """Returns the best plan found from each state; see `CEMPlanner.plan` for the arguments.
+
+        The `info` of the plan must hold `is_fallback`, `is_policy` and `num_nonfinite`, each (batch,).
+        """
         ...
 
 
 class Planner(SupportsPlan, Protocol):
-    """A planner, as controllers, schedulers and agents see it. A planner keeps no plan between calls."""
+    """The protocol of a planner for controllers, schedulers and agents. A planner keeps no plan between calls."""
 
     @property
     def action_dim(self) -> int:
@@ -86,20 +89,20 @@ PLANNERS: dict[str, Callable[..., Planner]] = {
     "icem": icem_planner,
     "mppi": mppi_planner,
 }
-"""A function per name that makes the planner of keyword arguments: a problem's `action_dim`, `action_low`,
-`action_high` and `discount`, and any option of `SearchOptions`."""
+"""By name, the function that makes a planner from keyword arguments: the problem (`action_dim`, `action_low`,
+`action_high`, `discount`), and any option of `SearchOptions`."""
 
 
 def make_planner(name: str, options: SearchOptions | None = None, **settings: Any) -> Planner:
     """Returns the planner that is registered under a name.
 
-    Options that have their default value leave the choice to the planner: `icem` and `mppi` then take their own values.
+    An option of `options` that has its default value is not passed on, so that `icem` and `mppi` take their own value.
 
     Args:
         name: A name in `PLANNERS`.
-        options: Options of the search, such as an agent's `PlannerConfig`; None leaves all to the planner.
-        **settings: The problem (`action_dim`, `action_low`, `action_high`, `discount`), and options that replace those
-            of `options` and of the planner, their default values included.
+        options: Options of the search, such as an agent's `PlannerConfig`; None passes none.
+        **settings: The problem (`action_dim`, `action_low`, `action_high`, `discount`), and options that replace the
+            values of `options` and of the planner; default values are passed on too.
 
     Raises:
         UserError: There is no planner of this name; the message names the nearest one.

@@ -1,4 +1,4 @@
-"""Random numbers for a search; an environment draws the same numbers whichever other environments share the call."""
+"""Random numbers for a search; the numbers of an environment do not depend on the other environments of the call."""
 
 from __future__ import annotations
 

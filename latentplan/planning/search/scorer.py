@@ -34,7 +34,7 @@ class Scorer:
         objective: Maximised.
         constraints: Each returns a violation (rows,), 0 where the constraint is satisfied.
         discounts: Powers of the discount, (horizon + 1,), in the precision of the returns.
-        use_continues: Whether the model's probability that the episode goes on discounts the later rewards.
+        use_continues: Whether the model's probability that the episode goes on discounts later rewards.
         penalty: Return subtracted per unit of violation; None ranks candidates by violation first.
     """
 
@@ -64,30 +64,30 @@ class Scorer:
         """
         if use_continues:
             require(model, "continues", "use_continues=True")
-        chosen = predicted_return(model, terminal_value) if objective is None else as_objective(objective)
-        kept = tuple(as_objective(constraint) for constraint in constraints)
-        for term in (chosen, *kept):
+        maximised = predicted_return(model, terminal_value) if objective is None else as_objective(objective)
+        violations = tuple(as_objective(constraint) for constraint in constraints)
+        for term in (maximised, *violations):
             term.check(model)
-        return cls(model, chosen, kept, discounts, use_continues, penalty)
+        return cls(model, maximised, violations, discounts, use_continues, penalty)
 
     @property
     def num_particles(self) -> int:
-        """Number of rollouts of each candidate, which the objective, a constraint or the model sets."""
-        asked = max(term.num_particles for term in (self.objective, *self.constraints))
-        return asked if asked > 1 else getattr(self.model, "num_particles", 1)
+        """Number of rollouts of each candidate, set by the objective and the constraints, or else by the model."""
+        largest = max(term.num_particles for term in (self.objective, *self.constraints))
+        return largest if largest > 1 else getattr(self.model, "num_particles", 1)
 
     def start_rows(self, state: State, num: int) -> State:
         """Returns the start of `num` candidates per environment, rows (batch sample particle), of a state (batch,)."""
         particles = self.num_particles
         if particles == 1:
             return repeat_rows(state, num)
-        several = (
+        versions = (
             self.model.particles(state, particles)  # type: ignore[attr-defined]
             if supports(self.model, "particles")
             else repeat_rows(state, particles)
         )
         pattern = "(batch particle) ... -> (batch num particle) ..."
-        return tree_map(lambda leaf: repeat(leaf, pattern, particle=particles, num=num), several)
+        return tree_map(lambda leaf: repeat(leaf, pattern, particle=particles, num=num), versions)
 
     def score(self, start: State, actions: Tensor) -> Scores:
         """Returns the scores of sequences.

@@ -1,1 +1,1 @@
-"""Planners of other libraries on the same model, each in a process of its own, with an environment of their own."""
+"""Peers: planners of other libraries on the same model, each in its own process, in a separate Python environment."""

@@ -1,4 +1,4 @@
-"""Our side of a peer (a planner of another library): its process, and requests to it."""
+"""Client of a peer (a planner of another library): starts its process and sends requests."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ SCRIPTS = Path(__file__).resolve().parents[2]
 
 
 class PeerProcess:
-    """A peer in a process of its own, which runs one search per request; `name` and `version` name the library.
+    """A peer in its own process, which runs one search per request; `name` and `version` describe the library.
 
     Args:
         name: One of `PEERS`.
@@ -62,6 +62,6 @@ class PeerProcess:
         return float(json.loads(answer)["ms"])
 
     def close(self) -> None:
-        """End the process."""
+        """Ends the process."""
         self._process.kill()
         self._process.communicate()

@@ -1,4 +1,4 @@
-"""pytorch_icem's iCEM, with the rewards of all steps computed at once."""
+"""iCEM of pytorch_icem, with the rewards of all steps computed at once."""
 
 from __future__ import annotations
 

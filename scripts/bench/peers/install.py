@@ -1,4 +1,4 @@
-"""Python environment of the peers, apart from the project's: the same torch, and packages of the peers alone."""
+"""The Python environment of the peers: the project's packages, and packages that only the peers need."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ class Peer(NamedTuple):
     """A library from PyPI.
 
     Attributes:
-        module: The adapter that serves it.
-        package: Its name on PyPI.
-        requirements: Further packages that pip installs, without their dependencies: those come from the project's own
-            environment, in the versions found there.
+        module: The adapter module of the library.
+        package: Name of the library on PyPI.
+        requirements: Further packages that pip installs without their dependencies, which come from the project's
+            environment.
     """
 
     module: str
@@ -52,14 +52,14 @@ PEERS = {
 
 
 def install(name: str, folder: Path) -> Path:
-    """Path of the Python of the peers' environment, with one peer installed; the environment is made on first use.
+    """Installs a peer, and returns the path of the Python of the peers' environment, which is made on first use.
 
     Args:
         name: One of `PEERS`.
         folder: Folder of the environment.
 
     Raises:
-        PeerError: It could not be installed.
+        PeerError: The peer could not be installed.
     """
     peer, python = PEERS[name], folder / "bin" / "python"
     requirements = (peer.package, *peer.requirements)
@@ -83,14 +83,14 @@ def installed_version(name: str, folder: Path) -> str:
 
 
 def last_line(text: str) -> str:
-    """The last line of a program's output that speaks of an error, or else its last line."""
+    """The last line of a program's output with the word error, else the last line."""
     lines = [line.strip() for line in text.splitlines() if line.strip()]
     errors = [line for line in lines if "error" in line.lower()]
     return (errors or lines or [""])[-1]
 
 
 def _show_own_packages(folder: Path) -> None:
-    """Lets another environment import what this one has, after its own packages."""
+    """Lets the environment in a folder import the project's packages, after its own packages."""
     own = {sysconfig.get_path(kind) for kind in ("purelib", "platlib")}
     (_site_packages(folder) / "own-packages.pth").write_text("\n".join(sorted(own)) + "\n")
 

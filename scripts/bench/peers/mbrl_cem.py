@@ -1,4 +1,4 @@
-"""mbrl-lib's CEMOptimizer, with an objective that steps the model."""
+"""CEMOptimizer of mbrl-lib, with an objective that steps the model."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""pytorch_mppi's MPPI: one command per iteration, with the nominal trajectory kept between commands."""
+"""MPPI of pytorch_mppi: one command per iteration, with the nominal trajectory kept between commands."""
 
 from __future__ import annotations
 

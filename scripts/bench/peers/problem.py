@@ -67,7 +67,7 @@ class FullPrecisionModel(WorldModel):
     """The world model with its trunk in float32."""
 
     def trunk_precision(self, *, cache: bool = True) -> AbstractContextManager[None]:
-        """No autocast."""
+        """A context without autocast."""
         return torch.autocast(self.device.type, enabled=False)
 
 
@@ -82,9 +82,9 @@ def build_model(problem: Problem, dtype: str) -> WorldModel:
 
 
 def start_state(problem: Problem, batch: int = 1) -> State:
-    """Where every search begins, (batch, ...)."""
+    """The state from which every search starts, (batch, ...)."""
     config, generator = problem.model_config, torch.Generator().manual_seed(problem.seed)
-    deter = torch.rand(batch, config.deter_dim, generator=generator) * 2.0 - 1.0  # what a GRU can hold
+    deter = torch.rand(batch, config.deter_dim, generator=generator) * 2.0 - 1.0  # the range of a GRU's state
     stoch = torch.randn(batch, config.latent_dim, generator=generator)
     return State(deter.to(problem.device), stoch.to(problem.device))
 
@@ -100,12 +100,12 @@ def summed_rewards(model: WorldModel, start: State, actions: Tensor) -> Tensor:
 
 
 def as_state(model: WorldModel, features: Tensor) -> State:
-    """The state inside one vector per row, features (rows, deter + latent)."""
+    """The state in features (rows, deter + latent)."""
     return State(*features.split([model.config.deter_dim, model.config.latent_dim], -1))
 
 
 def next_features(model: WorldModel, features: Tensor, action: Tensor) -> Tensor:
-    """One step for a planner that holds states as vectors: features (rows, deter + latent) to features."""
+    """The features (rows, deter + latent) after an action, for planners with vectors as states."""
     with model.trunk_precision():
         deter = model.dynamics.advance(as_state(model, features), action)
         return torch.cat([deter, model.dynamics.prior(deter).mean], -1)

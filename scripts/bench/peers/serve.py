@@ -1,4 +1,4 @@
-"""The peer's side: a process that runs one search for each line of input and answers with its time."""
+"""Server of a peer: a process that runs one search for each line of input and answers with its duration."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from bench.machine import now
+from bench.machine import read_clock
 from bench.peers.problem import Problem, build_model
 from latentplan.models import WorldModel
 
@@ -44,9 +44,9 @@ def serve(make_search: MakeSearch) -> None:
 @torch.no_grad()
 def _timed(search: Search, problem: Problem) -> dict[str, Any]:
     device = torch.device(problem.device)
-    started = now(device)
+    started = read_clock(device)
     action = search()
-    elapsed = now(device) - started
+    elapsed = read_clock(device) - started
     if action.shape != (problem.action_dim,) or not bool(torch.isfinite(action).all()):
         raise ValueError(f"a search must return an action of shape ({problem.action_dim},), got {action}")
     return {"ms": 1000.0 * elapsed}

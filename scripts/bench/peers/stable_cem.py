@@ -1,4 +1,4 @@
-"""stable-worldmodel's CEMSolver, whose model returns the cost of whole action sequences."""
+"""CEMSolver of stable-worldmodel, with a model that returns the cost of action sequences."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from latentplan.models import State, WorldModel
 
 
 class RewardCost:
-    """The model with the interface of that library: `get_cost` of candidates (1, sample, horizon, action)."""
+    """The model with the interface of stable-worldmodel: `get_cost` of candidates (1, sample, horizon, action)."""
 
     def __init__(self, model: WorldModel, start: State) -> None:
         self.model, self.start = model, start
@@ -44,10 +44,10 @@ def make_search(problem: Problem, model: WorldModel) -> Search:
     )
     space = gymnasium.spaces.Box(-1.0, 1.0, (1, problem.action_dim))
     solver.configure(action_space=space, n_envs=1, config=SimpleNamespace(horizon=problem.horizon, action_block=1))
-    nothing = {"start": torch.zeros(1, 1)}
+    info = {"start": torch.zeros(1, 1)}
 
     def search() -> Tensor:
-        plan: dict[str, Any] = solver.solve(nothing)
+        plan: dict[str, Any] = solver.solve(info)
         action: Tensor = plan["actions"][0, 0].clamp(-1.0, 1.0)
         return action
 

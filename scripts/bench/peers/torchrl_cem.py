@@ -1,4 +1,4 @@
-"""TorchRL's CEMPlanner, with the model as a model-based environment."""
+"""CEMPlanner of TorchRL, with the model as a model-based environment."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from latentplan.models import State, WorldModel
 
 
 class RssmEnv(ModelBasedEnvBase):  # type: ignore[misc]
-    """The world model as an environment whose observation is its state."""
+    """The world model as an environment with the model's state as observation."""
 
     def __init__(self, model: WorldModel, problem: Problem) -> None:
         def step(deter: Tensor, stoch: Tensor, action: Tensor) -> tuple[Tensor, Tensor, Tensor]:

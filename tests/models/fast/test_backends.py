@@ -1,4 +1,4 @@
-"""Every fast path returns what the reference returns."""
+"""Every fast path returns the results of the reference."""
 
 import pytest
 import torch
@@ -76,9 +76,10 @@ def one_frame(rows):
     frames = torch.randint(0, 256, (rows, 64, 64, 3), dtype=torch.uint8, generator=torch.Generator().manual_seed(4))
 
     def decide(model):
-        deter = model.backend.advance(model, start(rows), draw(rows, ACTION, seed=3).clamp(-1.0, 1.0))
-        state = model.backend.see(model, deter, frames)
-        return deter, state, model.backend.act(model, state)
+        advance, see, act = model.backend.frame_functions(model)
+        deter = advance(start(rows), draw(rows, ACTION, seed=3).clamp(-1.0, 1.0))
+        state = see(deter, frames)
+        return deter, state, act(state)
 
     return decide
 

@@ -6,8 +6,7 @@ from torch import nn
 
 from latentplan.config import ModelConfig
 from latentplan.models.dynamics import State
-from latentplan.models.fast import CpuBackend
-from latentplan.models.fast import compiled as fused
+from latentplan.models.fast import CpuBackend, compiled
 from latentplan.models.fast.rollout import imagine, propose
 from latentplan.models.world_model import WorldModel
 
@@ -124,7 +123,9 @@ def test_pack_returns_none_for_other_sizes_and_precisions(weights):
     odd = ModelConfig(deter_dim=64, hidden_dim=40, latent_dim=32, num_bins=31)
     assert weights_of(build(odd)).packed is None
     assert (
-        fused.pack(weights._replace(gates=weights.gates.float()), (weights.head, weights.logits, weights.logits_shift))
+        compiled.pack(
+            weights._replace(gates=weights.gates.float()), (weights.head, weights.logits, weights.logits_shift)
+        )
         is None
     )
 

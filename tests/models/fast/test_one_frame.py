@@ -8,6 +8,7 @@ from latentplan.agents.actor import ActorAgent
 from latentplan.config import Config, ModelConfig
 from latentplan.models import State, WorldModel
 from latentplan.models.fast import CpuBackend
+from latentplan.models.fast.backends import ConvertedWeights
 
 
 def make_model(channels=(8, 12, 16), seed=0):
@@ -28,15 +29,15 @@ def frames_of(rows, seed=0):
 @pytest.mark.parametrize("rows", [1, 5])
 def test_one_frame_path_equals_the_model_for_every_encoder(channels, rows):
     model = make_model(channels)
-    backend = CpuBackend()
+    advance, see, act = CpuBackend().frame_functions(model)
     state, action = State(torch.randn(rows, 24), torch.randn(rows, 32)), torch.rand(rows, 3) * 2 - 1
     frames = frames_of(rows)
     with torch.no_grad():
         expected = model.infer(state, action, frames)
-        believed = backend.see(model, backend.advance(model, state, action), frames)
+        believed = see(advance(state, action), frames)
         assert torch.allclose(believed.deter, expected.deter, atol=1e-5)
         assert torch.allclose(believed.stoch, expected.stoch, atol=1e-4)
-        for ours, models in zip(backend.act(model, expected), model.actor(expected.features), strict=True):
+        for ours, models in zip(act(expected), model.actor(expected.features), strict=True):
             assert torch.allclose(ours, models, atol=1e-5)
 
 
@@ -68,5 +69,15 @@ def test_agent_uses_weights_that_changed_between_two_frames(change):
 
 def test_backend_changes_no_weight():
     model, same = make_model(), make_model()
-    CpuBackend().act(model, State(torch.zeros(1, 24), torch.zeros(1, 32)))
+    CpuBackend().frame_functions(model).act(State(torch.zeros(1, 24), torch.zeros(1, 32)))
     assert all(torch.equal(ours, theirs) for ours, theirs in zip(model.parameters(), same.parameters(), strict=True))
+
+
+def test_agent_checks_the_weights_once_per_decision(monkeypatch):
+    model, checks, check = make_model(), [], ConvertedWeights.of
+    model.backend = CpuBackend()
+    agent, frames = ActorAgent(model, Config()), frames_of(2).numpy()
+    agent.act(frames)
+    monkeypatch.setattr(ConvertedWeights, "of", lambda *arguments: checks.append(1) or check(*arguments))
+    agent.act(frames)
+    assert len(checks) == 1

@@ -1,4 +1,4 @@
-"""Functions between products are compiled only where that works."""
+"""Elementwise functions are compiled only where torch can compile."""
 
 import pytest
 import torch
@@ -15,6 +15,6 @@ def test_can_compile_warns_once_when_torch_cannot_compile(monkeypatch):
     try:
         with pytest.warns(RuntimeWarning, match="cannot compile here.*: no C compiler$"):
             assert pointwise.can_compile("cpu") is False
-        assert pointwise.can_compile("cpu") is False  # told once
+        assert pointwise.can_compile("cpu") is False  # without another warning
     finally:
         pointwise.can_compile.cache_clear()

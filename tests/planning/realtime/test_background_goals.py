@@ -1,7 +1,6 @@
 """Goals of a background planner: they are pickled, can change between requests, and are refused if not picklable."""
 
 import pickle
-import time
 
 import pytest
 import torch
@@ -15,17 +14,10 @@ from latentplan.planning.objectives import (
     risk,
     smoothness_penalty,
 )
+from tests.planning.realtime.integrator import dynamics, reward, wait_for_plan
 
 STATE = torch.tensor([[1.0]])
 CEM = CEMPlanner(action_dim=1, horizon=4, num_samples=16, num_elites=4, num_iterations=2)
-
-
-def dynamics(state, action):
-    return state + action
-
-
-def reward(state, action):
-    return -(state + action).square().sum(dim=1)
 
 
 def to_the_left(state):
@@ -46,20 +38,11 @@ class Unreadable:
 MODEL = FunctionModel(dynamics, reward)
 
 
-def wait_for_plan(background, seconds=60.0):
-    deadline = time.monotonic() + seconds
-    while time.monotonic() < deadline:
-        found = background.poll()
-        if found is not None:
-            return found
-        time.sleep(0.002)
-    raise AssertionError("no plan came")
-
-
 @pytest.fixture(scope="module")
 def process():
-    """A background planner in a process, shared, because a process first imports torch for seconds."""
+    """A background planner in a process that is ready; shared, because a process imports torch first."""
     with BackgroundPlanner(CEM, MODEL) as background:
+        assert background.wait_until_ready(60.0)
         yield background
 
 

@@ -5,14 +5,11 @@ import torch
 
 from latentplan.planning import CEMPlanner, FunctionModel, PlanScheduler
 from latentplan.planning.realtime.scheduler import NominalTrajectory
+from tests.planning.realtime.integrator import dynamics, reward
 
 GAIN = -0.5
 PLAN = torch.tensor([[[0.4], [-0.2], [0.1]], [[0.0], [0.3], [0.9]]])
 START = torch.tensor([[1.0], [-2.0]])
-
-
-def dynamics(state, action):
-    return state + action
 
 
 def no_reward(state, action):
@@ -86,10 +83,7 @@ def drive(model, push, ticks=40):
 
 
 def test_policy_correction_keeps_a_pushed_body_nearer_to_its_goal():
-    """The plan for a tick was made before the last push, and the policy acts on the state after it."""
-
-    def reward(state, action):
-        return -(state + action).square().sum(dim=1)
+    """The plan for a tick is made before the last push, and the policy sees the state after the push."""
 
     def towards_zero(state, generator):
         return -state

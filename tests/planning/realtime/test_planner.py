@@ -12,11 +12,12 @@ import pytest
 import torch
 
 from latentplan.planning import BackgroundPlanner, CEMPlanner, FunctionModel, PlanScheduler
+from tests.planning.realtime.integrator import dynamics, policy, reward, wait_for_plan
 
 STATE = torch.tensor([[1.0]])
 CEM = CEMPlanner(action_dim=1, horizon=4, num_samples=16, num_elites=4, num_iterations=2)
 STARTING_SECONDS = 60.0  # a process imports torch first
-# A loop that waits for a hanging search takes minutes; delays of a busy machine are far below this limit.
+# A loop that waits for a hanging search takes minutes. Delays of a busy machine are far below this limit.
 DECISION_SECONDS = 1.0
 
 
@@ -55,18 +56,6 @@ class Scripted:
         return CEM.plan(model, state, previous, generator=generator)
 
 
-def dynamics(state, action):
-    return state + action
-
-
-def reward(state, action):
-    return -(state + action).square().sum(dim=1)
-
-
-def policy(state, generator):
-    return torch.full((len(state), 1), 0.05)
-
-
 MODEL = FunctionModel(dynamics, reward, policy=policy)
 
 
@@ -96,16 +85,6 @@ def start(planner, worker="process"):
     background = BackgroundPlanner(planner, MODEL, worker=worker)
     assert background.wait_until_ready(STARTING_SECONDS)
     return background
-
-
-def wait_for_plan(background, seconds=20.0):
-    deadline = time.monotonic() + seconds
-    while time.monotonic() < deadline:
-        found = background.poll()
-        if found is not None:
-            return found
-        time.sleep(0.002)
-    raise AssertionError("no plan came")
 
 
 def drive(background, num, tick_seconds, check=lambda decision: None):
@@ -221,13 +200,13 @@ def test_close_in_a_fork_leaves_the_worker_running(process):
     assert wait_for_plan(process)[0] == 0
 
 
-class Leaves:
+class Exits:
     def plan(self, *_, **__):
         sys.exit(3)
 
 
 def test_poll_raises_when_a_search_exits_its_thread():
-    with start(Leaves(), "thread") as background:
+    with start(Exits(), "thread") as background:
         for _ in range(2):
             background.request(STATE, 0)
             with pytest.raises(RuntimeError, match="SystemExit: 3"):
@@ -258,7 +237,7 @@ def test_background_planner_spawns_its_process(process):
     assert type(process.process).__name__ == "SpawnProcess" and process.process.daemon
 
 
-def test_background_planner_refuses_what_cannot_be_pickled():
+def test_background_planner_refuses_a_model_that_cannot_be_pickled_and_an_unknown_worker():
     model = FunctionModel(lambda state, action: state, reward)
     with pytest.raises(TypeError, match="worker='thread'"):
         BackgroundPlanner(CEM, model)

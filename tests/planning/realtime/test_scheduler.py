@@ -6,6 +6,7 @@ import pytest
 import torch
 
 from latentplan.planning import CEMPlanner, FunctionModel, PlanBuffer, PlanScheduler, learned_return
+from tests.planning.realtime.integrator import dynamics, policy, reward
 
 HORIZON = 4
 
@@ -102,18 +103,6 @@ class VirtualExecutor:
         if isinstance(plan, Exception):
             raise plan
         return tick, plan
-
-
-def dynamics(state, action):
-    return state + action
-
-
-def reward(state, action):
-    return -(state + action).square().sum(dim=1)
-
-
-def policy(state, generator):
-    return torch.full((len(state), 1), 0.05)
 
 
 @pytest.fixture

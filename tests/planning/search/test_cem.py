@@ -1,11 +1,11 @@
-"""Plans stay in the bounds, ignore numbers that are not finite, and refuse models and options that do not fit."""
+"""A search keeps the bounds, ignores numbers that are not finite, and refuses models and options that do not fit."""
 
 import dataclasses
 
 import pytest
 import torch
 
-from latentplan.planning import FunctionModel, ModelPredictiveController
+from latentplan.planning import CEMPlanner, FunctionModel, ModelPredictiveController
 
 RICH = {"num_policy_samples": 6, "keep_elite_fraction": 0.3, "noise_beta": 1.0, "tail": "policy"}
 
@@ -69,7 +69,7 @@ def test_init_std_is_a_quarter_of_the_range_by_default(make_planner, seeded):
 
 
 def test_min_std_is_at_most_a_derived_init_std(make_planner, seeded):
-    """Without that cap a floor of 0.05 would throw every sample onto the bounds of a narrow range."""
+    """With a floor of 0.05, every sample in a range of 0.02 would lie on the bounds."""
     model = FunctionModel(lambda state, action: state, lambda state, action: action.sum(dim=1))
     for init_std, expected in ((None, 0.005), (0.005, 0.05)):
         planner = make_planner(action_low=-0.01, action_high=0.01, init_std=init_std, min_std=0.05, smoothing=1e-9)
@@ -100,7 +100,7 @@ def test_nonfinite_candidates_are_counted_and_never_elites(states, make_planner,
 
 
 @pytest.mark.parametrize("options", [{}, {"warm_start": False}, {"num_policy_samples": 4}])
-def test_last_plans_tail_is_executed_when_no_return_is_finite(point, states, make_planner, seeded, options):
+def test_tail_of_the_last_plan_is_executed_when_no_return_is_finite(point, states, make_planner, seeded, options):
     planner = make_planner(action_low=-0.4, **options)
     last = planner.plan(point, states, generator=seeded())
     broken = FunctionModel(
@@ -232,8 +232,27 @@ def test_plan_is_float64_when_the_state_is_float64(point, states, make_planner):
     assert plan.mean.dtype == plan.expected_return.dtype == torch.float64
 
 
+def test_search_uses_fast_step_except_for_gradients(seeded):
+    class Model:
+        def __init__(self):
+            self.calls = {"step": 0, "fast_step": 0}
+
+        def step(self, state, action, name="step"):
+            self.calls[name] += 1
+            return state + action, -(state + action).square().sum(dim=1)
+
+        def fast_step(self, state, action):
+            return self.step(state, action, "fast_step")
+
+    model, plans = Model(), []
+    for steps in (0, 1):
+        planner = CEMPlanner(action_dim=2, horizon=3, num_samples=16, num_elites=4, gradient_steps=steps)
+        plans.append(planner.plan(model, torch.ones(1, 2), generator=seeded(0)))
+        assert (model.calls["step"] > 0) == (steps > 0) and model.calls["fast_step"] > 0
+    assert not torch.equal(plans[0].actions, plans[1].actions)
+
+
 def test_controller_brings_a_point_mass_to_rest(point, make_planner, seeded):
-    """Controlled for 40 steps, the mass comes to rest at the origin."""
     planner = make_planner(horizon=10, num_samples=256, num_elites=24, num_iterations=4, warm_start_iterations=3)
     controller = ModelPredictiveController(planner, point, generator=seeded())
     state = torch.tensor([[1.5, -1.0, 0.0, 0.5], [-1.0, 1.0, 0.5, 0.0]])

@@ -10,12 +10,12 @@ from latentplan.planning import FunctionModel, learned_return
 NAN = float("nan")
 
 
-def needle(state, action):
-    """The reward is small near the number of the state, and high at exactly 0.625."""
+def spiked_reward(state, action):
+    """A low maximum where the action equals the state, and a high reward at exactly 0.625."""
     return 1 - (action - state[:, :1]).square().sum(dim=1) + 10 * (action - 0.625).abs().amax(dim=1).lt(1e-6).float()
 
 
-def make_model(policy, reward=needle):
+def make_model(policy, reward=spiked_reward):
     return FunctionModel(lambda state, action: state, reward, policy=policy)
 
 
@@ -25,15 +25,15 @@ def constant(number):
 
 def test_final_better_executes_mean_or_policy_mode_by_return(make_planner, seeded):
     states = torch.tensor([[0.2], [-0.4], [0.3]])
-    knows = torch.tensor([[0.2], [0.3]])  # the first and the last policy know where the needle is
-    model = make_model(lambda state, generator: torch.where(torch.isin(state, knows), 0.625, 0.0).expand(len(state), 2))
+    good = torch.tensor([[0.2], [0.3]])  # states in which the policy takes the action of the high reward
+    model = make_model(lambda state, generator: torch.where(torch.isin(state, good), 0.625, 0.0).expand(len(state), 2))
     plain, planner = (make_planner(num_policy_samples=1, final=final) for final in ("mean", "better"))
     mean, plan = (each.plan(model, states, generator=seeded()) for each in (plain, planner))
     torch.testing.assert_close(plan.mean, mean.mean)  # the search itself is the same
     torch.testing.assert_close(plan.actions[0::2], torch.full_like(plan.actions[0::2], 0.625))
     torch.testing.assert_close(plan.actions[1], plan.mean[1])
-    earned = sum(planner.discount**step * needle(states, plan.actions[:, step]) for step in range(planner.horizon))
-    torch.testing.assert_close(plan.expected_return, earned)
+    rewards = [spiked_reward(states, action) for action in plan.actions.unbind(dim=1)]  # the discount is 1
+    torch.testing.assert_close(plan.expected_return, sum(rewards))
 
 
 @pytest.mark.parametrize("policy", [NAN, 5.0])

@@ -170,7 +170,7 @@ def test_pace_separates_wrappers_of_different_models(make, model, state, clock):
     assert planner.plan(Wrapper(model), state, deadline_ms=35).info["iterations"].sum() > 0
 
 
-def test_pace_refuses_for_ever_what_never_fitted(warm, model, state):
+def test_pace_refuses_every_iteration_when_none_ever_fitted(warm, model, state):
     planner, _ = warm
     before = model.num_rollouts
     for _ in range(100):

@@ -6,8 +6,15 @@ import pytest
 import torch
 
 from latentplan.config import PlannerConfig
-from latentplan.planning import CEMPlanner, FunctionModel, icem_planner, learned_return, mppi_planner, refit
-from latentplan.planning.search.options import SearchOptions
+from latentplan.planning import (
+    CEMPlanner,
+    FunctionModel,
+    SearchOptions,
+    icem_planner,
+    learned_return,
+    mppi_planner,
+    refit,
+)
 from latentplan.planning.search.sampling import Streams
 
 
@@ -161,10 +168,10 @@ def test_coloured_noise_has_unit_variance_and_correlated_steps(beta):
     streams = Streams(torch.Generator().manual_seed(0), 1, torch.device("cpu"))
     noise = streams.noise(20_000, 12, 1, beta, torch.float64)[0, :, :, 0]
     torch.testing.assert_close(noise.var(dim=0), torch.ones(12, dtype=torch.float64), atol=0.05, rtol=0)
-    likeness = (noise[:, 1:] * noise[:, :-1]).mean().item()
-    ends = (noise[:, 0] * noise[:, -1]).mean().item()
-    assert likeness == pytest.approx({0.0: 0.0, 1.0: 0.42, 3.0: 0.9}[beta], abs=0.15)
-    assert ends < likeness + 0.02  # the end of a sequence is not tied to its start
+    neighbours = (noise[:, 1:] * noise[:, :-1]).mean().item()
+    opposite_ends = (noise[:, 0] * noise[:, -1]).mean().item()
+    assert neighbours == pytest.approx({0.0: 0.0, 1.0: 0.42, 3.0: 0.9}[beta], abs=0.15)
+    assert opposite_ends < neighbours + 0.02  # the end of a sequence is not tied to its start
 
 
 def test_mppi_equals_its_formula(point, states, seeded):
@@ -213,8 +220,8 @@ def test_icem_beats_plain_cem_on_a_sluggish_system(seeded):
     assert better >= 4
 
 
-def test_gradient_steps_improve_the_plan_and_none_gets_worse(point, states, make_planner, seeded):
-    def worth(plan):
+def test_gradient_steps_raise_returns_and_lower_none(point, states, make_planner, seeded):
+    def true_return(plan):
         state, total = states, 0.0
         for action in plan.actions.unbind(1):
             total = total + point.reward(state, action)
@@ -222,8 +229,9 @@ def test_gradient_steps_improve_the_plan_and_none_gets_worse(point, states, make
         return total + point.value(state)
 
     plain, refined = (make_planner(gradient_steps=n).plan(point, states, generator=seeded()) for n in (0, 10))
-    assert (worth(refined) >= worth(plain) - 1e-5).all() and (worth(refined) > worth(plain) + 0.01).any()
-    torch.testing.assert_close(refined.expected_return, worth(refined))
+    gain = true_return(refined) - true_return(plain)
+    assert (gain >= -1e-5).all() and (gain > 0.01).any()
+    torch.testing.assert_close(refined.expected_return, true_return(refined))
     tiny = make_planner(gradient_steps=10, gradient_step_size=1e-4).plan(point, states, generator=seeded())
     assert (tiny.actions - plain.actions).abs().max() < 2e-3 < (refined.actions - plain.actions).abs().max()
 
@@ -236,9 +244,7 @@ def test_gradient_steps_that_overshoot_are_halved(make_planner, seeded):
     torch.testing.assert_close(plan.action, torch.full((1, 2), 0.37), atol=1e-3, rtol=0)
 
 
-def test_gradient_steps_work_under_inference_mode_and_refuse_what_cannot_be_differentiated(
-    point, states, make_planner, seeded
-):
+def test_gradient_steps_work_in_inference_mode_and_refuse_models_without_gradients(point, states, make_planner, seeded):
     planner = make_planner(gradient_steps=2)
     with torch.inference_mode():
         inside = planner.plan(point, states + 0.0, generator=seeded())
@@ -249,7 +255,6 @@ def test_gradient_steps_work_under_inference_mode_and_refuse_what_cannot_be_diff
 
 
 def test_planner_iteration_equals_refit_of_its_candidates(seeded):
-    """One iteration of the planner is `refit` of the candidates it drew."""
     seen = []
 
     def reward(state, action):

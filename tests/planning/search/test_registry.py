@@ -1,4 +1,4 @@
-"""Planners by name: presets, unknown names, and a planner of one's own in a controller and in an agent."""
+"""Planners by name: presets, unknown names, and a newly registered planner in a controller and in an agent."""
 
 from dataclasses import dataclass
 

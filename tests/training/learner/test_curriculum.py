@@ -7,7 +7,7 @@ import torch
 from latentplan.config import Config, EnvConfig, LearningConfig, UserError
 from latentplan.config.quantities import scales as quantity_scales
 from latentplan.envs import make_env
-from latentplan.envs.reward import ObjectiveReward
+from latentplan.envs.true_quantities import ObjectiveReward
 from latentplan.training.learner.curriculum import Curriculum, summed_reward
 from latentplan.training.state import RunState
 
