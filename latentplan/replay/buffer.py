@@ -105,7 +105,7 @@ class Replay:
         self.lane_size = -(-capacity // num_lanes)
         self.num_lanes, self.device = num_lanes, device
         total = self.lane_size * num_lanes
-        self.num_bytes = replay_bytes(total, action_dim, deter_dim, num_labels)
+        self.num_bytes = count_replay_bytes(total, action_dim, deter_dim, num_labels)
         check_memory(self.num_bytes, device)
         self.frames = torch.zeros(total, *FRAME_SHAPE, dtype=torch.uint8, device=device)
         self.deter = torch.zeros(total, deter_dim, dtype=torch.float16, device=device)
@@ -304,6 +304,6 @@ def read_saved(path: Path, device: torch.device | str = "cpu", keys: Sequence[st
         raise UserError(f"{path} is damaged: {str(error).splitlines()[0]}") from None
 
 
-def replay_bytes(num_rows: int, action_dim: int, deter_dim: int, num_labels: int = 0) -> int:
+def count_replay_bytes(num_rows: int, action_dim: int, deter_dim: int, num_labels: int = 0) -> int:
     """Memory that a replay of `num_rows` rows takes, in bytes."""
     return num_rows * (FRAME_BYTES + 2 * deter_dim + 4 * (action_dim + num_labels) + 4 + 4 + 8 + 1)

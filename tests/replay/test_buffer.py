@@ -8,7 +8,7 @@ import torch
 
 from latentplan.config import UserError
 from latentplan.replay import memory
-from latentplan.replay.buffer import Replay, replay_bytes
+from latentplan.replay.buffer import Replay, count_replay_bytes
 from tests.replay.numbered_rows import CPU, NumberedRows, frame_values, make_filled_replay, make_replay, sample
 
 
@@ -226,13 +226,13 @@ def test_draw_takes_an_episode_of_exactly_the_sequence_length():
 
 
 def test_replay_refuses_more_than_nine_tenths_of_the_free_memory(monkeypatch):
-    monkeypatch.setattr(memory, "free_memory", lambda: replay_bytes(100, 1, 2, 2))
+    monkeypatch.setattr(memory, "free_memory", lambda: count_replay_bytes(100, 1, 2, 2))
     make_replay(capacity=90)
     with pytest.raises(UserError, match=r"lower --replay\.capacity"):
         make_replay(capacity=91)
 
 
-def test_replay_bytes_equals_the_size_of_the_arrays():
+def test_count_replay_bytes_equals_the_size_of_the_arrays():
     replay = make_replay(capacity=10, lanes=3)
     arrays = [replay.frames, replay.deter, replay.actions, replay.rewards, replay.continues, replay.labels]
     held = sum(array.numel() * array.element_size() for array in arrays) + replay.episode.nbytes + replay.is_end.nbytes

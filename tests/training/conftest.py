@@ -1,4 +1,4 @@
-"""A task that a run learns within seconds (keep a dot in the middle of a picture), and runs that tests share."""
+"""Fixtures: a task that a run learns within seconds (keep a dot in the middle of a picture), and shared runs."""
 
 import os
 import shutil
@@ -117,7 +117,7 @@ def batch():
 
 @pytest.fixture
 def model(tiny):
-    """A tiny world model with random weights also in the last layers of its heads."""
+    """A tiny world model whose heads have random weights in their last layers too."""
     torch.manual_seed(0)
     model = WorldModel(tiny("").model, action_dim=1)
     with torch.no_grad():
@@ -129,7 +129,7 @@ def model(tiny):
 
 @pytest.fixture
 def learner(model, tiny):
-    """A learner of that model."""
+    """A learner of the fixture `model`."""
     replay = Replay(24, 1, 16, 1, torch.device("cpu"))
     return Learner(model, tiny("").learning, 0.9, replay, seed=0)
 

@@ -113,7 +113,7 @@ def test_resume_refuses_an_empty_folder(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("damage", "said"),
+    ("damage", "message"),
     [
         ("resume/state.pt", "state.pt is damaged"),
         ("resume/replay/rows.pt", "rows.pt is damaged"),
@@ -123,7 +123,7 @@ def test_resume_refuses_an_empty_folder(tmp_path):
         ("empty", "does not say what the task is"),
     ],
 )
-def test_resume_names_damaged_files_in_one_line(damage, said, finished, dot, tmp_path):
+def test_resume_names_damaged_files_in_one_line(damage, message, finished, dot, tmp_path):
     folder = shutil.copytree(finished.run_dir, tmp_path / "run")
     if damage == "latent_dim":
         text = (folder / "config.yaml").read_text()
@@ -134,7 +134,7 @@ def test_resume_names_damaged_files_in_one_line(damage, said, finished, dot, tmp
         torch.save({"run": {}}, folder / damage.split()[1])
     else:
         (folder / damage).write_bytes((folder / damage).read_bytes()[:-200])
-    with pytest.raises(UserError, match=said) as caught:
+    with pytest.raises(UserError, match=message) as caught:
         resume(folder, make_env=dot)
     assert "\n" not in str(caught.value)
 

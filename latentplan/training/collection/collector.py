@@ -93,7 +93,7 @@ class Collector:
         self._eval_env = build(config.env, 0)
         action_dim = int(np.prod(self.envs.single_action_space.shape or ()))
         self._decisions: int | None = getattr(self._eval_env.unwrapped, "decisions_per_episode", None)
-        self.discount = discount = config.learning.discount or _default_discount(self._decisions)
+        self.discount = discount = config.learning.discount or _choose_discount(self._decisions)
         self.labels: dict[str, float] = getattr(self._eval_env.unwrapped, "labels", {})
         self.model = accelerate(WorldModel(config.model, action_dim, self.labels).to(device))
         noise, correlation = config.collection.noise_std, config.collection.noise_correlation
@@ -234,7 +234,7 @@ class Collector:
             log.finish(int(lane), last_frame, last_labels, float(self._returns[lane]))
 
 
-def _default_discount(decisions: int | None) -> float:
+def _choose_discount(decisions: int | None) -> float:
     """Discount whose horizon is a fifth of an episode: 0.96 at 125 decisions, 0.99 at 500."""
     return 1.0 - 5.0 / min(max(decisions or 500, 50), 1000)
 

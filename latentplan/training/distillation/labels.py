@@ -41,13 +41,13 @@ def plan_actions(
     for rows in zip(*(part.split(rows_per_call) for part in states), strict=True):
         with model.trunk_precision():
             plan = planner.plan(model, State(*rows), generator=generator)
-        parts.append(first_actions(plan, planner.min_std))
+        parts.append(read_first_actions(plan, planner.min_std))
         report(sum(len(mean) for mean, _ in parts))
     means, stds = zip(*parts, strict=True)
     return Gaussian(torch.cat(means), torch.cat(stds))
 
 
-def first_actions(plan: Plan, min_std: float) -> Gaussian:
+def read_first_actions(plan: Plan, min_std: float) -> Gaussian:
     """Mean and std of a plan's first actions, (batch, action) each; the std is at least `min_std`.
 
     Raises:

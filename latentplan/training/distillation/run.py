@@ -36,7 +36,7 @@ from latentplan.models import Gaussian, State
 from latentplan.replay.buffer import read_saved
 from latentplan.training.collection.collector import EnvFactory
 from latentplan.training.console import StatusLine
-from latentplan.training.distillation.labels import Demonstrations, first_actions, plan_actions
+from latentplan.training.distillation.labels import Demonstrations, plan_actions, read_first_actions
 from latentplan.training.distillation.student import Student
 from latentplan.training.folder import DISTILLATION_FILE, lock_folder, refuse_used
 from latentplan.training.run import Result
@@ -172,7 +172,7 @@ class Comparison:
             "planner after": self.planner_after,
         }
         lines = [f"on the same {len(self.before)} test starts for all, which took no part in the selection:"]
-        lines += [f"{name:<16}{describe_mean(returns)}" for name, returns in played.items() if returns is not None]
+        lines += [f"{name:<16}{format_mean(returns)}" for name, returns in played.items() if returns is not None]
         if self.after is None or self.planner_after is None:
             return [*lines, "no round improved on the actor before: the actor before is kept, unchanged"]
         gains = _differences(self.after, self.before)
@@ -181,7 +181,7 @@ class Comparison:
             "planner, after - before": _differences(self.planner_after, self.planner),
             "after, actor - planner": _differences(self.after, self.planner_after),
         }
-        lines += [f"{name:<24}{describe_mean(values, signed=True)}" for name, values in differences.items()]
+        lines += [f"{name:<24}{format_mean(values, signed=True)}" for name, values in differences.items()]
         if np.mean(gains) <= 0.0:
             verdict = (
                 f"the actor of round {chosen_round} was better on the selection starts, but not on the test starts"
@@ -264,7 +264,7 @@ class _Distillation:
         state.before = self._play(self.acting, TEST, "the actor")
         state.best_return = float(np.mean(self._play(self.acting, SELECTING, "the actor")))
         state.planner = self._play(self.planning, TEST, "the planner")
-        self.line.print(f"actor    {describe_mean(state.before)}\nplanner  {describe_mean(state.planner)}")
+        self.line.print(f"actor    {format_mean(state.before)}\nplanner  {format_mean(state.planner)}")
         if np.mean(state.planner) <= np.mean(state.before):
             self.line.print("the planner earns no more than the actor: an improvement is not to be expected")
         self._save()
@@ -283,7 +283,7 @@ class _Distillation:
                 states.append(agent.state)
                 plan = self.planning.controller.plan
                 if agent is self.planning and plan is not None:
-                    plans.append(first_actions(plan, self.planner_config.min_std))
+                    plans.append(read_first_actions(plan, self.planner_config.min_std))
 
         self._play(agent, COLLECTED, "collecting", round_index, settings.episodes, store_belief)
         num_stale = int(settings.relabel_share * len(self.demonstrations))
@@ -315,7 +315,7 @@ class _Distillation:
             self.best = copy.deepcopy(self.model.actor.state_dict())
         self.line.print(
             f"round {round_index + 1:>2}  {len(self.demonstrations):>7,} beliefs  loss {state.loss:7.3f} nats  "
-            f"actor {describe_mean(returns)}{'  best' if state.best_round == round_index else ''}"
+            f"actor {format_mean(returns)}{'  best' if state.best_round == round_index else ''}"
         )
 
     def _finish(self) -> dict[str, float]:
@@ -425,7 +425,7 @@ def _load_distillation(folder: Path) -> dict[str, Any]:
     return saved
 
 
-def describe_mean(returns: Sequence[float], *, signed: bool = False) -> str:
+def format_mean(returns: Sequence[float], *, signed: bool = False) -> str:
     """The mean of returns with its 95 % interval, as text; `signed` writes a plus sign, for differences."""
     low, high = confidence_interval(returns)
     sign = "+" if signed else ""

@@ -61,7 +61,7 @@ class Curriculum(lightning.Callback):
         values = {name: batch.labels[..., column] for name, column in self._columns.items()}
         per_step = sum(weight * evaluate(node, values.__getitem__, scoring_degree) for weight, node in self._terms)
         per_step = torch.as_tensor(per_step).expand(batch.labels.shape[:2])  # (batch, time + 1)
-        return batch._replace(rewards=summed_reward(per_step, self._repeat))
+        return batch._replace(rewards=sum_rewards(per_step, self._repeat))
 
     def on_train_epoch_start(self, trainer: lightning.Trainer, learner: Learner) -> None:  # type: ignore[override]
         """Reset the value head in the first epoch that learns the run's own reward."""
@@ -87,7 +87,7 @@ def _parse_task(text: str, labels: Mapping[str, float]) -> tuple[tuple[float, No
         ) from None
 
 
-def summed_reward(values: Tensor, action_repeat: int) -> Tensor:
+def sum_rewards(values: Tensor, action_repeat: int) -> Tensor:
     """Reward per decision, from the reward per control step at the frames before and after the decision.
 
     Args:

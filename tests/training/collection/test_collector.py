@@ -177,9 +177,9 @@ def test_collector_plans_for_the_goal_of_a_round(make_cart):
     assert right is not None and left is not None and right is not left
 
 
-@pytest.mark.parametrize(("goal", "said"), [("cart -> ", "expected"), ("height > 1.0", "height")])
-def test_collector_refuses_goals_that_cannot_be_pursued(make_cart, goal, said):
-    with pytest.raises(UserError, match=said):
+@pytest.mark.parametrize(("goal", "message"), [("cart -> ", "expected"), ("height > 1.0", "height")])
+def test_collector_refuses_goals_that_cannot_be_pursued(make_cart, goal, message):
+    with pytest.raises(UserError, match=message):
         make_cart(goals=("cart -> 0.5", goal), goal_share=0.5)
 
 

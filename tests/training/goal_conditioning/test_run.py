@@ -142,7 +142,7 @@ def test_goal_learner_raises_the_imagined_worth(run):
     settings = GoalsConfig(starts=64, horizon=4, learning_rate=1e-2, entropy_scale=0.0)
     learner = GoalLearner(model, settings, config.learning, 0.9, 2, load_replay(run / "resume" / "replay", model))
     ends = torch.full((64, 2), -math.inf)
-    low, high = torch.where(torch.tensor([False, True]), 2.0, ends), -ends  # to be fast, whatever the height
+    low, high = torch.where(torch.tensor([False, True]), 2.0, ends), -ends  # a high speed at any height
     learner.source.draw = lambda num, generator: Boxes(low, high, torch.arange(num) % ROWS)
 
     def mean_degree():

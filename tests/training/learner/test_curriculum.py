@@ -8,7 +8,7 @@ from latentplan.config import Config, EnvConfig, LearningConfig, UserError
 from latentplan.config.quantities import scales as quantity_scales
 from latentplan.envs import make_env
 from latentplan.envs.true_quantities import ObjectiveReward
-from latentplan.training.learner.curriculum import Curriculum, summed_reward
+from latentplan.training.learner.curriculum import Curriculum, sum_rewards
 from latentplan.training.state import RunState
 
 LABELS = {"height": 0.2, "task.stand": 1.0, "task.walk": 1.0}
@@ -60,9 +60,9 @@ def test_curriculum_may_precede_an_objective(labelled, task):
     assert curriculum(labelled) is labelled
 
 
-@pytest.mark.parametrize(("labels", "told"), [(LABELS, "stand, walk"), ({}, "none")])
-def test_curriculum_refuses_an_unknown_task(labels, told):
-    with pytest.raises(UserError, match=f"curriculum_task 'fly' is unknown; .*: {told}; as an expression: .*fly"):
+@pytest.mark.parametrize(("labels", "tasks"), [(LABELS, "stand, walk"), ({}, "none")])
+def test_curriculum_refuses_an_unknown_task(labels, tasks):
+    with pytest.raises(UserError, match=f"curriculum_task 'fly' is unknown; .*: {tasks}; as an expression: .*fly"):
         Curriculum(make_config("fly"), labels, state_at(0))
 
 
@@ -92,14 +92,14 @@ def test_curriculum_gives_the_reward_of_the_same_objective(labelled):
 
 
 @pytest.mark.parametrize("action_repeat", [1, 2, 4, 8])
-def test_summed_reward_is_exact_for_linear_rewards(action_repeat):
+def test_sum_rewards_is_exact_for_linear_rewards(action_repeat):
     steps = torch.arange(3 * action_repeat + 1.0)
     expected = steps[1:].reshape(3, action_repeat).sum(-1)
-    assert torch.allclose(summed_reward(steps[None, ::action_repeat], action_repeat), expected[None])
+    assert torch.allclose(sum_rewards(steps[None, ::action_repeat], action_repeat), expected[None])
 
 
 @pytest.mark.parametrize(("action_repeat", "error"), [(1, 1e-6), (2, 0.04)])
-def test_summed_reward_of_labels_matches_the_rewards_of_the_task(action_repeat, error):
+def test_sum_rewards_of_labels_matches_the_rewards_of_the_task(action_repeat, error):
     """Labels of an episode, summed for its own task, give the episode's rewards; exactly with an action repeat of 1."""
     env = make_env(EnvConfig("walker", "walk", action_repeat, render_quality="fastest"), seed=0)
     rng = np.random.default_rng(0)
@@ -114,7 +114,7 @@ def test_summed_reward_of_labels_matches_the_rewards_of_the_task(action_repeat, 
     finally:
         env.close()
     walk = torch.tensor(np.array(labels), dtype=torch.float32)[None, :, column]
-    assert (summed_reward(walk, action_repeat)[0] - torch.tensor(rewards)).abs().mean() < error
+    assert (sum_rewards(walk, action_repeat)[0] - torch.tensor(rewards)).abs().mean() < error
 
 
 class Learner:
