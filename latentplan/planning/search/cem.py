@@ -78,7 +78,7 @@ class CEMPlanner(SearchOptions):
                 earlier durations at this problem size (see `Pace`).
 
         Returns:
-            The plan. Its `info` holds:
+            The plan. Its `info` has the following entries.
 
             * `elite_return`: mean return of the elites after each refit, (batch, iteration);
             * `std`: mean standard deviation of the samples after each refit, (batch, iteration);
