@@ -16,7 +16,7 @@ from sphinx.application import Sphinx
 
 from latentplan.config.quantities import QUANTITIES
 
-SPECIAL = re.compile(r"(``.*?``|`[^`]*`)|([*|])|(?<=\w)(_)(?!\w)", flags=re.DOTALL)
+SPECIAL = re.compile(r"(^ *[*-] |``.*?``|`[^`]*`)|([*|])|(?<=\w)(_)(?!\w)", flags=re.DOTALL)
 SHORT_CODE = 32  # characters
 SECTIONS = {f"{name}:" for name in ("Args", "Attributes", "Returns", "Raises", "Yields", "Note", "Example", "Examples")}
 

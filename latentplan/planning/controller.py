@@ -108,8 +108,8 @@ class ModelPredictiveController:
         assert self.plan is not None
         spread = self.plan.spread(where)
         # After a change of objective the new plans may have another length.
-        is_alike = aged is not None and aged.mean.shape == spread.mean.shape
-        self.plan = aged.updated(where, spread) if aged is not None and is_alike else spread
+        has_same_length = aged is not None and aged.mean.shape == spread.mean.shape
+        self.plan = aged.updated(where, spread) if aged is not None and has_same_length else spread
         self._is_stale = None if stale is None else stale & ~where
         return action
 

@@ -72,7 +72,7 @@ def start_process() -> tuple[SpawnProcess, Connection]:
     context = multiprocessing.get_context("spawn")
     ours, theirs = context.Pipe()
     process = context.Process(target=_serve, args=(theirs,), name="latentplan-plan", daemon=True)
-    resource_tracker.ensure_running()  # started by the process, the tracker would unblock the signal too early
+    resource_tracker.ensure_running()  # its start unblocks interrupts, so it must precede the block
     with _blocked_interrupts():  # the child inherits the blocked signal, and unblocks it once it ignores interrupts
         process.start()
     theirs.close()

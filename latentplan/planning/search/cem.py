@@ -64,6 +64,20 @@ class CEMPlanner(SearchOptions):
     ) -> Plan:
         """Searches the best action sequence from each state.
 
+        The `info` of the plan has these entries:
+
+        - `elite_return`: mean return of the elites after each refit, (batch, iteration);
+        - `std`: mean standard deviation of the samples after each refit, (batch, iteration);
+        - `iterations`: number of refits, (batch,);
+        - `num_nonfinite`: number of candidates whose return was not finite, (batch,);
+        - `is_fallback`: whether no candidate had a finite return or no iteration fitted the deadline, so that the
+          actions are the tail of the previous plan, zeros, or the policy's, (batch,);
+        - `is_policy`: whether no iteration fitted the deadline and the actions are the policy's, (batch,); false
+          unless the policy makes proposals, and false with constraints or an objective for which the policy was not
+          trained;
+        - `violation`: violation of the chosen sequence, only with constraints, (batch,);
+        - `stopped`: the reason the search ended, "iterations" or "deadline".
+
         Args:
             model: The model in which action sequences are imagined; see `latentplan.planning.model`.
             state: Start of the plans, rows (batch,).
@@ -78,7 +92,7 @@ class CEMPlanner(SearchOptions):
                 earlier durations at this problem size (see `Pace`).
 
         Returns:
-            The plan. Its `info` holds:
+            The plan. Its `info` has the following entries.
 
             * `elite_return`: mean return of the elites after each refit, (batch, iteration);
             * `std`: mean standard deviation of the samples after each refit, (batch, iteration);
