@@ -36,7 +36,13 @@ def escape_markup(app: Sphinx, what: str, name: str, subject: Any, options: Any,
             result += [_escaped(line) + ("" if line.endswith("::") else ":" if line.endswith(":") else " ::"), ""]
         else:
             result.append(line if block is not None else _escaped(line))
-    lines[:] = result
+    lines[:] = [_as_description(line, before) for line, before in zip(result, ["", *result], strict=False)]
+
+
+def _as_description(line: str, before: str) -> str:
+    """The first line below "Returns:", marked as a description where Napoleon would read text and colon as a type."""
+    is_first = before.strip() in ("Returns:", "Yields:")
+    return re.sub(r"^( *)", r"\1: ", line, count=1) if is_first and ":" in line else line
 
 
 def _opens_block(lines: list[str], number: int) -> bool:

@@ -18,13 +18,28 @@ TENSORS = ("actions", "mean", "var", "expected_return", "elites", "is_warm", "el
 class Plan:
     """The result of a search, for every environment in the call.
 
+    The diagnostics in `info` are:
+
+    - `elite_return`: mean return of the elites after each refit, (batch, iteration);
+    - `std`: mean standard deviation of the samples after each refit, (batch, iteration);
+    - `iterations`: number of refits, (batch,);
+    - `num_nonfinite`: number of candidates whose return was not finite, (batch,);
+    - `is_fallback`: whether no candidate had a finite return or no iteration fitted the deadline, so that the actions are
+      the tail of the previous plan, zeros, or the policy's, (batch,);
+    - `is_policy`: whether no iteration fitted the deadline and the actions are the policy's, (batch,); false unless the
+      policy makes proposals, and false with constraints or an objective for which the policy was not trained;
+    - `violation`: violation of the chosen sequence, only with constraints, (batch,);
+    - `stopped`: the reason the search ended, "iterations" or "deadline".
+
+    A planner of another kind must give `is_fallback`, `is_policy` and `num_nonfinite`.
+
     Attributes:
         actions: The chosen sequence within the bounds, (batch, horizon, action).
         mean: Mean of the search distribution, (batch, horizon, action).
         var: Variance of the search distribution, (batch, horizon, action).
         expected_return: Predicted return, (batch,): the mean return of the last elites, or the return of the chosen
             sequence if the option `final` is `best` or `better`. NaN where no candidate had a finite return.
-        info: Diagnostics, (batch,) or (batch, iteration), and the reason the search ended; see `CEMPlanner.plan`.
+        info: Diagnostics by name, see above.
         elites: Kept elites, (batch, kept, horizon, action), if the planner keeps some.
         is_warm: Whether the next search may start from this plan, (batch,) bool on the CPU.
         elapsed: Number of actions executed since this plan was made, (batch,) on the CPU; the next search shifts the

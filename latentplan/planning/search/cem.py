@@ -85,26 +85,13 @@ class CEMPlanner(SearchOptions):
             objective: Maximised, `objective(rollout) -> (rows,)`; None is the discounted reward, plus the value of the
                 last state if the option `terminal_value` says so.
             constraints: Each returns the violation of every rollout, (rows,), 0 where the constraint is satisfied.
-            generator: One generator for all environments, which then draw the same noise, or a list with one generator
-                per environment; None takes torch's default. An environment's plan does not depend on the others.
-            deadline_ms: Milliseconds that this call may take; None takes the planner's own limit, infinity lifts it. An
-                iteration or a gradient refinement starts only if it is expected to end in time, as predicted from
-                earlier durations at this problem size (see `Pace`).
+            generator: One generator for all environments, or one per environment; None takes torch's default. An
+                environment's plan does not depend on the others.
+            deadline_ms: Milliseconds that this call may take; None takes the planner's own limit, infinity lifts it. A
+                part of the search starts only if earlier durations of such parts predict that it ends in time.
 
         Returns:
-            The plan. Its `info` has the following entries.
-
-            * `elite_return`: mean return of the elites after each refit, (batch, iteration);
-            * `std`: mean standard deviation of the samples after each refit, (batch, iteration);
-            * `iterations`: number of refits, (batch,);
-            * `num_nonfinite`: number of candidates whose return was not finite, (batch,);
-            * `is_fallback`: whether no candidate had a finite return or no iteration fitted the deadline, so that the
-              actions are the tail of the previous plan, zeros, or the policy's, (batch,);
-            * `is_policy`: whether no iteration fitted the deadline and the actions are the policy's, (batch,); false
-              unless the policy makes proposals, and false with constraints or an objective for which the policy was not
-              trained;
-            * `violation`: violation of the chosen sequence, only with constraints, (batch,);
-            * `stopped`: the reason the search ended, "iterations" or "deadline".
+            The plan; `Plan` describes the diagnostics in its `info`.
 
         Raises:
             ValueError: The model lacks a method that an option needs, a method of the model returned a wrong shape, or
@@ -115,14 +102,18 @@ class CEMPlanner(SearchOptions):
         deadline_ms = self.deadline_ms if deadline_ms is None else deadline_ms
         if deadline_ms is not None and not deadline_ms >= 0.0:
             raise ValueError(f"deadline_ms must be at least 0, got {deadline_ms}")
-        # A plan made in inference mode could not be a training target, and gradient steps would fail.
+        # In inference mode the plan could not be a training target, and gradient steps would fail.
         with torch.inference_mode(False), torch.no_grad():
-            low, high = (self._per_dimension(name) for name in ("action_low", "action_high"))
-            init_std = None if self.init_std is None else self._per_dimension("init_std")
-            problem = Problem(model, state, objective, constraints, low, high, init_std, self.discount)
-            search = Search(self, problem, generator)
+            search = Search(self, self._problem(model, state, objective, constraints), generator)
             seconds = None if deadline_ms is None else deadline_ms / 1000
             return search.run(previous, search.budget(self.pace, clock, started, seconds))
+
+    def _problem(
+        self, model: Model, state: State, objective: Term | None, constraints: Sequence[Constraint]
+    ) -> Problem:
+        low, high = (self._per_dimension(name) for name in ("action_low", "action_high"))
+        init_std = None if self.init_std is None else self._per_dimension("init_std")
+        return Problem(model, state, objective, constraints, low, high, init_std, self.discount)
 
     def _per_dimension(self, name: str) -> torch.Tensor:
         return per_dimension(getattr(self, name), self.action_dim, name)
