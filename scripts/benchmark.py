@@ -8,7 +8,7 @@ from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
-from latentplan.commands.registry import Command, dispatch  # noqa: E402
+from latentplan.commands.main import Command, dispatch
 from latentplan.commands.shell import run_guarded  # noqa: E402
 
 COMMANDS = {

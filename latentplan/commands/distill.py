@@ -7,8 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from latentplan.commands.flags import overrides
-from latentplan.commands.learning import LearningRequest, name_folder
-from latentplan.commands.saved import saved_config, search_settings
+from latentplan.commands.shell import LearningRequest, name_folder, saved_config, search_settings
 from latentplan.config import DistillConfig, PlannerConfig
 
 

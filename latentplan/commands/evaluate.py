@@ -15,8 +15,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from latentplan.commands.flags import overrides
-from latentplan.commands.saved import saved_config, search_settings
-from latentplan.commands.shell import ComputeRequest
+from latentplan.commands.shell import ComputeRequest, saved_config, search_settings
 from latentplan.config import EnvConfig, PlannerConfig, UserError, to_dict
 from latentplan.config.checks import above_zero, at_least, one_of, within
 from latentplan.config.parsing import option

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from latentplan.commands.flags import overrides
-from latentplan.commands.learning import LearningRequest, name_folder
+from latentplan.commands.shell import LearningRequest, name_folder
 from latentplan.config import GoalsConfig
 
 

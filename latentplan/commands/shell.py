@@ -1,16 +1,21 @@
-"""Running a command: errors as one line and an exit code, and the choice of device and threads."""
+"""Shared parts of the commands: errors as one line and an exit code, device and threads, settings of a checkpoint."""
 
 from __future__ import annotations
 
 import errno
 import os
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from datetime import datetime
+from pathlib import Path
+from typing import Any
 
-from latentplan.config import MAX_THREADS, Device, UserError
+from latentplan.config import MAX_THREADS, Config, Device, PlannerConfig, UserError, from_dict, to_dict
 from latentplan.config.checks import within
+from latentplan.config.files import build_config
 from latentplan.config.parsing import option
+from latentplan.config.planner import override_planner
 
 
 def run_guarded(command: Callable[[Sequence[str]], int], argv: Sequence[str]) -> int:
@@ -34,12 +39,6 @@ def run_guarded(command: Callable[[Sequence[str]], int], argv: Sequence[str]) ->
         if error.errno != errno.ENAMETOOLONG:
             raise
         return _refuse(f"a file name is too long: {str(error.filename)[:80]}...")
-
-
-def _refuse(message: str) -> int:
-    line = " ".join(message.split()).encode(sys.stderr.encoding or "utf-8", "backslashreplace")
-    print(f"error: {line.decode(sys.stderr.encoding or 'utf-8')}", file=sys.stderr)
-    return 2
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -76,3 +75,64 @@ class ComputeRequest:
         if self.device == "cuda" and not has_cuda:
             raise UserError("device 'cuda' is not usable here; give --device cpu")
         return ("cuda" if has_cuda else "cpu") if self.device == "auto" else self.device
+
+
+def saved_config(checkpoint: Path, info: Mapping[str, Any]) -> Config:
+    """The settings of a checkpoint.
+
+    Args:
+        checkpoint: Folder of the checkpoint, which an error names.
+        info: Content of its `info.json`.
+
+    Raises:
+        UserError: The settings are those of an incompatible version.
+    """
+    try:
+        return from_dict(info["config"])
+    except (AttributeError, TypeError, ValueError) as error:
+        raise UserError(f"{checkpoint} has settings of another version: {error}") from None
+
+
+def search_settings(saved: PlannerConfig, given: Mapping[str, Any]) -> PlannerConfig:
+    """The settings of a checkpoint's search with the given ones in their place.
+
+    Raises:
+        UserError: A given value is not allowed beside the saved ones.
+    """
+    return build_config({"planner": override_planner(to_dict(saved), given)}).planner
+
+
+@dataclass(frozen=True, kw_only=True)
+class LearningRequest(ComputeRequest):
+    """The command line of teaching a trained agent: the agent, the output folder, or a folder to resume.
+
+    Attributes:
+        checkpoint: Folder of a trained agent, or of a run (its best checkpoint).
+        out: Folder of the agent that has learned; None makes one under `runs`, named by agent, task and date.
+        resume: Folder of the learning to continue.
+    """
+
+    checkpoint: Path | None = option(None, metavar="DIR")
+    out: Path | None = option(None, metavar="DIR")
+    resume: Path | None = option(None, metavar="DIR")
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.checkpoint is None and self.resume is None:
+            raise UserError("flag --checkpoint is missing; give the folder of a trained agent or of a run")
+
+
+def name_folder(kind: str, info: Mapping[str, Any]) -> Path:
+    """The default folder of an agent that is taught: `runs/<kind>-<domain>-<task>-<date>`.
+
+    Args:
+        kind: First word of the name, such as `distilled`.
+        info: Content of the `info.json` of the agent.
+    """
+    return Path("runs") / f"{kind}-{info['domain']}-{info['task']}-{datetime.now():%Y%m%d-%H%M%S}"
+
+
+def _refuse(message: str) -> int:
+    line = " ".join(message.split()).encode(sys.stderr.encoding or "utf-8", "backslashreplace")
+    print(f"error: {line.decode(sys.stderr.encoding or 'utf-8')}", file=sys.stderr)
+    return 2

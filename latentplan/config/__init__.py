@@ -1,11 +1,8 @@
 """Every setting of latentplan: one frozen dataclass per component, built on the standard library alone."""
 
 from latentplan.config.checks import MAX_THREADS, UserError, derive_seed, make_folder, output_file
-from latentplan.config.distill import DistillConfig
-from latentplan.config.goals import GoalsConfig
-from latentplan.config.learning import CollectionConfig, LearningConfig
-from latentplan.config.planner import PlannerConfig
-from latentplan.config.search import SearchOptions
+from latentplan.config.learning import CollectionConfig, DistillConfig, GoalsConfig, LearningConfig
+from latentplan.config.planner import PlannerConfig, SearchOptions
 from latentplan.config.settings import (
     DEVICES,
     FLOORS,

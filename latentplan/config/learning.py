@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from typing import Literal, get_args
 
 from latentplan.config.checks import above_zero, at_least, one_of, within
+from latentplan.config.parsing import option
 
 Behaviour = Literal["planner", "actor", "both"]
 BEHAVIOURS = get_args(Behaviour)
@@ -133,3 +134,72 @@ class CollectionConfig:
         if self.goals and self.goal_share == 0.0:
             raise ValueError("goals need a goal_share above 0: the share of rounds in which they are pursued")
         above_zero(self, "updates_per_decision", "episode_decisions")
+
+
+@dataclass(frozen=True)
+class DistillConfig:
+    """Distillation: an actor learns to act as its planner does.
+
+    Attributes:
+        rounds: Rounds; each plays episodes, has the planner label their beliefs, and trains the actor on the labels.
+        episodes: Episodes played per round.
+        minutes: Minutes after which no round begins; None sets no limit.
+        planner_rounds: First rounds in which the planner acts (behavioural cloning); in later rounds the actor acts.
+        updates: Updates of the actor per round.
+        batch_size: Beliefs per update.
+        learning_rate: Adam step of the actor.
+        relabel_share: Share of the stored beliefs that each round labels again, those with the oldest labels first.
+        plan_batch: Beliefs per call of the planner.
+        evaluation_episodes: Episodes by which the best round is chosen; the chosen actor is then measured by the same
+            number of episodes from other starts.
+        seed: Seed of every random stream.
+    """
+
+    rounds: int = 10
+    episodes: int = 4
+    minutes: float | None = None
+    planner_rounds: int = option(1, is_rare=True)
+    updates: int = 500
+    batch_size: int = option(256, is_rare=True)
+    learning_rate: float = option(1e-3, is_rare=True)
+    relabel_share: float = option(0.1, is_rare=True)
+    plan_batch: int = option(256, is_rare=True)
+    evaluation_episodes: int = 10
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        at_least(self, rounds=1, episodes=1, planner_rounds=0, updates=1, batch_size=1, plan_batch=1)
+        at_least(self, evaluation_episodes=2, seed=0)
+        above_zero(self, "minutes", "learning_rate")
+        within(self, relabel_share=(0.0, 1.0))
+
+
+@dataclass(frozen=True)
+class GoalsConfig:
+    """Goal-conditioned learning: a trained agent learns to pursue goals that are named later.
+
+    Attributes:
+        updates: Updates in total.
+        minutes: Minutes after which no update begins; None sets no limit.
+        starts: Imagined rollouts per update, each from a replayed belief and for a goal of its own.
+        horizon: Model steps of an imagined rollout.
+        hidden_dim: Width of the hidden layers of the actor and the value.
+        learning_rate: Adam step of the actor and the value.
+        entropy_scale: Weight of the actor's entropy, in units of the spread of returns per nat.
+        play_decisions: Decisions that the agent first plays where the replay of its run is missing.
+        seed: Seed of every random stream.
+    """
+
+    updates: int = 50_000
+    minutes: float | None = None
+    starts: int = 320
+    horizon: int = 12
+    hidden_dim: int = option(48, is_rare=True)
+    learning_rate: float = option(1e-3, is_rare=True)
+    entropy_scale: float = option(1e-3, is_rare=True)
+    play_decisions: int = 10_000
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        at_least(self, updates=1, starts=1, horizon=1, hidden_dim=1, play_decisions=1, seed=0, entropy_scale=0.0)
+        above_zero(self, "minutes", "learning_rate")

@@ -1,13 +1,129 @@
-"""Settings of an agent's planner."""
+"""Options of the search over action sequences, and settings of an agent's planner.
+
+The planning library builds on `SearchOptions`: one set of names, defaults and checks for every planner.
+"""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
+from numbers import Integral, Real
 from typing import Any
 
-from latentplan.config.checks import above_zero
-from latentplan.config.search import SearchOptions
+from latentplan.config.checks import above_zero, one_of, within
+
+WIDEST_STD = 1e15  # the square of this std, and sums of such squares, are finite in float32
+STEEPEST_NOISE = 100.0  # far below this exponent all steps share one cosine; from 150 on powers overflow
+NUM_POLICY_SAMPLES = 24
+
+
+@dataclass(frozen=True, kw_only=True)
+class SearchOptions:
+    """Options of a search over action sequences. `None` means that the search derives the value.
+
+    Attributes:
+        horizon: Model steps that a plan looks ahead.
+        goal_horizon: Model steps that a plan for an objective other than the predicted return looks ahead; null takes
+            `horizon`.
+        num_samples: Candidate sequences per iteration, the policy's proposals included.
+        num_elites: Best candidates that refit the search distribution.
+        num_iterations: Refits of a search that starts without a previous plan.
+        warm_start_iterations: Refits of a search that starts from the previous plan; null takes half of
+            `num_iterations`, rounded up.
+        smoothing: Weight of the new statistics in the Polyak update of mean and variance, in (0, 1].
+        init_std: Standard deviation at the start of a search, in action units; null takes a quarter of the action
+            range, which is 0.5 for actions in [-1, 1].
+        min_std: Floor of the sampling standard deviation, in action units; where `init_std` is null the floor is at
+            most the std at the start.
+        num_policy_samples: Candidates proposed by the model's policy, its mode first; 0 leaves the policy out; null
+            takes 24 (at most a quarter of `num_samples`) where the model has a policy, else 0.
+        warm_start: Whether a search starts from the shifted previous plan.
+        terminal_value: Whether the value of the last imagined state completes the return; null does so where the model
+            has a value.
+        use_continues: Whether the predicted probability that the episode goes on discounts the later rewards.
+        tail: How the end of the shifted previous plan is filled: `zero`, `hold` (the last action again) or `policy`.
+        final: The sequence that is executed: the `mean` of the distribution, the `best` candidate, or the `better` of
+            the mean and the policy's own sequence, by predicted return. Where the policy makes no proposals, or where
+            constraints or an objective that the policy was not trained for are set, `better` is `mean`.
+        noise_beta: Exponent of coloured sampling noise, in [0, 100]; 0 is white, larger is smoother over the horizon.
+        keep_elite_fraction: Share of the elites that stay candidates in the next iteration and plan, in [0, 1].
+        temperature: Elites are weighted by exp(return / temperature) as in MPPI; null weights all elites alike.
+        adapt_std: Whether the variance is refitted too.
+        gradient_steps: Steps of gradient ascent on the chosen sequence; the model must be differentiable.
+        gradient_step_size: Largest change of an action in the first gradient step, in action units.
+        constraint_penalty: Return that is subtracted per unit of violation; null ranks feasible candidates first.
+        deadline_ms: Milliseconds that a search may take; null sets no limit.
+
+    Raises:
+        ValueError: An option has a value that is not allowed; the message names the option.
+    """
+
+    horizon: int = 8
+    goal_horizon: int | None = None
+    num_samples: int = 128
+    num_elites: int = 16
+    num_iterations: int = 4
+    warm_start_iterations: int | None = None
+    smoothing: float = 0.9
+    init_std: float | None = None
+    min_std: float = 0.05
+    num_policy_samples: int | None = None
+    warm_start: bool = True
+    terminal_value: bool | None = None
+    use_continues: bool = False
+    tail: str = "zero"
+    final: str = "mean"
+    noise_beta: float = 0.0
+    keep_elite_fraction: float = 0.0
+    temperature: float | None = None
+    adapt_std: bool = True
+    gradient_steps: int = 0
+    gradient_step_size: float = 0.1
+    constraint_penalty: float | None = None
+    deadline_ms: float | None = None
+
+    def __post_init__(self) -> None:
+        check_whole(self, 1, "horizon", "goal_horizon", "num_samples", "num_elites", "num_iterations")
+        check_whole(self, 1, "warm_start_iterations")
+        check_whole(self, 0, "num_policy_samples", "gradient_steps")
+        above_zero(self, "smoothing", "temperature", "gradient_step_size", "deadline_ms")
+        within(self, smoothing=(0.0, 1.0), keep_elite_fraction=(0.0, 1.0))
+        within(self, noise_beta=(0.0, STEEPEST_NOISE), min_std=(0.0, WIDEST_STD))
+        if isinstance(self.init_std, Real):  # a planner checks a std per action dimension, which it alone accepts
+            within(self, init_std=(0.0, WIDEST_STD))
+        if self.constraint_penalty is not None and not 0.0 <= self.constraint_penalty < math.inf:
+            raise ValueError(f"constraint_penalty must be finite and at least 0, got {self.constraint_penalty}")
+        one_of(self, tail=("zero", "hold", "policy"), final=("mean", "best", "better"))
+        self._check_num_elites()
+        if self.num_policy_samples is not None and self.num_policy_samples >= self.num_samples:
+            raise ValueError(
+                f"num_policy_samples ({self.num_policy_samples}) must be below num_samples ({self.num_samples})"
+            )
+
+    def _check_num_elites(self) -> None:
+        if self.num_elites > self.num_samples:
+            raise ValueError(f"num_elites ({self.num_elites}) must not exceed num_samples ({self.num_samples})")
+
+    @property
+    def num_kept(self) -> int:
+        """Number of elites that stay candidates; at least one where any share is kept."""
+        return 0 if self.keep_elite_fraction == 0 else max(1, round(self.keep_elite_fraction * self.num_elites))
+
+    @property
+    def num_warm_iterations(self) -> int:
+        """Number of refits of a search that starts from the previous plan."""
+        return self.warm_start_iterations or math.ceil(self.num_iterations / 2)
+
+    def num_proposals(self, has_policy: bool) -> int:
+        """Returns the number of candidates that the policy of a model proposes.
+
+        Args:
+            has_policy: Whether the model has a policy.
+        """
+        if self.num_policy_samples is not None:
+            return self.num_policy_samples
+        return min(NUM_POLICY_SAMPLES, self.num_samples // 4) if has_policy else 0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -15,8 +131,8 @@ class PlannerConfig(SearchOptions):
     """The planner of an agent, with the options of its search (`SearchOptions`).
 
     Attributes:
-        method: Name of the planner in the registry of `latentplan.planning`: `cem`, `icem` or `mppi`. The options that
-            have their default value are replaced by the method's own.
+        method: Name of a registered planner, such as `cem`, `icem` or `mppi`. An option that has its default value is
+            left to the planner: `icem` and `mppi` then take their own value.
         surprise_limit: Nats by which a frame may differ from the model's prediction (`WorldModel.surprise`). Where a
             frame differs by more, `--mode planner` executes the actor's action instead of the plan's, unless a goal or
             constraint is set. null always executes the plan.
@@ -29,6 +145,10 @@ class PlannerConfig(SearchOptions):
         super().__post_init__()
         above_zero(self, "surprise_limit")
 
+    def _check_num_elites(self) -> None:
+        if self.method == "cem" or self.num_elites != SearchOptions.num_elites:  # else the method takes its own number
+            super()._check_num_elites()
+
 
 def override_planner(trained: Mapping[str, Any], given: Mapping[str, Any]) -> dict[str, Any]:
     """An agent's planner settings with the given ones in their place; a given `horizon` holds for goals too.
@@ -39,3 +159,11 @@ def override_planner(trained: Mapping[str, Any], given: Mapping[str, Any]) -> di
     """
     goal_horizon = {"goal_horizon": None} if "horizon" in given else {}
     return {**trained, **goal_horizon, **given}
+
+
+def check_whole(options: Any, least: int, *names: str) -> None:
+    """Requires options to be None or whole numbers of at least `least`."""
+    for name in names:
+        value = getattr(options, name)
+        if value is not None and (isinstance(value, bool) or not isinstance(value, Integral) or value < least):
+            raise ValueError(f"{name} must be a whole number, at least {least}, got {value!r}")

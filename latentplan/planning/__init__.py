@@ -3,7 +3,7 @@
 The package imports torch and einops, and only the settings from the rest of this project.
 """
 
-from latentplan.config.search import SearchOptions
+from latentplan.config.planner import SearchOptions
 from latentplan.planning.adapters import CEMTrajectoryOptimizer
 from latentplan.planning.check import check_model
 from latentplan.planning.controller import ModelPredictiveController

@@ -24,8 +24,8 @@ class Plan:
     - `std`: mean standard deviation of the samples after each refit, (batch, iteration);
     - `iterations`: number of refits, (batch,);
     - `num_nonfinite`: number of candidates whose return was not finite, (batch,);
-    - `is_fallback`: whether no candidate had a finite return or no iteration fitted the deadline, so that the actions are
-      the tail of the previous plan, zeros, or the policy's, (batch,);
+    - `is_fallback`: whether no candidate had a finite return or no iteration fitted the deadline, so that the actions
+      are the tail of the previous plan, zeros, or the policy's, (batch,);
     - `is_policy`: whether no iteration fitted the deadline and the actions are the policy's, (batch,); false unless the
       policy makes proposals, and false with constraints or an objective for which the policy was not trained;
     - `violation`: violation of the chosen sequence, only with constraints, (batch,);

@@ -26,12 +26,11 @@ from latentplan.training.callbacks import Collect, Record, Restore, Save, Stop, 
 from latentplan.training.collection.collector import Description, EnvFactory
 from latentplan.training.collection.process import Worker, make_worker
 from latentplan.training.console import Progress
-from latentplan.training.folder import lock_folder, refuse_used
 from latentplan.training.learner.batches import ReplayBatches, ReplayData
 from latentplan.training.learner.curriculum import Curriculum
 from latentplan.training.learner.graphed import make_learner
 from latentplan.training.resources import choose_device, choose_replay_capacity, choose_threads, set_up_torch
-from latentplan.training.state import INTERRUPTED, RunState, load_state, restore_learner
+from latentplan.training.state import INTERRUPTED, RunState, load_state, lock_folder, refuse_used, restore_learner
 
 if TYPE_CHECKING:
     from collections.abc import Mapping

@@ -1,20 +1,31 @@
-"""The state of a run (clocks, evaluations, weights, optimizers), saved and loaded."""
+"""The state of a run (clocks, evaluations, weights, optimizers), saved and loaded, and the lock of its folder."""
 
 from __future__ import annotations
 
+import contextlib
+import fcntl
+import os
 import time
+from collections.abc import Iterator
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import torch
 
+from latentplan.agents.checkpoint import INFO
 from latentplan.config import UserError, make_folder
 from latentplan.replay.buffer import Replay, read_saved
 
 if TYPE_CHECKING:
     from latentplan.training.learner.module import Learner
 
+
+LOCK_FILE = ".lock"
+RUN_FILE = "config.yaml"
+GOALS_FILE = "goals.pt"
+DISTILLATION_FILE = Path("resume") / "distill.pt"
+CONTENTS = {RUN_FILE: "a run", INFO: "an agent", GOALS_FILE: "an agent", str(DISTILLATION_FILE): "an agent"}
 STATE_FILE = "state.pt"
 INTERRUPTED = 130  # exit code of a run that the user ended
 
@@ -122,3 +133,46 @@ def restore_learner(learner: Learner, saved: dict[str, Any], folder: Path) -> No
         reason = str(error).splitlines()[-1].strip()
         raise UserError(f"the saved weights in {folder} do not fit the settings in its config.yaml: {reason}") from None
     learner.updates = saved["updates"]
+
+
+def refuse_used(folder: Path, own_file: str, flag: str) -> None:
+    """Refuses a folder that already holds a run or an agent.
+
+    Args:
+        folder: Where a new run or agent is about to be written.
+        own_file: The file in `CONTENTS` from which the caller can resume; if it exists, the message names `--resume`.
+        flag: The flag that chooses another folder.
+
+    Raises:
+        UserError: The folder holds one of the files in `CONTENTS`.
+    """
+    for name, content in CONTENTS.items():
+        if (folder / name).exists():
+            can_resume = (folder / own_file).exists()
+            advice = f"resume it with --resume {folder} (or from Python), or " if can_resume else ""
+            raise UserError(f"{folder} already holds {content}: {advice}choose another {flag}")
+
+
+@contextlib.contextmanager
+def lock_folder(folder: Path) -> Iterator[None]:
+    """Makes a folder if needed, and locks it until the context or the process ends.
+
+    On a file system without locks the folder stays unlocked.
+
+    Raises:
+        UserError: Another process holds the lock, or the folder cannot be made.
+    """
+    make_folder(folder)
+    try:
+        lock = os.open(folder / LOCK_FILE, os.O_RDWR | os.O_CREAT, 0o666)
+    except OSError as error:
+        raise UserError(f"cannot write to {folder}: {error.strerror}; choose another") from None
+    try:
+        with contextlib.suppress(OSError):
+            try:
+                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:
+                raise UserError(f"another process learns in {folder}: end it first, or choose another folder") from None
+        yield
+    finally:
+        os.close(lock)

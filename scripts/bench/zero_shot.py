@@ -17,8 +17,7 @@ from bench.ablation_arms import check_checkpoint
 from bench.report import format_interval, format_number, format_table, write_json
 from bench.workers import run_in_order
 from latentplan.commands.flags import overrides
-from latentplan.commands.saved import search_settings
-from latentplan.commands.shell import ComputeRequest
+from latentplan.commands.shell import ComputeRequest, search_settings
 from latentplan.config import EnvConfig, PlannerConfig, UserError, to_dict
 from latentplan.config.checks import above_zero, at_least
 from latentplan.config.parsing import option, raise_unknown

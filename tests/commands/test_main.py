@@ -8,9 +8,8 @@ import pytest
 import yaml
 
 from latentplan import __version__
-from latentplan.commands.completion import SHELLS
 from latentplan.commands.flags import GENERAL_FLAGS
-from latentplan.commands.main import COMMANDS, main
+from latentplan.commands.main import COMMANDS, SHELLS, main
 from latentplan.config import DistillConfig
 
 HEAVY = "{'torch', 'lightning', 'mujoco', 'dm_control', 'gymnasium', 'cv2', 'numpy'}"

@@ -2,6 +2,8 @@
 
 import json
 
+import pytest
+
 from latentplan.config import PlannerConfig, from_dict
 from latentplan.config.removed import drop_removed
 
@@ -22,3 +24,10 @@ def test_planner_config_has_the_effect_of_the_values_that_older_runs_spelled_out
     derived = PlannerConfig()
     assert derived.num_warm_iterations == spelled.num_warm_iterations
     assert derived.num_proposals(has_policy=True) == spelled.num_proposals(has_policy=True)
+
+
+def test_planner_config_checks_num_elites_only_if_the_method_uses_the_value():
+    assert PlannerConfig(method="mppi", num_samples=8, num_policy_samples=4).num_elites == 16  # mppi takes all samples
+    for settings in ({"num_samples": 8}, {"method": "mppi", "num_samples": 8, "num_elites": 9}):
+        with pytest.raises(ValueError, match="num_elites .* must not exceed num_samples"):
+            PlannerConfig(num_policy_samples=4, **settings)

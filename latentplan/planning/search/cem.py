@@ -10,7 +10,7 @@ from typing import Any
 
 import torch
 
-from latentplan.config.search import WIDEST_STD, SearchOptions, check_whole
+from latentplan.config.planner import WIDEST_STD, SearchOptions, check_whole
 from latentplan.planning.model import Bound, Model, State, per_dimension
 from latentplan.planning.objectives import Constraint, Term
 from latentplan.planning.plan import Plan

@@ -23,7 +23,7 @@ import torch
 from torch import Tensor
 from torch.utils._pytree import tree_map
 
-from latentplan.config.search import SearchOptions
+from latentplan.config.planner import SearchOptions
 from latentplan.planning.model import Model, State, action_dtype, count_rows, state_device, supports
 from latentplan.planning.objectives import Constraint, Term, apply_view
 from latentplan.planning.plan import Plan, WarmStart, shift_plan

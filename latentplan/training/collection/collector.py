@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import time
+import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,15 +19,15 @@ from latentplan.agents.base import ModelAgent
 from latentplan.agents.modes import make_agent
 from latentplan.agents.planning import PlanningAgent
 from latentplan.agents.random import RandomAgent
-from latentplan.config import Config, derive_seed
+from latentplan.config import Config, UserError, derive_seed
 from latentplan.envs import make_env, make_from, make_vector_env, render_info
 from latentplan.evaluation.episodes import episode_seed, run_episodes
 from latentplan.models import WorldModel
 from latentplan.models.fast import accelerate
+from latentplan.models.heads import LARGEST_SCALAR
 from latentplan.models.symmetry import first_turn
 from latentplan.replay.buffer import Rows
 from latentplan.reporting.film import filming_if_possible
-from latentplan.training.collection.rewards import RewardCheck
 
 TIMED_FRAMES = 5
 FILMED_FRAMES = 250
@@ -285,3 +286,42 @@ def _stack(entries: list[tuple[Any, ...]]) -> Rows:
         is_first=np.asarray(is_first, bool),
         labels=np.stack(labels),
     )
+
+
+class RewardCheck:
+    """Refuses rewards that are not finite, and warns once if discounted sums of rewards exceed the value head's range.
+
+    Args:
+        num_envs: Number of environments.
+        discount: Discount per decision.
+    """
+
+    def __init__(self, num_envs: int, discount: float) -> None:
+        self.discount = discount
+        self._sums = np.zeros(num_envs)
+        self._has_warned = False
+
+    def __call__(self, rewards: np.ndarray, is_first: np.ndarray) -> None:
+        """Check one step's rewards.
+
+        Args:
+            rewards: Rewards of one step, (env,).
+            is_first: Whether the step is the first of an episode, (env,).
+
+        Raises:
+            UserError: A reward is not finite in float32, in which replay stores it.
+        """
+        with np.errstate(over="ignore"):
+            is_finite = np.isfinite(np.asarray(rewards, np.float32))
+        if not is_finite.all():
+            raise UserError(f"the environment returned rewards that are not finite: {rewards.tolist()}")
+        self._sums = rewards + self.discount * np.where(is_first, 0.0, self._sums)
+        largest = float(np.abs(self._sums).max())
+        if largest > LARGEST_SCALAR and not self._has_warned:
+            self._has_warned = True
+            warnings.warn(
+                f"discounted rewards add up to {largest:.0f}, but the value head represents returns up to "
+                f"{LARGEST_SCALAR:.0f} only: scale the rewards down",
+                RuntimeWarning,
+                stacklevel=2,
+            )

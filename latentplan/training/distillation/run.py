@@ -38,9 +38,8 @@ from latentplan.training.collection.collector import EnvFactory
 from latentplan.training.console import StatusLine
 from latentplan.training.distillation.labels import Demonstrations, plan_actions, read_first_actions
 from latentplan.training.distillation.student import Student
-from latentplan.training.folder import DISTILLATION_FILE, lock_folder, refuse_used
 from latentplan.training.run import Result
-from latentplan.training.state import INTERRUPTED, save_atomically
+from latentplan.training.state import DISTILLATION_FILE, INTERRUPTED, lock_folder, refuse_used, save_atomically
 
 NUM_STAGES = 3  # per round: collect, train, select
 NO_ROUND = -1  # value of `best_round` while the actor before distillation is the best

@@ -20,8 +20,8 @@ from latentplan.models import State, WorldModel
 from latentplan.objectives.box import box_degree
 from latentplan.replay.buffer import Replay
 from latentplan.training.learner.losses import draw_noise, entropy, lambda_return
+from latentplan.training.learner.module import Snapshot
 from latentplan.training.learner.optimization import descend, return_scale
-from latentplan.training.learner.snapshot import Snapshot
 
 RANGE = (0.005, 0.995)  # quantiles of the observed quantities, between which box centres are moved
 RANGE_ROWS = 20_000  # rows from which the quantiles are estimated

@@ -12,7 +12,7 @@ from torch import Tensor, nn
 
 from latentplan.config import LearningConfig, derive_seed
 from latentplan.models import State, WorldModel
-from latentplan.models.heads import ScalarHead
+from latentplan.models.heads import Mlp, ScalarHead
 from latentplan.replay.buffer import Batch, Replay
 from latentplan.training.learner.augmentation import quarter_turns
 from latentplan.training.learner.losses import (
@@ -26,7 +26,6 @@ from latentplan.training.learner.losses import (
     world_model_loss,
 )
 from latentplan.training.learner.optimization import descend, keep_freed_memory, return_scale, update_average
-from latentplan.training.learner.snapshot import Snapshot
 
 MODEL, BEHAVIOUR = 0, 1  # indices of the two halves of an update: their parameters, optimizers and average counts
 
@@ -229,3 +228,37 @@ def _halves(model: WorldModel) -> tuple[list[nn.Parameter], list[nn.Parameter]]:
     behaviour = [*model.actor.parameters(), *model.value_head.parameters()]
     chosen = {id(parameter) for parameter in behaviour}
     return [parameter for parameter in model.parameters() if id(parameter) not in chosen], behaviour
+
+
+class Snapshot:
+    """A copy of a world model with frozen dynamics, reward and continue heads, and the same actor and value head.
+
+    Weights of matrix products are stored in the model's `trunk_dtype`, to which autocast would convert them at every
+    use. Norms and the last layers of heads stay in float32.
+
+    Args:
+        model: The world model to copy.
+
+    Attributes:
+        model: The frozen copy.
+    """
+
+    def __init__(self, model: WorldModel) -> None:
+        self.model = copy.copy(model)  # shares every module
+        self.model._modules = dict(model._modules)
+        self._pairs: list[tuple[Tensor, Tensor]] = []
+        for name in ("dynamics", "reward_head", "continue_head"):
+            original = getattr(model, name)
+            frozen = copy.deepcopy(original).requires_grad_(False)
+            outputs = {id(part.output) for part in frozen.modules() if isinstance(part, Mlp)}
+            for part in frozen.modules():
+                if isinstance(part, nn.Linear) and id(part) not in outputs:
+                    part.to(model.trunk_dtype)
+            setattr(self.model, name, frozen)
+            self._pairs += zip(frozen.parameters(), original.parameters(), strict=True)
+
+    @torch.no_grad()
+    def refresh(self) -> None:
+        """Copy the present weights of the model."""
+        frozen, original = zip(*self._pairs, strict=True)
+        torch._foreach_copy_(list(frozen), list(original))

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from latentplan.config import UserError
-from latentplan.training.collection.rewards import RewardCheck
+from latentplan.training.collection.collector import RewardCheck
 
 NONE = np.array([False])
 

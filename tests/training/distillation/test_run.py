@@ -15,8 +15,7 @@ from latentplan.training import distill, resume_distillation
 from latentplan.training.distillation.labels import Demonstrations, plan_actions
 from latentplan.training.distillation.run import Comparison
 from latentplan.training.distillation.student import Student
-from latentplan.training.folder import DISTILLATION_FILE, lock_folder
-from latentplan.training.state import INTERRUPTED
+from latentplan.training.state import DISTILLATION_FILE, INTERRUPTED, lock_folder
 
 INFO = {"domain": "user", "task": "push", "env_frames": 7, "discount": 0.9, "metrics": [{"planner": 1.0}]}
 PLANNER = PlannerConfig(

@@ -18,14 +18,12 @@ from latentplan.objectives.box import box_degree, box_of
 from latentplan.objectives.parser import parse_objective
 from latentplan.replay.buffer import Replay, Rows
 from latentplan.training import learn_goals, resume_goals
-from latentplan.training.folder import GOALS_FILE, lock_folder
 from latentplan.training.goal_conditioning import learner as goal_learner
-from latentplan.training.goal_conditioning import play
+from latentplan.training.goal_conditioning import run as goal_run
 from latentplan.training.goal_conditioning.learner import Boxes, BoxSource, GoalLearner
-from latentplan.training.goal_conditioning.play import describe_box
-from latentplan.training.goal_conditioning.run import load_replay
+from latentplan.training.goal_conditioning.run import describe_box, load_replay
 from latentplan.training.learner.optimization import descend
-from latentplan.training.state import INTERRUPTED
+from latentplan.training.state import GOALS_FILE, INTERRUPTED, lock_folder
 
 LABELS = {"height": 0.5, "speed": 1.0, "task.walk": 0.5}
 INFO = {"domain": "walker", "task": "walk", "env_frames": 7, "discount": 0.9, "metrics": []}
@@ -220,7 +218,7 @@ def test_learn_goals_refuses_folders_and_agents_it_cannot_use(run, finished, tin
 @pytest.fixture
 def cartpole(tiny, monkeypatch):
     """Settings and quantities of a cartpole agent that plays short rounds."""
-    monkeypatch.setattr(play, "ROUND_DECISIONS", 25)
+    monkeypatch.setattr(goal_run, "ROUND_DECISIONS", 25)
     env = {"domain": "cartpole", "task": "swingup", "action_repeat": 50, "render_quality": "fastest"}
     return tiny("", env=env), {quantity.name: quantity.scale for quantity in QUANTITIES["cartpole"]}
 

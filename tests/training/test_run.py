@@ -10,7 +10,7 @@ from latentplan.agents.checkpoint import load_agent, read_info
 from latentplan.config import UserError
 from latentplan.training import resume, train
 from latentplan.training.callbacks import COLUMNS
-from latentplan.training.folder import lock_folder
+from latentplan.training.state import lock_folder
 from tests.training.run_folder import read_epochs, read_rows, read_state
 
 LOSSES = (
