@@ -34,7 +34,7 @@ def test_main_prints_the_version(argv, capsys):
     ("argv", "expected"),
     [
         (["trian"], "unknown command 'trian'; did you mean 'train'?"),
-        (["qqq"], "unknown command 'qqq'; available: train, eval, distill, goals, export, doctor"),
+        (["qqq"], f"unknown command 'qqq'; available: {', '.join(COMMANDS)}"),
         (["--hel"], "unknown command '--hel'"),
         (["doctor", "--fast"], "unknown flag '--fast'"),
         (["export", "--out", "actor.pt2"], "flag --checkpoint is missing"),
