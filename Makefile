@@ -36,7 +36,7 @@ soak: $(STAMP)
 	@$(BIN)/python $(if $(ARGS),scripts/benchmark.py soak $(ARGS),-m pytest -m soak)
 
 docs: $(DOCS_STAMP)
-	$(BIN)/sphinx-build -W --keep-going -b html docs build/docs
+	$(BIN)/sphinx-build -q -W --keep-going -b html docs build/docs
 	@echo "open build/docs/index.html"
 
 clean:
