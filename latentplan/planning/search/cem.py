@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from functools import cached_property
 from typing import Any
 
@@ -45,6 +45,20 @@ class CEMPlanner(SearchOptions):
     def __post_init__(self) -> None:
         super().__post_init__()
         _check_problem(self)
+
+    @classmethod
+    def from_config(
+        cls,
+        config: SearchOptions,
+        action_dim: int,
+        discount: float,
+        *,
+        action_low: Bound = -1.0,
+        action_high: Bound = 1.0,
+    ) -> CEMPlanner:
+        """Returns the planner with the options of a configuration, for actions of `action_dim` numbers."""
+        options: dict[str, Any] = {option.name: getattr(config, option.name) for option in fields(SearchOptions)}
+        return cls(action_dim=action_dim, discount=discount, action_low=action_low, action_high=action_high, **options)
 
     @cached_property
     def pace(self) -> Pace:

@@ -5,7 +5,8 @@ import dataclasses
 import pytest
 import torch
 
-from latentplan.planning import CEMPlanner, FunctionModel, ModelPredictiveController
+from latentplan.config import PlannerConfig
+from latentplan.planning import CEMPlanner, FunctionModel, ModelPredictiveController, SearchOptions
 
 RICH = {"num_policy_samples": 6, "keep_elite_fraction": 0.3, "noise_beta": 1.0, "tail": "policy"}
 
@@ -304,3 +305,12 @@ def test_plan_names_wrong_shapes_from_the_model(point, states, make_planner):
     plan = make_planner().plan(point, states[:3])
     with pytest.raises(ValueError, match="last plan is for 3 environments and actions of 2, this search for 5"):
         make_planner().plan(point, states, plan)
+
+
+def test_from_config_takes_every_option_of_a_configuration():
+    config = PlannerConfig(horizon=3, num_samples=24, num_elites=6, final="best", surprise_limit=2.0)
+    planner = CEMPlanner.from_config(config, 2, 0.9, action_low=(-1.0, 0.0))
+    assert all(
+        getattr(planner, option.name) == getattr(config, option.name) for option in dataclasses.fields(SearchOptions)
+    )
+    assert (planner.action_dim, planner.discount, planner.action_low) == (2, 0.9, (-1.0, 0.0))
