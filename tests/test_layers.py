@@ -19,7 +19,7 @@ ROOMS = {
     "models": (("config",), {"torch", "einops"}),
     "replay": (("config",), {"numpy", "torch", "einops"}),
     "reporting": (("config",), {"numpy", "cv2", "matplotlib"}),
-    "objectives": (("config", "planning", "models", "replay"), {"torch", "einops", "numpy", "cv2", "lark"}),
+    "objectives": (("config", "planning", "models", "replay"), {"torch", "einops", "numpy", "cv2"}),
     "envs": (BELOW_AGENTS, {*SIMULATION, "numpy", "cv2"}),
     "agents": (BELOW_AGENTS, {"torch", "numpy", "einops", "safetensors"}),
     "evaluation": ((*BELOW_AGENTS, "envs", "agents"), {"numpy", "scipy", "torch", "gymnasium"}),

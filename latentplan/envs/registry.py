@@ -8,6 +8,7 @@ one), and returns a `gymnasium.Env` with these spaces and values:
     reset                   depends on `seed` alone where one is given, else continues the random stream
     step                    holds the action for `config.action_repeat` control steps and sums the rewards
     info["env_frames"]      control steps that this step took; 0 from `reset`
+    render                  the present frame, uint8 (height, width, 3)
 
 `latentplan.envs.wrap_user_env` adapts any gymnasium environment with image observations. Further attributes are
 optional; each of them enables one feature:

@@ -1,6 +1,7 @@
 """Backends that compute a world model faster than plain torch, with the same results up to rounding.
 
-`accelerate` gives a model the backend for its device. The backends are the only callers of the other modules.
+`accelerate` gives a model the backend for its device. The other modules compute for the backends; the exported
+actor uses `one_frame` too.
 """
 
 from __future__ import annotations
