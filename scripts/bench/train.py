@@ -1,10 +1,12 @@
 """`benchmark.py train`: time of an update of the learner, part by part, on synthetic replay.
 
-The table shows milliseconds, GFLOP and GFLOP/s of each part, beside the GFLOP/s of a large matrix product.
+The table shows milliseconds, GFLOP and GFLOP/s of each part, beside the GFLOP/s of a large matrix product. With
+`--against REV` another commit is timed in turns with this tree, so that a speed-up is a ratio of one sitting.
 """
 
 from __future__ import annotations
 
+import json
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -24,6 +26,7 @@ class Request(ComposeRequest):
     Attributes:
         updates: Timed updates.
         json: Result as JSON.
+        against: Commit to compare with: both trees are timed in turns, and the ratio of updates per second is printed.
         model: Settings of the model.
         learning: Settings of the learning.
         replay: Settings of the replay.
@@ -31,6 +34,7 @@ class Request(ComposeRequest):
 
     updates: int = 20
     json: Path | None = option(None, metavar="FILE", is_output=True)
+    against: str | None = option(None, metavar="REV")
     model: dict[str, Any] = overrides(ModelConfig, prefix="model.")
     learning: dict[str, Any] = overrides(LearningConfig, prefix="learning.")
     replay: dict[str, Any] = overrides(ReplayConfig, prefix="replay.")
@@ -42,6 +46,9 @@ class Request(ComposeRequest):
 
 def run(request: Request) -> int:
     """Times updates on synthetic replay and prints the time of each part."""
+    from bench.against import compare_with, find_commit
+
+    commit = None if request.against is None else find_commit(request.against)
     config = request.compose({"model": request.model, "learning": request.learning, "replay": request.replay})
     device_name = request.use_device()
     action_dim = request.action_size(config)
@@ -65,8 +72,24 @@ def run(request: Request) -> int:
         "fraction_of_limit": {name: measured["flop_per_s"] / limit for name, limit in limits.items()},
     }
     print(_summary(result))
+    if commit is not None:
+        result["compare"] = compared = compare_with(commit, "train", _repeat_flags(request), "updates_per_s")
+        print(f"{compared['ratio']:.3f} times the updates/s of {compared['commit'][:12]} (medians, in turns)")
     write_json(request.json, result)
     return 0
+
+
+def _repeat_flags(request: Request) -> list[str]:
+    """The flags that time the same updates again."""
+    single = ("domain", "preset", "action_dim", "updates", "device", "threads")
+    given = {f"--{name.replace('_', '-')}": getattr(request, name) for name in single}
+    for section in ("model", "learning", "replay"):
+        given |= {f"--{section}.{name}": value for name, value in getattr(request, section).items()}
+    return [
+        f"{flag}={json.dumps(value) if isinstance(value, tuple | bool) else value}"
+        for flag, value in given.items()
+        if value is not None
+    ]
 
 
 def _summary(result: dict[str, Any]) -> str:

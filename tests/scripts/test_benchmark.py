@@ -249,3 +249,31 @@ def test_ablate_returns_do_not_depend_on_the_number_of_workers(tmp_path, save_ag
     )
     for name in ("full", "actor"):
         assert alone[name]["returns"] == together[name]["returns"]
+
+
+def test_train_against_a_commit_reports_the_ratio_of_both_trees(tmp_path, monkeypatch):
+    monkeypatch.setattr("bench.against.ROUNDS", 1)
+    speeds = {"tree": 2.0, "this": 3.0}
+    measured = []
+
+    def measure(tree, command, flags):
+        measured.append((command, list(flags)))
+        assert (tree / "scripts" / "benchmark.py").is_file()
+        return {"updates_per_s": speeds["tree" if tree.name == "tree" else "this"]}
+
+    monkeypatch.setattr("bench.against._measure", measure)
+    flags = ["--learning.batch_size=2", "--learning.sequence_length=3", "--learning.imagination_starts=4"]
+    flags += ["--learning.imagination_horizon=2", "--model.encoder_channels=[4, 4]", "--model.deter_dim=8"]
+    always = ["--action-dim=1", "--updates=1", "--device=cpu", "--threads=1"]
+    path = tmp_path / "result.json"
+    assert benchmark.main(["train", *always, *flags, "--against", "HEAD", "--json", str(path)]) == 0
+    compared = json.loads(path.read_text())["compare"]
+    assert compared["ratio"] == 1.5 and len(compared["commit"]) == 40
+    assert [(command, sorted(words)) for command, words in measured] == [("train", sorted(always + flags))] * 2
+
+
+def test_train_refuses_an_unknown_commit_in_one_line(capsys):
+    flags = ["--learning.batch_size=2", "--learning.sequence_length=3", "--model.deter_dim=8", "--updates=1"]
+    assert benchmark.main(["train", "--action-dim=1", "--device=cpu", *flags, "--against", "no-such-commit"]) == 2
+    error = capsys.readouterr().err
+    assert error.count("\n") == 1 and "--against 'no-such-commit' is no commit of this checkout" in error
