@@ -6,11 +6,10 @@ A new planner is one module with a class that satisfies `Planner`, and one line 
 from __future__ import annotations
 
 import dataclasses
-import difflib
 from collections.abc import Callable, Sequence
 from typing import Any, Protocol
 
-from latentplan.config import UserError
+from latentplan.config.parsing import raise_unknown
 from latentplan.config.planner import SearchOptions
 from latentplan.planning.model import Bound, State
 from latentplan.planning.objectives import Constraint, Term
@@ -109,9 +108,7 @@ def make_planner(name: str, options: SearchOptions | None = None, **settings: An
         ValueError: An option has a value that is not allowed.
     """
     if name not in PLANNERS:
-        nearest = difflib.get_close_matches(name, PLANNERS, n=1, cutoff=0.5)
-        hint = f"; did you mean {nearest[0]!r}?" if nearest else ""
-        raise UserError(f"unknown planner {name!r}; available: {', '.join(PLANNERS)}{hint}")
+        raise_unknown("planner", name, PLANNERS)
     changed: dict[str, Any] = {}
     if options is not None:
         fields = dataclasses.fields(SearchOptions)
