@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from functools import partial
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import torch
 from einops import rearrange
@@ -18,6 +18,7 @@ from torch import Tensor
 from latentplan.models.dynamics import Gaussian, State
 
 if TYPE_CHECKING:
+    from latentplan.models.heads import Mlp, ScalarHead
     from latentplan.models.world_model import WorldModel
 
 
@@ -154,9 +155,26 @@ class Backend:
         """See `Dynamics.imagine`, with the model's actor as the policy; gradients reach the actor."""
         return model.dynamics.imagine(model.actor, start, action_noise, noise, decay)
 
-    def call(self, function: Callable[..., Any], *arguments: Any) -> Any:
-        """The result of a function of tensors; a faster backend may compile the function."""
-        return function(*arguments)
+    def apply(self, network: Mlp, features: Tensor) -> Tensor:
+        """The outputs of a network, (..., out), for features (..., in); gradients reach features and weights."""
+        outputs: Tensor = network(features)
+        return outputs
+
+    def mean(self, head: ScalarHead, logits: Tensor) -> Tensor:
+        """See `ScalarHead.mean`; gradients reach the logits."""
+        return head.mean(logits)
+
+    def cross_entropy(self, head: ScalarHead, logits: Tensor, targets: Tensor) -> Tensor:
+        """See `ScalarHead.loss`; gradients reach the logits."""
+        return head.loss(logits, targets)
+
+    def lambda_return(self, rewards: Tensor, discounts: Tensor, values: Tensor, lambda_: float) -> Tensor:
+        """See the function `lambda_return`; gradients reach rewards, discounts and values."""
+        return lambda_return(rewards, discounts, values, lambda_)
+
+    def frozen_dtype(self, model: WorldModel) -> torch.dtype:
+        """The precision in which `imagine` reads weights without a gradient fastest."""
+        return self.trunk_dtype
 
     @torch.no_grad()
     def move_towards(self, slow: Sequence[Tensor], fast: Sequence[Tensor], rate: float | Tensor) -> None:
@@ -169,6 +187,27 @@ class Backend:
         """
         for slow_tensor, fast_tensor in zip(slow, fast, strict=True):
             slow_tensor.lerp_(fast_tensor, rate)
+
+
+def lambda_return(rewards: Tensor, discounts: Tensor, values: Tensor, lambda_: float) -> Tensor:
+    """λ-returns (Sutton and Barto 2018, eq. 12.18, with a discount per step).
+
+    Args:
+        rewards: rewards[t] arrives with state t + 1, (time, ...).
+        discounts: discounts[t] weighs the return from state t + 1 on, (time, ...); 0 where the episode ended.
+        values: values[t] is the value of state t + 1, (time, ...).
+        lambda_: Weight in [0, 1] of longer returns: 0 gives one-step targets, 1 the whole return.
+
+    Returns:
+        Returns from state t on, (time, ...).
+    """
+    following, returns = values[-1], []
+    steps = zip(rewards.unbind(), discounts.unbind(), values.unbind(), strict=True)
+    for reward, discount, value in reversed(list(steps)):
+        mixed = (1.0 - lambda_) * value + lambda_ * following
+        following = reward + discount * mixed
+        returns.append(following)
+    return torch.stack(returns[::-1])
 
 
 def _act(model: WorldModel, state: State) -> tuple[Tensor, Tensor]:

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from latentplan.models.heads import NormedLinear, sample_action
+from latentplan.models.heads import NormedLinear, sample_action, single_or_double
 
 MIN_STD = 0.1
 UPDATE_SHIFT = 1.0  # subtracted before the update gate's sigmoid, so that untrained states change slowly
@@ -190,7 +190,7 @@ def next_deter(gates: Tensor, deter: Tensor) -> Tensor:
 
 def gaussian(raw: Tensor) -> Gaussian:
     """The latent's distribution from a layer's output (..., 2 latent); std in [0.1, 2.1]."""
-    mean, raw_std = raw.float().chunk(2, -1)
+    mean, raw_std = single_or_double(raw).chunk(2, -1)
     return Gaussian(mean, 2.0 * torch.sigmoid(raw_std / 2.0) + MIN_STD)
 
 

@@ -32,7 +32,7 @@ class NormedLinear(nn.Module):
 
 
 class Mlp(nn.Module):
-    """Two normed hidden layers and a linear output that is always computed in float32."""
+    """Two normed hidden layers and a linear output that is never computed in less than float32."""
 
     def __init__(self, in_features: int, hidden_dim: int, out_features: int, output_scale: float = 1.0) -> None:
         super().__init__()
@@ -46,7 +46,7 @@ class Mlp(nn.Module):
         """Outputs, float32 (..., out), for features (..., in)."""
         hidden = self.trunk(features)
         with torch.autocast(hidden.device.type, enabled=False):
-            return self.output(hidden.float())
+            return self.output(single_or_double(hidden))
 
 
 class ScalarHead(nn.Module):
@@ -90,6 +90,11 @@ class Actor(nn.Module):
     def forward(self, features: Tensor) -> tuple[Tensor, Tensor]:
         """Mean and std of the action, float32 (..., action) each, for features (..., in)."""
         return action_distribution(self.mlp(features))
+
+
+def single_or_double(values: Tensor) -> Tensor:
+    """The values in float32, or in float64 if they are float64."""
+    return values.to(torch.promote_types(values.dtype, torch.float32))
 
 
 def action_distribution(raw: Tensor) -> tuple[Tensor, Tensor]:

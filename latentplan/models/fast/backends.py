@@ -10,11 +10,12 @@ from typing import Any, cast
 import torch
 from torch import Tensor, nn
 
-from latentplan.models.backend import Backend, FrameFunctions
+from latentplan.models.backend import Backend, FrameFunctions, lambda_return
 from latentplan.models.dynamics import Gaussian, Rssm, State
-from latentplan.models.fast import compiled, one_frame, pointwise, unroll
+from latentplan.models.fast import compiled, native, native_heads, native_unroll, one_frame, pointwise, unroll
 from latentplan.models.fast import frames as sliced_frames
 from latentplan.models.fast import rollout as rollouts
+from latentplan.models.heads import Mlp, ScalarHead, action_distribution
 from latentplan.models.world_model import WorldModel
 
 ROLLOUT_PARTS = ("dynamics", "reward_head", "value_head", "actor")
@@ -129,6 +130,56 @@ class CpuBackend(_ConvertingBackend):
         """See `Backend.turn_frames`."""
         return sliced_frames.turn_by_slices(frames, amounts)
 
+    def observe(
+        self, model: WorldModel, embeddings: Tensor, actions: Tensor, deter: Tensor, noise: Tensor
+    ) -> tuple[State, Gaussian]:
+        """See `Backend.observe`."""
+        if not native.fits(model.dynamics):
+            return super().observe(model, embeddings, actions, deter, noise)
+        return native_unroll.observe(_rssm(model), embeddings, actions, deter, noise)
+
+    def predict(self, model: WorldModel, start: State, actions: Tensor) -> tuple[Tensor, Gaussian]:
+        """See `Backend.predict`; gradients do not reach the start."""
+        if not native.fits(model.dynamics):
+            return super().predict(model, start, actions)
+        return native_unroll.predict(_rssm(model), start, actions)
+
+    def imagine(
+        self, model: WorldModel, start: State, action_noise: Tensor, noise: Tensor, decay: float
+    ) -> tuple[Tensor, Tensor]:
+        """See `Backend.imagine`; the weights of the dynamics get no gradient."""
+        if not (native.fits(model.dynamics) and native.fits(model.actor)):
+            return super().imagine(model, start, action_noise, noise, decay)
+
+        def act(features: Tensor) -> tuple[Tensor, Tensor]:
+            return action_distribution(self.apply(model.actor.mlp, features))
+
+        return native_unroll.imagine(_rssm(model), model.actor, start, action_noise, noise, decay, act)
+
+    def apply(self, network: Mlp, features: Tensor) -> Tensor:
+        """See `Backend.apply`."""
+        return native_heads.apply(network, features) if native.fits(network) else super().apply(network, features)
+
+    def mean(self, head: ScalarHead, logits: Tensor) -> Tensor:
+        """See `Backend.mean`."""
+        return native_heads.mean(head, logits) if native.fits(head) else super().mean(head, logits)
+
+    def cross_entropy(self, head: ScalarHead, logits: Tensor, targets: Tensor) -> Tensor:
+        """See `Backend.cross_entropy`."""
+        if not native.fits(head):
+            return super().cross_entropy(head, logits, targets)
+        return native_heads.cross_entropy(head, logits, targets)
+
+    def lambda_return(self, rewards: Tensor, discounts: Tensor, values: Tensor, lambda_: float) -> Tensor:
+        """See `Backend.lambda_return`."""
+        known = rewards.device.type == "cpu" and native.find_kernels(rewards.dtype) is not None
+        compute = native_heads.lambda_return if known else super().lambda_return
+        return compute(rewards, discounts, values, lambda_)
+
+    def frozen_dtype(self, model: WorldModel) -> torch.dtype:
+        """See `Backend.frozen_dtype`; compiled functions read float32."""
+        return torch.float32 if native.fits(model.dynamics) else self.trunk_dtype
+
     def _packed(self, model: WorldModel) -> compiled.Packed | None:
         """Weights for compiled calls; None if torch has to compute, or if gradients could be required."""
         return None if torch.is_grad_enabled() else self._weights(model).packed
@@ -160,9 +211,10 @@ class GpuBackend(_ConvertingBackend):
         """See `Backend.imagine`; the weights of the dynamics get no gradient."""
         return unroll.imagine(_rssm(model), model.actor, start, action_noise, noise, decay)
 
-    def call(self, function: Callable[..., Any], *arguments: Any) -> Any:
-        """See `Backend.call`."""
-        return pointwise.run(function, *arguments)
+    def lambda_return(self, rewards: Tensor, discounts: Tensor, values: Tensor, lambda_: float) -> Tensor:
+        """See `Backend.lambda_return`."""
+        returns: Tensor = pointwise.run(lambda_return, rewards, discounts, values, lambda_)
+        return returns
 
     @torch.no_grad()
     def move_towards(self, slow: Sequence[Tensor], fast: Sequence[Tensor], rate: float | Tensor) -> None:

@@ -1,9 +1,9 @@
 // Rollouts along the mean of the prior. A thread computes all steps of 32 rows before the next 32, so that its working
 // memory stays in the core's cache. Products are bfloat16 with float32 sums; elementwise work is float32.
 
-#include <stddef.h>
+#include "products.h"
 
-#if !defined(__AVX512BF16__)
+#if PAIR != 2
 
 int can_imagine(void) { return 0; }
 int imagine(void) { return 1; }
@@ -15,7 +15,6 @@ int imagine(void) { return 1; }
 #include "vectors.h"
 
 #define BLOCK 32
-#define TILE 16
 #define ALIGNMENT 64
 
 // A product's weights are stored in tiles of 16 columns x 32 rows, with the rows in pairs: (column tile, row tile,
@@ -45,87 +44,16 @@ typedef struct {
     long width, count;
 } Workspace;
 
-#if defined(__AMX_BF16__) && defined(__linux__)
-#include <sys/syscall.h>
-#include <unistd.h>
-#define ASK_FOR_TILES 0x1023  // ARCH_REQ_XCOMP_PERM of arch_prctl(2)
-#define TILE_DATA 18
+int can_imagine(void) { return can_multiply(); }
 
-int can_imagine(void) { return syscall(SYS_arch_prctl, ASK_FOR_TILES, TILE_DATA) == 0; }
-
-static void set_up(void) {
-    struct {
-        uint8_t palette, start_row, reserved[14];
-        uint16_t bytes[16];
-        uint8_t rows[16];
-    } __attribute__((aligned(ALIGNMENT))) tiles = {.palette = 1};
-    for (int i = 0; i < 8; i++) {
-        tiles.bytes[i] = 64;
-        tiles.rows[i] = 16;
-    }
-    _tile_loadconfig(&tiles);
+static void apply(Workspace *work, const bfloat16 *rows, const Layer *layer) {
+    long count = (work->count + TILE - 1) / TILE * TILE, outputs = layer->outputs;
+    multiply(rows, work->width, count, layer->weights, layer->inputs, outputs, work->product, outputs);
 }
-
-static void tear_down(void) { _tile_release(); }
-
-static void multiply(Workspace *work, const bfloat16 *rows, const Layer *layer) {
-    long width = work->width;
-    for (long column = 0; column < layer->outputs; column += 2 * TILE) {
-        const bfloat16 *left = layer->weights + column * layer->inputs, *right = left + TILE * layer->inputs;
-        _tile_zero(0);
-        _tile_zero(1);
-        _tile_zero(2);
-        _tile_zero(3);
-        for (long k = 0; k < layer->inputs; k += 32) {
-            _tile_loadd(4, rows + k, width * 2);
-            _tile_loadd(6, left + k * TILE, 64);
-            _tile_loadd(5, rows + TILE * width + k, width * 2);
-            _tile_loadd(7, right + k * TILE, 64);
-            _tile_dpbf16ps(0, 4, 6);
-            _tile_dpbf16ps(1, 4, 7);
-            _tile_dpbf16ps(2, 5, 6);
-            _tile_dpbf16ps(3, 5, 7);
-        }
-        float *upper = work->product + column, *lower = upper + TILE * layer->outputs;
-        _tile_stored(0, upper, layer->outputs * 4);
-        _tile_stored(1, upper + TILE, layer->outputs * 4);
-        _tile_stored(2, lower, layer->outputs * 4);
-        _tile_stored(3, lower + TILE, layer->outputs * 4);
-    }
-}
-
-#else
-
-int can_imagine(void) { return 1; }
-static void set_up(void) {}
-static void tear_down(void) {}
-
-static void multiply(Workspace *work, const bfloat16 *rows, const Layer *layer) {
-    long width = work->width;
-    for (long top = 0; top < work->count; top += TILE) {
-        for (long column = 0; column < layer->outputs; column += TILE) {
-            const bfloat16 *weights = layer->weights + column * layer->inputs;
-            __m512 sums[TILE];
-            for (int r = 0; r < TILE; r++) sums[r] = _mm512_setzero_ps();
-            for (long k = 0; k < layer->inputs; k += 2) {
-                __m512i pairs = _mm512_load_si512(weights + k * TILE);
-                for (int r = 0; r < TILE; r++) {
-                    int32_t pair;
-                    memcpy(&pair, rows + (top + r) * width + k, sizeof pair);
-                    sums[r] = _mm512_dpbf16_ps(sums[r], (__m512bh)_mm512_set1_epi32(pair), (__m512bh)pairs);
-                }
-            }
-            float *place = work->product + top * layer->outputs + column;
-            for (int r = 0; r < TILE; r++) _mm512_storeu_ps(place + r * layer->outputs, sums[r]);
-        }
-    }
-}
-
-#endif
 
 // One hidden layer of every row, written to `hidden`.
 static void apply_layer(Workspace *work, const bfloat16 *from, const Layer *layer) {
-    multiply(work, from, layer);
+    apply(work, from, layer);
     for (long r = 0; r < work->count; r++) {
         const float *row = work->product + r * layer->outputs;
         silu_row(work->hidden + r * work->width, row, layer->scale, layer->shift, layer->outputs);
@@ -138,7 +66,7 @@ static void apply_mlp(Workspace *work, const Mlp *mlp) {
     long half = output->outputs / 2;
     apply_layer(work, work->stoch, &mlp->first);
     apply_layer(work, work->hidden, &mlp->second);
-    multiply(work, work->hidden, output);
+    apply(work, work->hidden, output);
     for (long r = 0; r < work->count; r++) {
         float *row = work->product + r * output->outputs;
         VECTOR() for (long i = 0; i < half; i++) row[i] += row[half + i] + output->shift[i];
@@ -147,14 +75,14 @@ static void apply_mlp(Workspace *work, const Mlp *mlp) {
 
 static void advance(Workspace *work, const Model *model) {
     apply_layer(work, work->rows, &model->input);
-    multiply(work, work->rounded, &model->gates);
+    apply(work, work->rounded, &model->gates);
     for (long r = 0; r < work->count; r++) {
         const float *row = work->product + r * model->gates.outputs;
         float *deter = work->deter + r * model->deter;
         gate_row(deter, work->rounded + r * work->width, row, model->gates.scale, model->gates.shift, model->deter);
     }
     apply_layer(work, work->rounded, &model->prior);
-    multiply(work, work->hidden, &model->mean);
+    apply(work, work->hidden, &model->mean);
     for (long r = 0; r < work->count; r++) {
         const float *row = work->product + r * model->latent;
         bfloat16 *stoch = work->stoch + r * work->width;
@@ -169,8 +97,6 @@ static void read_bins(Workspace *work, const Model *model, const Mlp *head, floa
         scalars[r * apart] = wide_expected(work->product + r * head->output.outputs, model->bin_values, model->bins);
 }
 
-static long padded(long size) { return (size + BLOCK - 1) / BLOCK * BLOCK; }
-
 static size_t workspace_floats(const Model *model) {
     long widest = 3 * model->deter;
     widest = widest > model->hidden ? widest : model->hidden;
@@ -182,13 +108,13 @@ static size_t workspace_floats(const Model *model) {
 }
 
 static float *allocate_workspace(const Model *model) {
-    set_up();
+    set_up_products();
     return aligned_alloc(ALIGNMENT, (workspace_floats(model) * sizeof(float) + ALIGNMENT - 1) / ALIGNMENT * ALIGNMENT);
 }
 
 static void free_workspace(float *memory) {
     free(memory);
-    tear_down();
+    tear_down_products();
 }
 
 // Copies up to BLOCK rows into the working memory of a thread; missing rows are zeros.

@@ -15,6 +15,7 @@ import platform
 import shutil
 import subprocess
 import tempfile
+from collections.abc import Sequence
 from pathlib import Path
 
 import torch
@@ -22,7 +23,10 @@ from torch import Tensor
 
 from latentplan.models.fast import pointwise
 
-SOURCES = tuple(Path(__file__).with_name(name) for name in ("rows.h", "vectors.h", "kernels.c", "imagine.c"))
+FOLDER = Path(__file__).parent
+HEADERS = ("rows.h", "vectors.h", "products.h", "layers.h")
+LEARNED = ("unroll.c", "heads.c")  # with gradients
+PLANNED = ("kernels.c", "imagine.c")
 # Sums may be reordered, because compilers cannot vectorize them otherwise; all other rules of IEEE 754 hold.
 ARITHMETIC = ("-fassociative-math", "-fno-signed-zeros", "-fno-trapping-math", "-fno-math-errno")
 FLAGS = ("-O3", "-march=native", *ARITHMETIC, "-fopenmp", "-shared", "-fPIC")
@@ -94,15 +98,28 @@ def _pointers(*tensors: Tensor) -> list[int]:
 
 
 @functools.cache
-def load() -> ctypes.CDLL | None:
-    """The compiled library; None if it is switched off or cannot be built."""
+def load(*, is_exact: bool = False) -> ctypes.CDLL | None:
+    """The compiled library; None if it is switched off or cannot be built.
+
+    Args:
+        is_exact: Whether the functions with gradients compute in float64, without rounding; then the library holds
+            these functions alone.
+    """
     if os.environ.get("LATENTPLAN_KERNELS") == "0":
         return None
     try:
-        library = ctypes.CDLL(str(_compile()))
+        library = ctypes.CDLL(str(_compile(LEARNED, ["-DEXACT"]) if is_exact else _compile(PLANNED + LEARNED, [])))
     except (OSError, RuntimeError, subprocess.SubprocessError):
         return None
-    place, count, threads = ctypes.c_void_p, ctypes.c_long, ctypes.c_int
+    place, count, threads, number = ctypes.c_void_p, ctypes.c_long, ctypes.c_int, ctypes.c_double
+    library.unroll.argtypes = library.apply_network.argtypes = [place, threads]
+    library.unroll_back.argtypes = library.apply_network_back.argtypes = [place, place, threads]
+    library.mean_of_bins.argtypes = [place] * 4 + [count, count]
+    library.cross_entropy.argtypes = [place] * 5 + [count, count]
+    library.lambda_return.argtypes = [place] * 3 + [number, place, count, count]
+    library.lambda_return_back.argtypes = [place] * 3 + [number] + [place] * 4 + [count, count]
+    if is_exact:
+        return library
     for dtype in DTYPES.values():
         getattr(library, f"norm_silu_{dtype}").argtypes = [place] * 3 + [count, count, threads]
         getattr(library, f"gates_{dtype}").argtypes = [place] * 6 + [count, count, threads]
@@ -111,8 +128,8 @@ def load() -> ctypes.CDLL | None:
     return library
 
 
-def _compile() -> Path:
-    """The path of the compiled library, which is built if it is not in the cache.
+def _compile(names: Sequence[str], options: Sequence[str]) -> Path:
+    """The path of the library compiled from some sources, which is built if it is not in the cache.
 
     Raises:
         OSError: There is no compiler, or the cache cannot be written.
@@ -123,8 +140,9 @@ def _compile() -> Path:
     if compiler is None:
         raise FileNotFoundError("no C compiler")
     wide = [WIDE] if platform.machine() in ("x86_64", "AMD64") else []
-    command = [*compiler.split(), *FLAGS, *wide, *(str(source) for source in SOURCES if source.suffix == ".c")]
-    texts = [source.read_text() for source in SOURCES]
+    sources = [FOLDER / name for name in names]
+    command = [*compiler.split(), *FLAGS, *wide, *options, *map(str, sources), "-lm"]
+    texts = [source.read_text() for source in (*(FOLDER / name for name in HEADERS), *sources)]
     key = hashlib.sha256("\n".join([*command, _describe_processor(), *texts]).encode()).hexdigest()[:16]
     home = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "latentplan"
     library = home / f"kernels-{key}.so"

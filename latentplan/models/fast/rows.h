@@ -1,4 +1,5 @@
-// Elementwise work on single rows in float32, in loops that the compiler can vectorize.
+// Elementwise work on single rows, in loops that the compiler can vectorize. Numbers are float32; with EXACT they are
+// float64, so that tests can compare formulas with autograd to the last digits.
 
 #ifndef LATENTPLAN_ROWS_H
 #define LATENTPLAN_ROWS_H
@@ -7,12 +8,18 @@
 #include <stdint.h>
 #include <string.h>
 
-#define NORM_EPS 1e-5f
+#define NORM_EPS ((real)1e-5)
 
 #define PRAGMA(TEXT) _Pragma(#TEXT)
 #define VECTOR(HOW) PRAGMA(omp simd HOW)
 
 typedef uint16_t bfloat16;
+
+#ifdef EXACT
+typedef double real;
+#else
+typedef float real;
+#endif
 
 static inline float read_bfloat16(bfloat16 half) {
     uint32_t bits = (uint32_t)half << 16;
@@ -30,6 +37,17 @@ static inline bfloat16 write_bfloat16(float value) {
 
 static inline float read_float(float value) { return value; }
 static inline float write_float(float value) { return value; }
+
+#ifdef EXACT
+
+static inline real exponential(real x) { return exp(x); }
+static inline real square_root(real x) { return sqrt(x); }
+static inline real logarithm(real x) { return log(x); }
+
+#else
+
+static inline real square_root(real x) { return sqrtf(x); }
+static inline real logarithm(real x) { return logf(x); }
 
 // exp(x) = 2^n exp(r) with |r| <= ln(2) / 2; the polynomial is Taylor's of degree 5, relative error 3e-6.
 static inline float exponential(float x) {
@@ -49,42 +67,44 @@ static inline float exponential(float x) {
     return p * power;
 }
 
-static inline float sigmoid(float x) { return 1.0f / (1.0f + exponential(-x)); }
-static inline float hyperbolic_tangent(float x) { return 2.0f * sigmoid(2.0f * x) - 1.0f; }
+#endif
+
+static inline real sigmoid(real x) { return 1 / (1 + exponential(-x)); }
+static inline real hyperbolic_tangent(real x) { return 2 * sigmoid(2 * x) - 1; }
 
 // A layer norm of one row: the mean, and the factor that scales deviations to a variance of 1.
 typedef struct {
-    const float *row, *scale, *shift;
-    float mean, factor;
+    const real *row, *scale, *shift;
+    real mean, factor;
 } Norm;
 
-static inline Norm compute_norm(const float *row, const float *scale, const float *shift, long length) {
-    float sum = 0.0f, squares = 0.0f;
+static inline Norm compute_norm(const real *row, const real *scale, const real *shift, long length) {
+    real sum = 0, squares = 0;
     VECTOR(reduction(+ : sum)) for (long i = 0; i < length; i++) sum += row[i];
-    float mean = sum / (float)length;
+    real mean = sum / (real)length;
     VECTOR(reduction(+ : squares)) for (long i = 0; i < length; i++) squares += (row[i] - mean) * (row[i] - mean);
-    return (Norm){row, scale, shift, mean, 1.0f / sqrtf(squares / (float)length + NORM_EPS)};
+    return (Norm){row, scale, shift, mean, 1 / square_root(squares / (real)length + NORM_EPS)};
 }
 
-static inline float normed(const Norm *norm, long i) {
+static inline real normed(const Norm *norm, long i) {
     return (norm->row[i] - norm->mean) * norm->factor * norm->scale[i] + norm->shift[i];
 }
 
-static inline float silu(float x) { return x * sigmoid(x); }
+static inline real silu(real x) { return x * sigmoid(x); }
 
 // The next state of unit i of the GRU; the row holds reset, candidate and update gates side by side.
-static inline float gated(const Norm *norm, long i, long size, float before) {
-    float reset = sigmoid(normed(norm, i));
-    float candidate = hyperbolic_tangent(reset * normed(norm, size + i));
-    return before + sigmoid(normed(norm, 2 * size + i) - 1.0f) * (candidate - before);
+static inline real gated(const Norm *norm, long i, long size, real before) {
+    real reset = sigmoid(normed(norm, i));
+    real candidate = hyperbolic_tangent(reset * normed(norm, size + i));
+    return before + sigmoid(normed(norm, 2 * size + i) - 1) * (candidate - before);
 }
 
 // The mean of the bins' values under the softmax of a row of logits.
-static inline float expected(const float *row, const float *values, long size) {
-    float highest = -INFINITY, sum = 0.0f, mean = 0.0f;
+static inline real expected(const real *row, const real *values, long size) {
+    real highest = -INFINITY, sum = 0, mean = 0;
     VECTOR(reduction(max : highest)) for (long i = 0; i < size; i++) highest = row[i] > highest ? row[i] : highest;
     VECTOR(reduction(+ : sum, mean)) for (long i = 0; i < size; i++) {
-        float weight = exponential(row[i] - highest);
+        real weight = exponential(row[i] - highest);
         sum += weight;
         mean += weight * values[i];
     }

@@ -45,13 +45,13 @@ def observe(
     dynamics: Rssm, embeddings: Tensor, actions: Tensor, deter: Tensor, noise: Tensor
 ) -> tuple[State, Gaussian]:
     """The same as `Rssm.observe`; gradients reach the weights and the embeddings."""
-    deter, *latent = _Unrolled.apply(embeddings, actions, deter, None, noise, *_collect_weights(dynamics, prior=False))
+    deter, *latent = _Unrolled.apply(embeddings, actions, deter, None, noise, *collect_weights(dynamics, prior=False))
     return State(deter, latent[0]), Gaussian(*latent[1:])
 
 
 def predict(dynamics: Rssm, start: State, actions: Tensor) -> tuple[Tensor, Gaussian]:
     """The same as `Rssm.predict`; gradients reach the weights alone."""
-    weights = _collect_weights(dynamics, prior=True)
+    weights = collect_weights(dynamics, prior=True)
     deter, _, *prior = _Unrolled.apply(None, actions, start.deter, start.stoch, None, *weights)
     return deter, Gaussian(*prior)
 
@@ -72,7 +72,7 @@ def imagine(
     Returns:
         Features, the start first, (horizon + 1, rows, feature); std of the actions, (horizon, rows, action).
     """
-    steps, deter, stoch, features = _Steps(_collect_weights(dynamics, prior=True)), *start, [start.features]
+    steps, deter, stoch, features = _Steps(collect_weights(dynamics, prior=True)), *start, [start.features]
     with torch.no_grad():
         for action_draws, draws in zip(action_noise.unbind(), noise.unbind(), strict=True):
             inputs = run(pointwise.append_action, _apply_mlp(actor.mlp, features[-1]), action_draws, stoch)
@@ -93,7 +93,8 @@ def _apply_mlp(mlp: Mlp, features: Tensor) -> Tensor:
     return torch.addmm(mlp.output.bias, features, mlp.output.weight.T)
 
 
-def _collect_weights(dynamics: Rssm, *, prior: bool) -> Weights:
+def collect_weights(dynamics: Rssm, *, prior: bool) -> Weights:
+    """The parameters of steps that read the latent from the prior, or else from the posterior."""
     first, gates, norm = dynamics.input, dynamics.gates, dynamics.gates_norm
     advance = (first.linear.weight, first.norm.weight, first.norm.bias, gates.weight, norm.weight, norm.bias)
     hidden, norm, output = dynamics.posterior_deter, dynamics.posterior_norm, dynamics.posterior_output

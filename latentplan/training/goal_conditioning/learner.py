@@ -19,7 +19,7 @@ from latentplan.config import GoalsConfig, LearningConfig, derive_seed
 from latentplan.models import State, WorldModel
 from latentplan.objectives.box import box_degree
 from latentplan.replay.buffer import Replay
-from latentplan.training.learner.losses import draw_noise, entropy, lambda_return
+from latentplan.training.learner.losses import draw_noise, entropy
 from latentplan.training.learner.module import Snapshot
 from latentplan.training.learner.optimization import descend, return_scale
 
@@ -123,7 +123,7 @@ class GoalLearner:
         self.model, self.settings, self.learning = model, settings, learning
         self.discount, self.frames_per_step = discount, frames_per_step
         self.updates, self.return_range = 0, torch.zeros((), device=model.device)
-        self.frozen_model = Snapshot(model).model
+        self.frozen_model = Snapshot(model, model.trunk_dtype).model
         self.target = copy.deepcopy(model.goal_heads).requires_grad_(False)
         parameters = [*model.goal_heads.requires_grad_(True).parameters()]
         self.optimizer = torch.optim.Adam(parameters, lr=settings.learning_rate, eps=1e-6, fused=True)
@@ -152,8 +152,8 @@ class GoalLearner:
             degrees = box_degree(low, high, self.model.goal_quantities(features[1:]), scales)  # (horizon, rows)
             values = self.target.value(features[1:], code)
         discounts = torch.full_like(degrees, self.discount)
-        returns = self.model.backend.call(
-            lambda_return, self.frames_per_step * degrees, discounts, values, self.learning.lambda_
+        returns = self.model.backend.lambda_return(
+            self.frames_per_step * degrees, discounts, values, self.learning.lambda_
         )
         reach = torch.cat([torch.ones_like(discounts[:1]), discounts[:-1]]).cumprod(0)
         gains = returns / return_scale(self.return_range, returns.detach()) + settings.entropy_scale * entropies

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from latentplan.config import LearningConfig
 from latentplan.models import Gaussian, State, WorldModel, kl_divergence
-from latentplan.models.heads import MAX_ACTION_STD, MIN_ACTION_STD, Actor, ScalarHead
+from latentplan.models.heads import MAX_ACTION_STD, MIN_ACTION_STD, Actor
 from latentplan.replay.buffer import Batch
 from latentplan.training.learner.augmentation import random_shift
 from latentplan.training.learner.registry import BEHAVIOUR_LOSSES, WORLD_MODEL_LOSSES, register, weighted_sum
@@ -143,9 +143,9 @@ def world_model_loss(model: WorldModel, batch: Batch, config: LearningConfig, ge
     with model.trunk_precision(cache=False):
         prior = model.dynamics.prior(states.deter)
         patches = model.decoder(features.flatten(0, 1))
-        reward_logits = model.reward_head(features[:, 1:])
-        open_loop_logits = model.reward_head(open_loop)
-        continue_logits = model.continue_head(features[:, 1:]).squeeze(-1)
+        reward_logits = model.backend.apply(model.reward_head.mlp, features[:, 1:])
+        open_loop_logits = model.backend.apply(model.reward_head.mlp, open_loop)
+        continue_logits = model.backend.apply(model.continue_head, features[:, 1:]).squeeze(-1)
     prediction = Prediction(
         model=model,
         batch=batch,
@@ -175,15 +175,17 @@ def _reconstruction(predicted: Prediction) -> Tensor:
 @register(WORLD_MODEL_LOSSES, "reward", "reward_scale")
 def _reward(predicted: Prediction) -> Tensor:
     """Cross-entropy of the reward predicted from the posterior state, in nats."""
-    batch = predicted.batch
-    return mean_within(predicted.model.reward_head.loss(predicted.reward_logits, batch.rewards), batch.within)
+    model, batch = predicted.model, predicted.batch
+    errors = model.backend.cross_entropy(model.reward_head, predicted.reward_logits, batch.rewards)
+    return mean_within(errors, batch.within)
 
 
 @register(WORLD_MODEL_LOSSES, "open_loop_reward", "reward_scale")
 def _open_loop_reward(predicted: Prediction) -> Tensor:
     """Cross-entropy of the reward predicted from actions alone, as a planner predicts it, in nats."""
-    batch, reached = predicted.batch, predicted.open_loop.shape[1]
-    errors = predicted.model.reward_head.loss(predicted.open_loop_reward_logits, batch.rewards[:, :reached])
+    model, batch, reached = predicted.model, predicted.batch, predicted.open_loop.shape[1]
+    rewards = batch.rewards[:, :reached]
+    errors = model.backend.cross_entropy(model.reward_head, predicted.open_loop_reward_logits, rewards)
     return mean_within(errors, batch.within[:, :reached])
 
 
@@ -237,14 +239,14 @@ def _value(behaviour: Behaviour) -> Tensor:
     """Cross-entropy of the value head to returns of imagined rollouts, in nats."""
     with behaviour.model.trunk_precision(cache=False):
         features = behaviour.imagined.features[:-1]
-        return value_loss(behaviour.model.value_head, features, behaviour.returns, behaviour.reach)
+        return value_loss(behaviour.model, features, behaviour.returns, behaviour.reach)
 
 
 @register(BEHAVIOUR_LOSSES, "replayed_value", "replay_value_scale", is_recorded=False)
 def _replayed_value(behaviour: Behaviour) -> Tensor:
     """Cross-entropy of the value head to returns of replayed sequences, in nats."""
     with behaviour.model.trunk_precision(cache=False):
-        return value_loss(behaviour.model.value_head, *behaviour.replayed)
+        return value_loss(behaviour.model, *behaviour.replayed)
 
 
 def imagine(
@@ -260,8 +262,9 @@ def imagine(
         decay: Share of a state's gradient that a step passes back to the state before.
     """
     features, std = model.backend.imagine(model, start, *draw_noise(model, horizon, len(start.deter), generator), decay)
-    rewards = model.reward_head.mean(model.reward_head(features[1:]))
-    continues = torch.sigmoid(model.continue_head(features[1:])).squeeze(-1)
+    backend = model.backend
+    rewards = backend.mean(model.reward_head, backend.apply(model.reward_head.mlp, features[1:]))
+    continues = torch.sigmoid(backend.apply(model.continue_head, features[1:])).squeeze(-1)
     return Imagination(features, rewards, continues, entropy(std))
 
 
@@ -282,31 +285,10 @@ def entropy(std: Tensor) -> Tensor:
     return (std.log() + HALF_LOG_2_PI_E).sum(-1)
 
 
-def lambda_return(rewards: Tensor, discounts: Tensor, values: Tensor, lambda_: float) -> Tensor:
-    """λ-returns (Sutton and Barto 2018, eq. 12.18, with a discount per step).
-
-    Args:
-        rewards: rewards[t] arrives with state t + 1, (time, ...).
-        discounts: discounts[t] weighs the return from state t + 1 on, (time, ...); 0 where the episode ended.
-        values: values[t] is the value of state t + 1, (time, ...).
-        lambda_: Weight in [0, 1] of longer returns: 0 gives one-step targets, 1 the whole return.
-
-    Returns:
-        Returns from state t on, (time, ...).
-    """
-    following, returns = values[-1], []
-    steps = zip(rewards.unbind(), discounts.unbind(), values.unbind(), strict=True)
-    for reward, discount, value in reversed(list(steps)):
-        mixed = (1.0 - lambda_) * value + lambda_ * following
-        following = reward + discount * mixed
-        returns.append(following)
-    return torch.stack(returns[::-1])
-
-
-def value_loss(head: ScalarHead, features: Tensor, returns: Tensor, weights: Tensor) -> Tensor:
-    """Weighted cross-entropy of a value head on detached features (..., feature) to returns (...)."""
-    logits = head(features.detach())
-    return (weights * head.loss(logits, returns.detach())).mean()
+def value_loss(model: WorldModel, features: Tensor, returns: Tensor, weights: Tensor) -> Tensor:
+    """Weighted cross-entropy of the value head on detached features (..., feature) to returns (...)."""
+    logits = model.backend.apply(model.value_head.mlp, features.detach())
+    return (weights * model.backend.cross_entropy(model.value_head, logits, returns.detach())).mean()
 
 
 def imitation_loss(actor: Actor, features: Tensor, mean: Tensor, std: Tensor) -> Tensor:
@@ -361,7 +343,7 @@ def mean_within(values: Tensor, within: Tensor) -> Tensor:
 def _probe_errors(model: WorldModel, features: Tensor, labels: Tensor) -> Tensor:
     """Mean squared error of the quantities read from features, in typical sizes, (...); features get no gradient."""
     with model.trunk_precision(cache=False):
-        predicted = model.probe(features.detach())
+        predicted = model.backend.apply(model.probe_head, features.detach())
     return ((predicted - labels) / model.label_scales).square().mean(-1)
 
 

@@ -21,7 +21,6 @@ from latentplan.training.learner.losses import (
     Learned,
     Replayed,
     imagine,
-    lambda_return,
     weighted_sum,
     world_model_loss,
 )
@@ -96,7 +95,7 @@ class Learner(lightning.LightningModule):
     @cached_property
     def snapshot(self) -> Snapshot:
         """The frozen model in which behaviour imagines; made at first use, when the model is on its device."""
-        return Snapshot(self.model)
+        return Snapshot(self.model, self.model.backend.frozen_dtype(self.model))
 
     def catch_up(self) -> None:
         """Update behaviour from the latest batch of the model; needed before weights are used or saved."""
@@ -174,9 +173,9 @@ class Learner(lightning.LightningModule):
                 generator,
                 config.gradient_decay,
             )
-            values = self.target_value.mean(self.target_value(imagined.features[1:]))
+            values = self._target_values(imagined.features[1:])
         discounts = self.discount * imagined.continues
-        returns = self.model.backend.call(lambda_return, imagined.rewards, discounts, values, config.lambda_)
+        returns = self.model.backend.lambda_return(imagined.rewards, discounts, values, config.lambda_)
         reach = torch.cat([torch.ones_like(discounts[:1]), discounts[:-1]]).cumprod(0).detach()
         scale = return_scale(self.return_range, returns.detach())
         with self.model.trunk_precision(cache=False):
@@ -187,6 +186,11 @@ class Learner(lightning.LightningModule):
         parts["entropy"] = imagined.entropies.detach().mean()
         return loss, parts
 
+    def _target_values(self, features: Tensor) -> Tensor:
+        """Values (...) of states with these features (..., feature), by the slow target."""
+        logits = self.model.backend.apply(self.target_value.mlp, features)
+        return self.model.backend.mean(self.target_value, logits)
+
     def _replayed(self, learned: Learned, batch: Batch) -> Replayed:
         """Posterior states and open-loop states of a batch, with the returns of its replayed rewards.
 
@@ -196,9 +200,9 @@ class Learner(lightning.LightningModule):
         features = learned.states.features.transpose(0, 1)
         predicted = learned.open_loop.transpose(0, 1)
         with torch.no_grad():
-            values = self.target_value.mean(self.target_value(features[1:]))
+            values = self._target_values(features[1:])
             discounts = self.discount * batch.continues.T
-            returns = self.model.backend.call(lambda_return, batch.rewards.T, discounts, values, self.config.lambda_)
+            returns = self.model.backend.lambda_return(batch.rewards.T, discounts, values, self.config.lambda_)
         seen = torch.cat([features[:-1], predicted])
         targets = torch.cat([returns, torch.cat([returns, values[-1:]])[1 : len(predicted) + 1]])
         within = batch.within.T
@@ -233,17 +237,18 @@ def _halves(model: WorldModel) -> tuple[list[nn.Parameter], list[nn.Parameter]]:
 class Snapshot:
     """A copy of a world model with frozen dynamics, reward and continue heads, and the same actor and value head.
 
-    Weights of matrix products are stored in the model's `trunk_dtype`, to which autocast would convert them at every
-    use. Norms and the last layers of heads stay in float32.
+    Norms and the last layers of heads stay in float32.
 
     Args:
         model: The world model to copy.
+        dtype: Precision in which the weights of other matrix products are stored. With the model's `trunk_dtype`
+            autocast need not convert them at every use.
 
     Attributes:
         model: The frozen copy.
     """
 
-    def __init__(self, model: WorldModel) -> None:
+    def __init__(self, model: WorldModel, dtype: torch.dtype) -> None:
         self.model = copy.copy(model)  # shares every module
         self.model._modules = dict(model._modules)
         self._pairs: list[tuple[Tensor, Tensor]] = []
@@ -253,7 +258,7 @@ class Snapshot:
             outputs = {id(part.output) for part in frozen.modules() if isinstance(part, Mlp)}
             for part in frozen.modules():
                 if isinstance(part, nn.Linear) and id(part) not in outputs:
-                    part.to(model.trunk_dtype)
+                    part.to(dtype)
             setattr(self.model, name, frozen)
             self._pairs += zip(frozen.parameters(), original.parameters(), strict=True)
 

@@ -1,0 +1,106 @@
+"""What all compiled functions with gradients share: their number formats, their layers, and padding of rows."""
+
+from __future__ import annotations
+
+import ctypes
+import functools
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+from latentplan.models.fast.library import load
+
+TILE = 16  # as in products.h: numbers of rows are multiples of this
+MULTIPLE = 32  # padded sizes are multiples of this
+LONGEST_ROW = 4096  # as in layers.h
+HALVES = {2: torch.bfloat16, 4: torch.float32, 8: torch.float64}
+
+Place = ctypes.c_void_p
+Count = ctypes.c_long
+
+
+class Layer(ctypes.Structure):
+    """A linear layer and its norm, as in layers.h."""
+
+    _fields_ = (("weights", Place), ("scale", Place), ("shift", Place), ("inputs", Count), ("outputs", Count))
+
+
+class Kernels(NamedTuple):
+    """The compiled functions of one number format.
+
+    Attributes:
+        library: The compiled library.
+        real: Format of sums and of elementwise work; every tensor that a function takes has it.
+        half: Format of the factors of products.
+    """
+
+    library: ctypes.CDLL
+    real: torch.dtype
+    half: torch.dtype
+
+
+@functools.cache
+def find_kernels(real: torch.dtype) -> Kernels | None:
+    """The compiled functions for weights of a format; None if there are none.
+
+    Args:
+        real: float32, or float64 to compute without rounding to other formats.
+    """
+    library = load(is_exact=real == torch.float64) if real in (torch.float32, torch.float64) else None
+    size = 0 if library is None else library.size_of_half()
+    return None if library is None or size == 0 else Kernels(library, real, HALVES[size])
+
+
+def describe_layer(linear: Tensor, scale: Tensor | None, shift: Tensor) -> Layer:
+    """The layer with these weights (out, in); every tensor must be contiguous, and must live on."""
+    outputs, inputs = linear.shape
+    return Layer(linear.data_ptr(), None if scale is None else scale.data_ptr(), shift.data_ptr(), inputs, outputs)
+
+
+def point_to(structure: ctypes.Structure, **tensors: Tensor | None) -> None:
+    """Sets fields of a structure to the places of contiguous tensors; None becomes NULL."""
+    for name, tensor in tensors.items():
+        assert tensor is None or tensor.is_contiguous(), name
+        setattr(structure, name, None if tensor is None else tensor.data_ptr())
+
+
+def pad_size(size: int) -> int:
+    """The size up to which arrays of factors are padded."""
+    return -(-size // MULTIPLE) * MULTIPLE
+
+
+def pad_rows(tensor: Tensor, dim: int) -> Tensor:
+    """The tensor with rows of zeros up to a multiple of `TILE` along an axis, contiguous."""
+    missing = -tensor.shape[dim] % TILE
+    if missing:
+        tensor = functional.pad(tensor, [0, 0] * (tensor.dim() - 1 - dim) + [0, missing])
+    return tensor.contiguous()
+
+
+def weight_gradient(of_outputs: Tensor, inputs: Tensor, weight: Tensor) -> Tensor:
+    """The gradient of a layer's weight (out, in), from padded factors (..., padded size)."""
+    product = of_outputs.flatten(0, -2).t() @ inputs.flatten(0, -2)
+    outputs, columns = weight.shape
+    return product[:outputs, :columns].to(weight.dtype)
+
+
+def split_norms(norms: Tensor, sizes: Sequence[int]) -> list[Tensor]:
+    """Gradients of scale and shift of some norms, which compiled functions store side by side."""
+    return list(norms.split([size for size in sizes for _ in range(2)]))
+
+
+def check_called(failed: int) -> None:
+    """Raises MemoryError if a compiled function could not allocate memory."""
+    if failed:
+        raise MemoryError("not enough memory for an update of the model")
+
+
+def fits(module: nn.Module) -> bool:
+    """Whether compiled functions can compute a module: float32 or float64 weights of moderate sizes on the CPU."""
+    parameters = list(module.parameters())
+    known = all(parameter.device.type == "cpu" and parameter.is_contiguous() for parameter in parameters)
+    small = all(max(parameter.shape) <= LONGEST_ROW for parameter in parameters)
+    return known and small and find_kernels(parameters[0].dtype) is not None
