@@ -10,7 +10,7 @@ from latentplan.agents.base import ModelAgent
 from latentplan.config import Config
 from latentplan.models import State, WorldModel
 from latentplan.models.heads import sample_action
-from latentplan.models.symmetry import flat, mean_over_turns
+from latentplan.models.symmetry import mean_over_turns
 
 
 class ActorAgent(ModelAgent):
@@ -41,9 +41,12 @@ class ActorAgent(ModelAgent):
         """The action in [-1, 1], float32 (action,) or (batch, action); see `ModelAgent.act`."""
         return super().act(frame)
 
+    def _infer(self, state: State, action: Tensor | None, frames: Tensor, is_first: Tensor | None) -> State:
+        belief, *self._distribution = self._frame_functions.infer_and_act(state, action, frames, is_first)
+        return belief
+
     def _choose(self, state: State) -> Tensor:
-        raw = self._frame_functions.act(flat(state))
-        mean, std = (mean_over_turns(part, state) for part in raw)
+        mean, std = (mean_over_turns(part, state) for part in self._distribution)
         if not self.explore:
             return mean
         return sample_action(mean, std, self.noise.draw(mean, self.generator, self._is_reset))

@@ -188,15 +188,13 @@ class ModelAgent:
             raise ValueError(f"got {len(frames)} frames after {len(self.state.deter)}: call reset() between batches")
         frames, turns = turned(frames, self._turns), self._turns
         if self.state is None or self._action is None:
-            return folded(self._posterior(self.model.dynamics.initial(len(frames)).deter, frames), turns)
-        deter = self._frame_functions.advance(flat(self.state), per_turn(self._action, turns))
-        if self._is_reset is not None:
-            deter = torch.where(per_turn(self._is_reset, turns)[:, None], 0.0, deter)
-        return folded(self._posterior(deter, frames), turns)
+            return folded(self._infer(self.model.dynamics.initial(len(frames)), None, frames, None), turns)
+        is_first = None if self._is_reset is None else per_turn(self._is_reset, turns)
+        return folded(self._infer(flat(self.state), per_turn(self._action, turns), frames, is_first), turns)
 
-    def _posterior(self, deter: Tensor, frames: Tensor) -> State:
-        """The state at the posterior's mean, for the GRU's state (rows, deter) and frames (rows, 64, 64, 3)."""
-        return self._frame_functions.see(deter, frames)
+    def _infer(self, state: State, action: Tensor | None, frames: Tensor, is_first: Tensor | None) -> State:
+        """The belief of `FrameFunctions.infer`; subclasses read more from the same call."""
+        return self._frame_functions.infer(state, action, frames, is_first)
 
     def _check_frames(self, frames: np.ndarray) -> Tensor:
         """The frames (batch, 64, 64, 3) on the model's device.

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from latentplan.agents.planning import PlanningAgent
 from latentplan.config import Config, PlannerConfig
-from latentplan.models import State, WorldModel, kl_divergence
+from latentplan.models import State, WorldModel
 from latentplan.models.symmetry import flat, mean_over_turns
 from latentplan.objectives.expression import Expression
 from latentplan.planning.objectives import Constraint, Term, apply_view
@@ -135,17 +135,16 @@ class GatedAgent(PlanningAgent):
             )
         return super()._update_belief(frames)
 
-    def _posterior(self, deter: Tensor, frames: Tensor) -> State:
-        posterior = self.model.dynamics.posterior(deter, self.model.encoder(frames))
-        mismatch = kl_divergence(posterior, self.model.dynamics.prior(deter))
+    def _infer(self, state: State, action: Tensor | None, frames: Tensor, is_first: Tensor | None) -> State:
+        belief, mismatch = self._frame_functions.infer_and_compare(state, action, frames, is_first)
         self._mismatch = mismatch.unflatten(0, (-1, self._turns)).mean(1)
         self._drift = self._mismatch if self._drift is None else self._drift + self._mismatch
-        return State(deter, posterior.mean)
+        return belief
 
     def _choose(self, state: State) -> Tensor:
         assert self._is_first is not None and self._drift is not None
         is_task_actor = self._actor_model is self.imagined
-        mode = self.model.actor(flat(state).features)[0] if is_task_actor else self._actor_model.policy(state)
+        mode = self._frame_functions.act(flat(state))[0] if is_task_actor else self._actor_model.policy(state)
         action = mean_over_turns(mode, state) if is_task_actor else mode
         must_plan, is_tail = self._is_first, torch.zeros_like(self._is_first)
         if self._is_goal_untrained:

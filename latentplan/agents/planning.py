@@ -11,6 +11,7 @@ from torch import Tensor
 from latentplan.agents.base import ModelAgent
 from latentplan.config import Config, PlannerConfig
 from latentplan.models import State, WorldModel
+from latentplan.models.symmetry import flat, mean_over_turns
 from latentplan.objectives.expression import Expression
 from latentplan.planning import ModelPredictiveController, make_planner
 from latentplan.planning.objectives import Constraint, Term
@@ -89,7 +90,8 @@ class PlanningAgent(ModelAgent):
         self.was_surprised = False
         if self.surprise_limit is None or self.controller.objective is not None or self.controller.constraints:
             return action
-        is_surprised = self.imagined.surprise(state) > self.surprise_limit
+        surprise = mean_over_turns(self._frame_functions.surprise(flat(state)), state)
+        is_surprised = surprise > self.surprise_limit
         if not bool(is_surprised.any()):
             return action
         if bool(is_surprised[0]):

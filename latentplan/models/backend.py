@@ -8,35 +8,77 @@ same results up to rounding; `latentplan.models.fast.accelerate` chooses the bac
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from functools import partial
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
 import torch
 from einops import rearrange
 from torch import Tensor
 
-from latentplan.models.dynamics import Gaussian, State
+from latentplan.models.dynamics import Gaussian, State, kl_divergence, surprise
 
 if TYPE_CHECKING:
     from latentplan.models.heads import Mlp, ScalarHead
     from latentplan.models.world_model import WorldModel
 
 
-class FrameFunctions(NamedTuple):
-    """Belief update and actor of a model for one frame per row, with the weights that the model had when asked.
+class FrameFunctions:
+    """Belief update and actor for one frame per row, in plain torch; an agent asks for them at every decision.
 
-    The results are float32 and carry no gradients.
+    The results are float32 and carry no gradients. A faster backend computes them with the weights that the model had
+    when asked.
 
-    Attributes:
-        advance: `advance(state, action)` returns the deterministic state (rows, deter) after action (rows, action).
-        see: `see(deter, frames)` returns the belief, with the posterior's mean, for deter (rows, deter) and uint8
-            frames (rows, 64, 64, 3).
-        act: `act(state)` returns mean in [-1, 1] and std of the actor's action, (rows, action) each.
+    Args:
+        model: The world model.
     """
 
-    advance: Callable[[State, Tensor], Tensor]
-    see: Callable[[Tensor, Tensor], State]
-    act: Callable[[State], tuple[Tensor, Tensor]]
+    def __init__(self, model: WorldModel) -> None:
+        # A reference to the model would close a circle, because the model's backend keeps these functions.
+        self._encoder, self._dynamics, self._actor = model.encoder, model.dynamics, model.actor
+
+    def infer(self, state: State, action: Tensor | None, frames: Tensor, is_first: Tensor | None = None) -> State:
+        """The belief, with the posterior's mean, after actions and the frames that resulted.
+
+        Args:
+            state: The belief before the action, (rows, ...).
+            action: Actions in [-1, 1], (rows, action); None if `state.deter` is the state at the frame already.
+            frames: Frames after the actions, uint8 (rows, 64, 64, 3).
+            is_first: Rows whose episode begins with the frame, (rows,) bool; None stands for no row.
+        """
+        deter = self._find_deter(state, action, is_first)
+        return State(deter, self._dynamics.posterior(deter, self._encoder(frames)).mean)
+
+    def infer_and_act(
+        self, state: State, action: Tensor | None, frames: Tensor, is_first: Tensor | None = None
+    ) -> tuple[State, Tensor, Tensor]:
+        """The belief of `infer`, and mean and std of the actor's action at this belief; see `act`."""
+        belief = self.infer(state, action, frames, is_first)
+        return belief, *self.act(belief)
+
+    def infer_and_compare(
+        self, state: State, action: Tensor | None, frames: Tensor, is_first: Tensor | None = None
+    ) -> tuple[State, Tensor]:
+        """The belief of `infer`, and KL(posterior || prior) of its latent in nats, (rows,)."""
+        deter = self._find_deter(state, action, is_first)
+        posterior = self._dynamics.posterior(deter, self._encoder(frames))
+        return State(deter, posterior.mean), kl_divergence(posterior, self._dynamics.prior(deter))
+
+    def act(self, state: State) -> tuple[Tensor, Tensor]:
+        """Mean in [-1, 1] and std of the actor's action at a belief, (rows, action) each."""
+        mean, std = self._actor(state.features)
+        return mean, std
+
+    def surprise(self, state: State) -> Tensor:
+        """The surprise of beliefs in nats, (rows,); see `WorldModel.surprise`."""
+        return surprise(state.stoch, self._dynamics.prior(state.deter))
+
+    def _find_deter(self, state: State, action: Tensor | None, is_first: Tensor | None) -> Tensor:
+        """The deterministic state (rows, deter) at the frames; see `infer`."""
+        deter = state.deter if action is None else self._advance(state, action)
+        return deter if is_first is None else torch.where(is_first[:, None], 0.0, deter)
+
+    def _advance(self, state: State, action: Tensor) -> Tensor:
+        """The deterministic state (rows, deter) after actions (rows, action)."""
+        return self._dynamics.advance(state, action)
 
 
 class Backend:
@@ -103,7 +145,7 @@ class Backend:
 
     def frame_functions(self, model: WorldModel) -> FrameFunctions:
         """Belief update and actor with the model's present weights; an agent asks again at every decision."""
-        return FrameFunctions(model.dynamics.advance, model.see, partial(_act, model))
+        return FrameFunctions(model)
 
     # For learners, with gradients where weights take part.
 
@@ -208,11 +250,6 @@ def lambda_return(rewards: Tensor, discounts: Tensor, values: Tensor, lambda_: f
         following = reward + discount * mixed
         returns.append(following)
     return torch.stack(returns[::-1])
-
-
-def _act(model: WorldModel, state: State) -> tuple[Tensor, Tensor]:
-    mean, std = model.actor(state.features)
-    return mean, std
 
 
 def _shifted_places(size: int, offset: Tensor, pixels: int) -> Tensor:

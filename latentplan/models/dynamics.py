@@ -181,6 +181,11 @@ def kl_divergence(left: Gaussian, right: Gaussian) -> Tensor:
     return 0.5 * (ratio + distance - 1.0 - ratio.log()).sum(-1)
 
 
+def surprise(stoch: Tensor, prior: Gaussian) -> Tensor:
+    """Half the squared distance of latents (..., latent) from the prior's mean, in standard deviations, (...)."""
+    return 0.5 * ((stoch - prior.mean) / prior.std).square().sum(-1)
+
+
 def next_deter(gates: Tensor, deter: Tensor) -> Tensor:
     """The next deterministic state (rows, deter) from normed reset, candidate and update gates (rows, 3 deter)."""
     reset, candidate, update = gates.chunk(3, -1)

@@ -12,7 +12,7 @@ from latentplan.config import ModelConfig
 from latentplan.config.quantities import TASK_PREFIX
 from latentplan.models.backend import Backend
 from latentplan.models.decoder import Decoder
-from latentplan.models.dynamics import Dynamics, Rssm, State
+from latentplan.models.dynamics import Dynamics, Rssm, State, surprise
 from latentplan.models.encoder import Encoder
 from latentplan.models.goal_heads import GoalHeads
 from latentplan.models.heads import Actor, Mlp, ScalarHead, sample_action
@@ -197,5 +197,4 @@ class WorldModel(nn.Module):
         Surprise is half the squared distance between the latent and the prior's mean, in standard deviations of the
         prior.
         """
-        prior = self.dynamics.prior(state.deter)
-        return 0.5 * ((state.stoch - prior.mean) / prior.std).square().sum(-1)
+        return surprise(state.stoch, self.dynamics.prior(state.deter))

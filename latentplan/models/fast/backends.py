@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Hashable, Sequence
-from functools import partial
 from operator import attrgetter
 from typing import Any, cast
 
@@ -12,9 +11,11 @@ from torch import Tensor, nn
 
 from latentplan.models.backend import Backend, FrameFunctions, lambda_return
 from latentplan.models.dynamics import Gaussian, Rssm, State
-from latentplan.models.fast import compiled, native, native_heads, native_unroll, one_frame, pointwise, unroll
+from latentplan.models.fast import compiled, native, native_heads, native_unroll, pointwise, unroll
 from latentplan.models.fast import frames as sliced_frames
 from latentplan.models.fast import rollout as rollouts
+from latentplan.models.fast.native_frame import NativeFrameFunctions
+from latentplan.models.fast.one_frame import TorchFrameFunctions
 from latentplan.models.heads import Mlp, ScalarHead, action_distribution
 from latentplan.models.world_model import WorldModel
 
@@ -233,7 +234,4 @@ def _convert_for_rollouts(model: WorldModel, dtype: torch.dtype) -> rollouts.Wei
 
 
 def _convert_for_frames(model: WorldModel, dtype: torch.dtype) -> FrameFunctions:
-    weights = one_frame.convert_weights(model)
-    return FrameFunctions(
-        partial(one_frame.advance, weights), partial(one_frame.see, weights), partial(one_frame.act, weights)
-    )
+    return NativeFrameFunctions(model) if NativeFrameFunctions.can_pack(model) else TorchFrameFunctions(model)

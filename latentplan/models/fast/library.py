@@ -26,7 +26,7 @@ from latentplan.models.fast import pointwise
 FOLDER = Path(__file__).parent
 HEADERS = ("rows.h", "vectors.h", "products.h", "layers.h")
 LEARNED = ("unroll.c", "heads.c")  # with gradients
-PLANNED = ("kernels.c", "imagine.c")
+PLANNED = ("kernels.c", "imagine.c", "frame.c")
 # Sums may be reordered, because compilers cannot vectorize them otherwise; all other rules of IEEE 754 hold.
 ARITHMETIC = ("-fassociative-math", "-fno-signed-zeros", "-fno-trapping-math", "-fno-math-errno")
 FLAGS = ("-O3", "-march=native", *ARITHMETIC, "-fopenmp", "-shared", "-fPIC")
@@ -125,6 +125,7 @@ def load(*, is_exact: bool = False) -> ctypes.CDLL | None:
         getattr(library, f"gates_{dtype}").argtypes = [place] * 6 + [count, count, threads]
     library.expectation.argtypes = [place] * 3 + [count, count, threads]
     library.imagine.argtypes = [place] * 6 + [count, count, threads]
+    library.decide.argtypes = [place, place, count, threads]
     return library
 
 

@@ -14,6 +14,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
+from latentplan.models.backend import FrameFunctions
 from latentplan.models.dynamics import Rssm, State
 from latentplan.models.encoder import FRAME_SIZE, PATCH
 from latentplan.models.fast import pointwise
@@ -53,6 +54,25 @@ class FrameWeights(NamedTuple):
     posterior_mean: Affine
     actor: tuple[Hidden, ...]
     action: Affine
+
+
+class TorchFrameFunctions(FrameFunctions):
+    """`FrameFunctions` by calls of this module where these are faster than the model's own."""
+
+    def __init__(self, model: WorldModel) -> None:
+        super().__init__(model)
+        self._weights = convert_weights(model)
+
+    def infer(self, state: State, action: Tensor | None, frames: Tensor, is_first: Tensor | None = None) -> State:
+        """See `FrameFunctions.infer`."""
+        return see(self._weights, self._find_deter(state, action, is_first), frames)
+
+    def act(self, state: State) -> tuple[Tensor, Tensor]:
+        """See `FrameFunctions.act`."""
+        return act(self._weights, state)
+
+    def _advance(self, state: State, action: Tensor) -> Tensor:
+        return advance(self._weights, state, action)
 
 
 @torch.no_grad()
