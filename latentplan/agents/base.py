@@ -204,7 +204,7 @@ class ModelAgent:
         """
         if frames.dtype != np.uint8 or frames.shape[1:] != (64, 64, 3):
             raise ValueError(f"frames must be uint8 (64, 64, 3), got {frames.dtype} {frames.shape[1:]}")
-        return torch.as_tensor(np.ascontiguousarray(frames), device=self.model.device)
+        return torch.from_numpy(np.ascontiguousarray(frames)).to(self.generator.device)
 
 
 class CorrelatedNoise:

@@ -36,8 +36,7 @@ def frame_calls(model: WorldModel) -> Calls:
 
     @torch.inference_mode()
     def decide(model: WorldModel) -> Any:
-        advance, see, act = model.backend.frame_functions(model)
-        return act(see(advance(state, action), frames))
+        return model.backend.frame_functions(model).infer_and_act(state, action, frames)
 
     return {"one frame": decide}
 

@@ -78,7 +78,7 @@ def test_surprise_is_half_the_squared_distance_in_standard_deviations(model):
 @pytest.mark.parametrize("limit", [5.0, 1.0, 0.5])
 def test_planning_agent_acts_by_the_actor_when_a_frame_exceeds_the_surprise_limit(model, frames, monkeypatch, limit):
     surprise = torch.tensor([3.0, 0.7])
-    monkeypatch.setattr(WorldModel, "surprise", lambda self, state: surprise)
+    monkeypatch.setattr(type(model.backend.frame_functions(model)), "surprise", lambda self, state: surprise)
     planner, actor = make_planner(model), ActorAgent(model, CONFIG)
     limited = make_planner(model, surprise_limit=limit)
     planned, acted, action = (agent.act(frames) for agent in (planner, actor, limited))

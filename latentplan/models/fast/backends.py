@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable, Hashable, Sequence
 from operator import attrgetter
 from typing import Any, cast
 
 import torch
 from torch import Tensor, nn
+from torch.optim.optimizer import register_optimizer_step_post_hook
 
 from latentplan.models.backend import Backend, FrameFunctions, lambda_return
 from latentplan.models.dynamics import Gaussian, Rssm, State
@@ -51,6 +53,7 @@ class ConvertedWeights:
         key = (dtype, *map(Tensor.data_ptr, parameters), *map(_version_of, parameters))
         kept = self._kept  # read once: another thread may replace it
         if kept is None or kept[0] != key:
+            _count_fused_steps()
             with torch.inference_mode(False):  # tensors made in inference mode could not be used for gradients later
                 kept = self._kept = (key, self._convert(model, dtype))
         return kept[1]
@@ -223,6 +226,18 @@ class GpuBackend(_ConvertingBackend):
         steps = torch._foreach_sub(list(fast), list(slow))
         torch._foreach_mul_(steps, rate)
         torch._foreach_add_(list(slow), steps)
+
+
+@functools.cache
+def _count_fused_steps() -> None:
+    """Makes later steps of fused optimizers count as writes, which torch does not do itself."""
+
+    def count(optimizer: torch.optim.Optimizer, *_: Any) -> None:
+        for group in optimizer.param_groups:
+            if group.get("fused"):
+                torch.autograd.graph.increment_version(group["params"])
+
+    register_optimizer_step_post_hook(count)
 
 
 def _rssm(model: WorldModel) -> Rssm:

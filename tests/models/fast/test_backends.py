@@ -76,10 +76,8 @@ def one_frame(rows):
     frames = torch.randint(0, 256, (rows, 64, 64, 3), dtype=torch.uint8, generator=torch.Generator().manual_seed(4))
 
     def decide(model):
-        advance, see, act = model.backend.frame_functions(model)
-        deter = advance(start(rows), draw(rows, ACTION, seed=3).clamp(-1.0, 1.0))
-        state = see(deter, frames)
-        return deter, state, act(state)
+        action = draw(rows, ACTION, seed=3).clamp(-1.0, 1.0)
+        return model.backend.frame_functions(model).infer_and_act(start(rows), action, frames)
 
     return decide
 
