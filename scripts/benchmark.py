@@ -14,7 +14,7 @@ from latentplan.commands.shell import run_guarded  # noqa: E402
 COMMANDS = {
     "train": Command("bench.train", "time of each part of an update, beside the peak FLOP/s of the machine"),
     "render": Command("bench.render", "milliseconds per frame and change of the picture in each render quality"),
-    "decide": Command("bench.decide", "milliseconds per decision of planner and actor"),
+    "decide": Command("bench.decide", "milliseconds per decision of planner, actor and exported actor"),
     "paths": Command("bench.paths", "milliseconds of every fast path of the world model beside plain torch"),
     "plan": Command("bench.plan", "milliseconds per search beside other planners, on the same model and settings"),
     "compile": Command("bench.compile", "milliseconds per search in small models, stepped and with compile_rollout"),

@@ -7,7 +7,7 @@ same results up to rounding; `latentplan.models.fast.accelerate` chooses the bac
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import torch

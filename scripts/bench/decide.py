@@ -1,4 +1,4 @@
-"""`benchmark.py decide`: milliseconds per decision of planner and actor, from a frame in memory to an action.
+"""`benchmark.py decide`: milliseconds per decision of planner, actor and exported actor, from a frame in memory.
 
 The table shows percentiles over decisions on random frames, and the model steps per decision and environment.
 """
@@ -6,6 +6,7 @@ The table shows percentiles over decisions on random frames, and the model steps
 from __future__ import annotations
 
 import math
+import tempfile
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -22,8 +23,10 @@ from latentplan.config.files import build_config
 from latentplan.config.parsing import option
 
 if TYPE_CHECKING:
+    import numpy as np
     import torch
 
+    from latentplan.agents.actor import ActorAgent
     from latentplan.agents.base import Agent
     from latentplan.models import WorldModel
 
@@ -138,6 +141,44 @@ def count_model_steps(model: WorldModel) -> Iterator[dict[str, int]]:
             delattr(model, name)
 
 
+class ExportedActor:
+    """The program that `latentplan export` writes, as an agent.
+
+    Args:
+        agent: The agent that is exported.
+    """
+
+    def __init__(self, agent: ActorAgent) -> None:
+        import torch
+
+        from latentplan.agents.export import export_actor, input_sizes
+
+        self.model, self._sizes = agent.model, input_sizes(agent.model)
+        with tempfile.TemporaryDirectory() as folder:
+            self._program = torch.export.load(export_actor(agent, Path(folder) / "actor.pt2")).module()
+        self._past: tuple[torch.Tensor, ...] | None = None
+
+    def act(self, frame: np.ndarray) -> np.ndarray:
+        """The action for frames uint8 (64, 64, 3) or (batch, 64, 64, 3)."""
+        import torch
+
+        frames = torch.from_numpy(frame).view(-1, *frame.shape[-3:])
+        past = self._past or tuple(torch.zeros(len(frames), size) for size in self._sizes.values())
+        is_first = torch.full((len(frames),), self._past is None)
+        with torch.inference_mode():
+            action, deter, stoch = self._program(frames, *past, is_first)
+        self._past = deter, stoch, action
+        actions: np.ndarray = action.numpy()
+        return actions[0] if frame.ndim == 3 else actions
+
+    def reset(self) -> None:
+        """Forgets the past."""
+        self._past = None
+
+    def seed(self, seed: int) -> None:
+        """Does nothing, because the program draws no random numbers."""
+
+
 def _load_model(request: Request, composed: Config | None, device: torch.device) -> tuple[WorldModel, Config, float]:
     """The model, settings and discount of the checkpoint, or of an untrained agent with composed settings."""
     if composed is not None:
@@ -161,10 +202,16 @@ def _agents(model: WorldModel, config: Config, discount: float) -> dict[str, Age
     from bench.ablation_arms import without_actor
     from latentplan.agents.actor import ActorAgent
     from latentplan.agents.planning import PlanningAgent
+    from latentplan.models import Rssm
 
     alone = replace(config.planner, **without_actor(config.planner))
-    return {
+    actor = ActorAgent(model, config)
+    agents: dict[str, Agent] = {
         "planner": PlanningAgent(model, config, discount),
         "planner without actor": PlanningAgent(model, config, discount, planner=alone),
-        "actor": ActorAgent(model, config),
+        "actor": actor,
     }
+    # The program computes on a processor, and can be written for the dynamics of the class Rssm alone.
+    if model.device.type == "cpu" and type(model.dynamics) is Rssm:
+        agents["exported actor"] = ExportedActor(actor)
+    return agents

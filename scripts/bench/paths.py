@@ -127,6 +127,7 @@ def _paths(
     from bench.path_calls import augmentation_calls, frame_calls, learner_calls, planner_calls
     from latentplan.models.backend import Backend
     from latentplan.models.fast import GpuBackend, accelerate
+    from latentplan.models.fast.native_frame import NativeFrameFunctions
 
     precision = accelerate(model).trunk_dtype
     kinds: dict[str, Callable[[], AbstractContextManager[Any]]] = {"converted weights": nullcontext}
@@ -147,6 +148,8 @@ def _paths(
                     yield f"{name}, {kind}", call, Backend(precision), backend(), context
     for name, call in frame_calls(model).items():
         yield name, call, Backend(precision), backend(), nullcontext
+        if NativeFrameFunctions.can_pack(model):
+            yield f"{name}, converted weights", call, Backend(precision), backend(), _without_compiled_frames
     for name, call in augmentation_calls(model, learning).items() if device.type == "cpu" else ():
         yield name, call, Backend(precision), backend(), nullcontext
     for name, call in learner_calls(model, learning).items():
@@ -158,6 +161,12 @@ def _without_compiled() -> AbstractContextManager[Any]:
     from latentplan.models.fast import compiled
 
     return patch.object(compiled, "pack", lambda *_: None)
+
+
+def _without_compiled_frames() -> AbstractContextManager[Any]:
+    from latentplan.models.fast.native_frame import NativeFrameFunctions
+
+    return patch.object(NativeFrameFunctions, "can_pack", lambda _: False)
 
 
 def _without_kernels() -> AbstractContextManager[Any]:

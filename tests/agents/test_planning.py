@@ -8,7 +8,7 @@ import torch
 
 from latentplan.agents.actor import ActorAgent
 from latentplan.agents.planning import PlanningAgent
-from latentplan.models import State, WorldModel
+from latentplan.models import State
 from latentplan.models.symmetry import TurnedModel
 from tests.agents.small_agents import CONFIG, make_model
 

@@ -12,7 +12,7 @@ import pytest
 import torch
 from bench.ablate import compare_arms
 from bench.ablation_arms import NAMES, Arm, Outcome, parse_arms
-from bench.decide import measure_decisions
+from bench.decide import ExportedActor, measure_decisions
 from bench.estimates import interquartile_estimate, interquartile_mean, paired_difference
 from bench.machine import product_limits
 from bench.render import measure_qualities
@@ -218,6 +218,22 @@ def test_decide_applies_planner_settings_of_the_command_line(tmp_path, checkpoin
     assert result["planner"]["horizon"] == 1
     assert result["arms"]["planner"]["model_steps"] == 14
     assert result["arms"]["planner without actor"]["model_steps"] == 16
+    assert result["arms"]["exported actor"]["model_steps"] == 0
+
+
+def test_exported_actor_acts_like_the_agent(config):
+    torch.manual_seed(0)
+    model = WorldModel(config.model, action_dim=2)
+    torch.nn.init.normal_(model.actor.mlp.output.weight, std=0.5)
+    agent = ActorAgent(model, config)
+    program, film = ExportedActor(agent), np.random.default_rng(0).integers(0, 256, (6, 64, 64, 3), dtype=np.uint8)
+    for frames in (film, film.reshape(3, 2, 64, 64, 3)):
+        for each in (agent, program):
+            each.reset()
+        for frame in frames:
+            expected = agent.act(frame)
+            assert np.ptp(expected) > 0.01
+            np.testing.assert_allclose(program.act(frame), expected, atol=1e-4)
 
 
 def test_measure_qualities_compares_the_same_states(config, monkeypatch):
