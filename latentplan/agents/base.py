@@ -12,7 +12,7 @@ from torch import Tensor
 from latentplan.config import Config
 from latentplan.models import State, WorldModel
 from latentplan.models.backend import FrameFunctions
-from latentplan.models.symmetry import TurnedModel, first_turn, flat, folded, per_turn, turned
+from latentplan.models.symmetry import TurnedModel, first_turn, flat, folded, mean_over_turns, per_turn, turned
 from latentplan.objectives.expression import Expression
 from latentplan.objectives.objective import build_goals, read_goal_image
 from latentplan.planning import Planner
@@ -195,6 +195,11 @@ class ModelAgent:
     def _infer(self, state: State, action: Tensor | None, frames: Tensor, is_first: Tensor | None) -> State:
         """The belief of `FrameFunctions.infer`; subclasses read more from the same call."""
         return self._frame_functions.infer(state, action, frames, is_first)
+
+    def _act_by_actor(self, state: State) -> Tensor:
+        """The mode of the actor, mean over turns, in [-1, 1], (batch, action)."""
+        mean, _ = self._frame_functions.act(flat(state))
+        return mean_over_turns(mean, state)
 
     def _check_frames(self, frames: np.ndarray) -> Tensor:
         """The frames (batch, 64, 64, 3) on the model's device.

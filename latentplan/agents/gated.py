@@ -14,7 +14,6 @@ from torch import Tensor
 from latentplan.agents.planning import PlanningAgent
 from latentplan.config import Config, PlannerConfig
 from latentplan.models import State, WorldModel
-from latentplan.models.symmetry import flat, mean_over_turns
 from latentplan.objectives.expression import Expression
 from latentplan.planning.objectives import Constraint, Term, apply_view
 
@@ -143,9 +142,7 @@ class GatedAgent(PlanningAgent):
 
     def _choose(self, state: State) -> Tensor:
         assert self._is_first is not None and self._drift is not None
-        is_task_actor = self._actor_model is self.imagined
-        mode = self._frame_functions.act(flat(state))[0] if is_task_actor else self._actor_model.policy(state)
-        action = mean_over_turns(mode, state) if is_task_actor else mode
+        action = self._act_by_actor(state)
         must_plan, is_tail = self._is_first, torch.zeros_like(self._is_first)
         if self._is_goal_untrained:
             planned, is_tail = self.controller.next_actions() or (action, is_tail)
@@ -174,6 +171,11 @@ class GatedAgent(PlanningAgent):
         """Whether an objective or a constraint is set for which the model has no trained actor."""
         is_untrained = self.controller.objective is not None and self._actor_model is self.imagined
         return is_untrained or bool(self.controller.constraints)
+
+    def _act_by_actor(self, state: State) -> Tensor:
+        """The mode of the actor of the task, or of the goal where the model learned to pursue it."""
+        is_task_actor = self._actor_model is self.imagined
+        return super()._act_by_actor(state) if is_task_actor else self._actor_model.policy(state)
 
     def _is_doubtful(self, state: State, action: Tensor, must_plan: Tensor) -> Tensor:
         """Whether the signal exceeds the threshold and the budget allows for a plan, (batch,) bool on the CPU.
@@ -214,7 +216,7 @@ class GatedAgent(PlanningAgent):
             gap, weight = -self._actor_model.value(state), 1.0
             for step in range(GAP_STEPS):
                 if step > 0:
-                    action = self._actor_model.policy(state)
+                    action = self._act_by_actor(state)
                 state, reward = self._actor_model.fast_step(state, action)
                 gap, weight = gap + weight * reward, weight * self.discount
             return (gap + weight * self._actor_model.value(state)).abs()

@@ -96,4 +96,4 @@ class PlanningAgent(ModelAgent):
             return action
         if bool(is_surprised[0]):
             self.was_surprised, self.last_source = self.last_source == "plan", "actor"
-        return torch.where(is_surprised[:, None], self.imagined.policy(state), action)
+        return torch.where(is_surprised[:, None], self._act_by_actor(state), action)
