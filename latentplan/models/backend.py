@@ -181,6 +181,15 @@ class Backend:
         turned = torch.stack([torch.rot90(frames, amount, (2, 3)) for amount in range(4)])
         return turned[amounts, torch.arange(len(frames), device=frames.device)]
 
+    def encode(self, model: WorldModel, frames: Tensor) -> Tensor:
+        """Embeddings, float32 (rows, embedding), of uint8 frames (rows, 64, 64, 3); gradients reach the weights."""
+        embeddings: Tensor = model.encoder(frames)
+        return embeddings
+
+    def reconstruction_errors(self, model: WorldModel, features: Tensor, frames: Tensor) -> Tensor:
+        """Squared errors (rows,) of the pictures decoded from features (rows, feature); see `Decoder.loss`."""
+        return model.decoder.loss(model.decoder(features), frames)
+
     def observe(
         self, model: WorldModel, embeddings: Tensor, actions: Tensor, deter: Tensor, noise: Tensor
     ) -> tuple[State, Gaussian]:

@@ -8,6 +8,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from latentplan.models.encoder import FRAME_SIZE
+from latentplan.models.heads import single_or_double
 
 SIZE = 32  # side of the decoded picture: each pixel is the mean of SHRINK x SHRINK pixels of the frame
 SHRINK = FRAME_SIZE // SIZE
@@ -51,7 +52,7 @@ class Decoder(nn.Module):
             frames, "rows (height y) (width x) channel -> rows height width (y x channel)", y=side, x=side
         )
         target = pixels.to(patches.dtype) @ self.pool.to(patches.dtype)  # a matrix product computes these means fastest
-        error = patches.float() - target.float().mul_(1.0 / 255.0).sub_(0.5)
+        error = single_or_double(patches) - single_or_double(target).mul_(1.0 / 255.0).sub_(0.5)
         return error.square().sum((1, 2, 3))
 
     def picture(self, features: Tensor) -> Tensor:

@@ -9,6 +9,8 @@ from einops import rearrange
 from torch import Tensor, nn
 from torch.nn import functional
 
+from latentplan.models.heads import single_or_double
+
 FRAME_SIZE = 64
 PATCH = 4
 
@@ -38,7 +40,8 @@ class Encoder(nn.Module):
         features = rearrange(tokens, "rows height width channel -> rows channel height width")
         for convolution in self.convolutions:
             features = functional.silu(convolution(features))
-        return self.linear(rearrange(features, "rows channel height width -> rows (height width channel)")).float()
+        flat = rearrange(features, "rows channel height width -> rows (height width channel)")
+        return single_or_double(self.linear(flat))
 
     def _project(self, patches: Tensor) -> Tensor:
         """The first layer on pixels / 255 - 0.5; the scale and the shift are applied to the weights instead.

@@ -13,7 +13,7 @@ from torch.optim.optimizer import register_optimizer_step_post_hook
 
 from latentplan.models.backend import Backend, FrameFunctions, lambda_return
 from latentplan.models.dynamics import Gaussian, Rssm, State
-from latentplan.models.fast import compiled, native, native_heads, native_unroll, pointwise, unroll
+from latentplan.models.fast import compiled, native, native_heads, native_pictures, native_unroll, pointwise, unroll
 from latentplan.models.fast import frames as sliced_frames
 from latentplan.models.fast import rollout as rollouts
 from latentplan.models.fast.native_frame import NativeFrameFunctions
@@ -159,6 +159,18 @@ class CpuBackend(_ConvertingBackend):
             return action_distribution(self.apply(model.actor.mlp, features))
 
         return native_unroll.imagine(_rssm(model), model.actor, start, action_noise, noise, decay, act)
+
+    def encode(self, model: WorldModel, frames: Tensor) -> Tensor:
+        """See `Backend.encode`."""
+        if not native_pictures.can_encode(model.encoder):
+            return super().encode(model, frames)
+        return native_pictures.encode(model.encoder, frames)
+
+    def reconstruction_errors(self, model: WorldModel, features: Tensor, frames: Tensor) -> Tensor:
+        """See `Backend.reconstruction_errors`."""
+        if not native_pictures.can_encode(model.decoder):
+            return super().reconstruction_errors(model, features, frames)
+        return native_pictures.reconstruction_errors(model.decoder, features, frames)
 
     def apply(self, network: Mlp, features: Tensor) -> Tensor:
         """See `Backend.apply`."""

@@ -53,13 +53,13 @@ static void apply_block(const Network *n, half *const weights[4], long from, lon
         write_row(rows + r * inputs, n->features + (from + r) * n->first.inputs, n->first.inputs);
         clear_row(rows + r * inputs, n->first.inputs, inputs);
     }
-    multiply(rows, inputs, count, weights[0], inputs, hidden, products, hidden);
+    multiply(rows, inputs, count, weights[0], inputs, hidden, products, hidden, 0);
     hide(middle, products, &n->first, count);
-    multiply(middle, hidden, count, weights[1], hidden, last, last_products, last);
+    multiply(middle, hidden, count, weights[1], hidden, last, last_products, last, 0);
     hide(end, last_products, &n->second, count);
-    multiply(end, last, count, weights[2], last, outputs, raw, outputs);
+    multiply(end, last, count, weights[2], last, outputs, raw, outputs, 0);
     // The last layer is as precise as its inputs: a second product has what rounding took from the weights.
-    multiply(end, last, count, weights[3], last, outputs, error, outputs);
+    multiply(end, last, count, weights[3], last, outputs, error, outputs, 0);
     for (long r = 0; r < count; r++) {
         real *row = n->results + (from + r) * n->output.outputs;
         VECTOR() for (long i = 0; i < n->output.outputs; i++)
@@ -78,20 +78,20 @@ static void apply_block_back(const Network *n, const Gradients *g, half *const w
         write_row(of_output + r * outputs, g->of_results + (from + r) * n->output.outputs, n->output.outputs);
         clear_row(of_output + r * outputs, n->output.outputs, outputs);
     }
-    multiply(of_output, outputs, count, weights[2], outputs, last, gradient, last);
+    multiply(of_output, outputs, count, weights[2], outputs, last, gradient, last, 0);
     for (long r = 0; r < count; r++) {
         const real *product = n->last_products + (from + r) * last;
         norm_silu_back(of_second + r * last, gradient + r * last, product, &n->second, sums + 2 * n->first.outputs);
         clear_row(of_second + r * last, n->second.outputs, last);
     }
-    multiply(of_second, last, count, weights[1], last, hidden, gradient, hidden);
+    multiply(of_second, last, count, weights[1], last, hidden, gradient, hidden, 0);
     for (long r = 0; r < count; r++) {
         const real *product = n->products + (from + r) * hidden;
         norm_silu_back(of_first + r * hidden, gradient + r * hidden, product, &n->first, sums);
         clear_row(of_first + r * hidden, n->first.outputs, hidden);
     }
     if (g->of_features == NULL) return;
-    multiply(of_first, hidden, count, weights[0], hidden, inputs, gradient, inputs);
+    multiply(of_first, hidden, count, weights[0], hidden, inputs, gradient, inputs, 0);
     for (long r = 0; r < count; r++)
         memcpy(g->of_features + (from + r) * n->first.inputs, gradient + r * inputs,
                (size_t)n->first.inputs * sizeof(real));

@@ -48,7 +48,7 @@ int can_imagine(void) { return can_multiply(); }
 
 static void apply(Workspace *work, const bfloat16 *rows, const Layer *layer) {
     long count = (work->count + TILE - 1) / TILE * TILE, outputs = layer->outputs;
-    multiply(rows, work->width, count, layer->weights, layer->inputs, outputs, work->product, outputs);
+    multiply(rows, work->width, count, layer->weights, layer->inputs, outputs, work->product, outputs, 0);
 }
 
 // One hidden layer of every row, written to `hidden`.

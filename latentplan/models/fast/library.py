@@ -24,8 +24,8 @@ from torch import Tensor
 from latentplan.models.fast import pointwise
 
 FOLDER = Path(__file__).parent
-HEADERS = ("rows.h", "vectors.h", "products.h", "layers.h")
-LEARNED = ("unroll.c", "heads.c")  # with gradients
+HEADERS = ("rows.h", "vectors.h", "products.h", "layers.h", "convolutions.h")
+LEARNED = ("unroll.c", "heads.c", "encoder.c", "decoder.c")  # with gradients
 PLANNED = ("kernels.c", "imagine.c", "frame.c")
 # Sums may be reordered, because compilers cannot vectorize them otherwise; all other rules of IEEE 754 hold.
 ARITHMETIC = ("-fassociative-math", "-fno-signed-zeros", "-fno-trapping-math", "-fno-math-errno")
@@ -114,6 +114,7 @@ def load(*, is_exact: bool = False) -> ctypes.CDLL | None:
     place, count, threads, number = ctypes.c_void_p, ctypes.c_long, ctypes.c_int, ctypes.c_double
     library.unroll.argtypes = library.apply_network.argtypes = [place, threads]
     library.unroll_back.argtypes = library.apply_network_back.argtypes = [place, place, threads]
+    library.encode.argtypes = library.decode.argtypes = [place, place, threads]
     library.mean_of_bins.argtypes = [place] * 4 + [count, count]
     library.cross_entropy.argtypes = [place] * 5 + [count, count]
     library.lambda_return.argtypes = [place] * 3 + [number, place, count, count]

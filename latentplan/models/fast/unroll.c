@@ -54,7 +54,7 @@ static const real *stoch_before(const Block *block, long step, long r) {
 
 static void apply(const Block *block, const half *rows, const half *weights, const Layer *layer, real *to) {
     long inputs = padded(layer->inputs), outputs = padded(layer->outputs);
-    multiply(rows, inputs, block->count, weights, inputs, outputs, to, outputs);
+    multiply(rows, inputs, block->count, weights, inputs, outputs, to, outputs, 0);
 }
 
 // Writes the actions of a step, a sample of the actor.
@@ -183,7 +183,7 @@ static void read_latent_back(const Block *block, const Gradients *g, Passed *pas
         }
         clear_row(row, 2 * u->latent, outputs);
     }
-    multiply(of_raw, outputs, block->count, block->weights->output, outputs, hidden, passed->of_hidden, hidden);
+    multiply(of_raw, outputs, block->count, block->weights->output, outputs, hidden, passed->of_hidden, hidden, 0);
     for (long r = 0; r < block->count; r++) {
         const real *second = u->second + row_of(block, step, r) * hidden;
         half *row = of_second + r * hidden;
@@ -195,7 +195,7 @@ static void read_latent_back(const Block *block, const Gradients *g, Passed *pas
             VECTOR() for (long i = 0; i < u->hidden.outputs; i++) to[i] = read_half(row[i]);
         }
     }
-    multiply(of_second, hidden, block->count, block->weights->hidden, hidden, deter, passed->of_deter, deter);
+    multiply(of_second, hidden, block->count, block->weights->hidden, hidden, deter, passed->of_deter, deter, 0);
 }
 
 // The gradient of a row of gates; `gradient` is that of the next deter, and becomes the part that passes directly to
@@ -237,13 +237,13 @@ static void advance_back(const Block *block, const Gradients *g, Passed *passed,
         clear_row(of_gates + r * gates, 3 * u->deter, gates);
     }
     multiply(of_gates, gates, block->count, block->weights->gates, gates, gate_inputs, passed->of_gate_inputs,
-             gate_inputs);
+             gate_inputs, 0);
     for (long r = 0; r < block->count; r++) {
         const real *first = u->first + row_of(block, index, r) * hidden;
         norm_silu_back(of_first + r * hidden, passed->of_gate_inputs + r * gate_inputs, first, &u->input, passed->sums);
         clear_row(of_first + r * hidden, u->input.outputs, hidden);
     }
-    multiply(of_first, hidden, block->count, block->weights->input, hidden, inputs, passed->of_inputs, inputs);
+    multiply(of_first, hidden, block->count, block->weights->input, hidden, inputs, passed->of_inputs, inputs, 0);
     if (g->of_actions != NULL)
         for (long r = 0; r < block->count; r++)
             memcpy(g->of_actions + row_of(block, index, r) * u->action, passed->of_inputs + r * inputs + u->latent,

@@ -48,7 +48,7 @@ class Prediction(NamedTuple):
         features: Features of posterior states, (batch, time + 1, feature).
         posterior: Distribution of the latent given the frame, (batch, time + 1, latent).
         prior: Distribution of the latent before the frame, (batch, time + 1, latent).
-        patches: Decoded pictures, one row per frame, batch-major.
+        reconstruction_errors: Squared error of each decoded picture, (batch time + 1,).
         reward_logits: Predicted rewards, (batch, time, bin).
         continue_logits: Predicted continuation, (batch, time).
         open_loop: Features predicted from actions alone, (batch, reached, feature); see `_predict_open_loop`.
@@ -63,7 +63,7 @@ class Prediction(NamedTuple):
     features: Tensor
     posterior: Gaussian
     prior: Gaussian
-    patches: Tensor
+    reconstruction_errors: Tensor
     reward_logits: Tensor
     continue_logits: Tensor
     open_loop: Tensor
@@ -133,7 +133,7 @@ def world_model_loss(model: WorldModel, batch: Batch, config: LearningConfig, ge
     size, frames_per_sequence = batch.frames.shape[:2]
     moved = random_shift(model.backend, batch.frames, config.random_shift, generator)
     with model.trunk_precision(cache=False):
-        embeddings = model.encoder(moved.flatten(0, 1)).unflatten(0, (size, frames_per_sequence))
+        embeddings = model.backend.encode(model, moved.flatten(0, 1)).unflatten(0, (size, frames_per_sequence))
     noise = torch.randn(
         size, frames_per_sequence, model.config.latent_dim, generator=generator, device=batch.frames.device
     )
@@ -142,7 +142,7 @@ def world_model_loss(model: WorldModel, batch: Batch, config: LearningConfig, ge
     overshooting, open_loop = _predict_open_loop(model, batch, states, posterior, config)
     with model.trunk_precision(cache=False):
         prior = model.dynamics.prior(states.deter)
-        patches = model.decoder(features.flatten(0, 1))
+        errors = model.backend.reconstruction_errors(model, features.flatten(0, 1), batch.frames.flatten(0, 1))
         reward_logits = model.backend.apply(model.reward_head.mlp, features[:, 1:])
         open_loop_logits = model.backend.apply(model.reward_head.mlp, open_loop)
         continue_logits = model.backend.apply(model.continue_head, features[:, 1:]).squeeze(-1)
@@ -153,7 +153,7 @@ def world_model_loss(model: WorldModel, batch: Batch, config: LearningConfig, ge
         features=features,
         posterior=posterior,
         prior=prior,
-        patches=patches,
+        reconstruction_errors=errors,
         reward_logits=reward_logits,
         continue_logits=continue_logits,
         open_loop=open_loop,
@@ -168,8 +168,7 @@ def world_model_loss(model: WorldModel, batch: Batch, config: LearningConfig, ge
 @register(WORLD_MODEL_LOSSES, "reconstruction", "reconstruction_scale")
 def _reconstruction(predicted: Prediction) -> Tensor:
     """Squared error of the decoded picture, summed over the picture."""
-    errors = predicted.model.decoder.loss(predicted.patches, predicted.batch.frames.flatten(0, 1))
-    return mean_within(errors, predicted.is_seen.flatten())
+    return mean_within(predicted.reconstruction_errors, predicted.is_seen.flatten())
 
 
 @register(WORLD_MODEL_LOSSES, "reward", "reward_scale")

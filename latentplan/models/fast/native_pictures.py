@@ -1,0 +1,198 @@
+"""Encoder and decoder in one compiled call each way, for processors.
+
+Convolutions are products of rows that hold the inputs of one place, as `encoder.c` and `decoder.c` compute them frame by
+frame in the cache.
+"""
+
+from __future__ import annotations
+
+import ctypes
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from latentplan.models.decoder import Decoder
+from latentplan.models.encoder import Encoder
+from latentplan.models.fast.native import (
+    LONGEST_ROW,
+    TILE,
+    Count,
+    Kernels,
+    Layer,
+    Place,
+    check_called,
+    describe_layer,
+    find_kernels,
+    fits,
+    pad_size,
+    point_to,
+)
+
+MOST_CONVOLUTIONS = 4  # as in encoder.c
+
+
+class _Convolution(ctypes.Structure):
+    _fields_ = (("layer", Layer), *((name, Count) for name in ("side", "channels", "kernel", "stride")))
+
+
+class _LayerGradients(ctypes.Structure):
+    _fields_ = (("weights", Place), ("shift", Place))
+
+
+class _Encoder(ctypes.Structure):
+    _fields_ = (
+        *((name, Layer) for name in ("patches", "linear")),
+        ("convolutions", _Convolution * MOST_CONVOLUTIONS),
+        *((name, Count) for name in ("num_convolutions", "rows")),
+        *((name, Place) for name in ("frames", "embeddings", "kept")),
+    )
+
+
+class _EncoderGradients(ctypes.Structure):
+    _fields_ = (
+        ("of_embeddings", Place),
+        *((name, _LayerGradients) for name in ("patches", "linear")),
+        ("convolutions", _LayerGradients * MOST_CONVOLUTIONS),
+    )
+
+
+class _Decoder(ctypes.Structure):
+    _fields_ = (
+        *((name, Layer) for name in ("tokens", "paint")),
+        ("mix", _Convolution),
+        ("rows", Count),
+        *((name, Place) for name in ("features", "frames", "errors", "kept", "differences")),
+    )
+
+
+class _DecoderGradients(ctypes.Structure):
+    _fields_ = (
+        *((name, Place) for name in ("of_errors", "of_features")),
+        *((name, _LayerGradients) for name in ("tokens", "paint", "mix")),
+    )
+
+
+def encode(encoder: Encoder, frames: Tensor) -> Tensor:
+    """Embeddings (rows, embedding) of uint8 frames (rows, 64, 64, 3); gradients reach the weights."""
+    weight = encoder.patches.weight / 255.0
+    shift = encoder.patches.bias - 0.5 * encoder.patches.weight.sum(-1)  # see `Encoder._project`
+    layers = [weight, shift, encoder.linear.weight, encoder.linear.bias]
+    for part in encoder.convolutions:
+        layers += [part.weight.permute(0, 2, 3, 1), part.bias]
+    embeddings: Tensor = _Encoded.apply(frames.contiguous(), *layers)
+    return embeddings
+
+
+def reconstruction_errors(decoder: Decoder, features: Tensor, frames: Tensor) -> Tensor:
+    """Squared errors (rows,) of decoded pictures; gradients reach features (rows, feature) and weights."""
+    mix = decoder.mix
+    layers = [decoder.tokens.weight, decoder.tokens.bias, decoder.paint.weight, decoder.paint.bias]
+    layers += [mix.weight.permute(0, 2, 3, 1), mix.bias]
+    errors: Tensor = _Reconstructed.apply(features, frames.contiguous(), *layers)
+    return errors
+
+
+def can_encode(module: nn.Module) -> bool:
+    """Whether compiled functions can compute an encoder or a decoder."""
+    layers = [part for part in module.modules() if isinstance(part, nn.Linear | nn.Conv2d)]
+    return fits(module) and all(part.weight[0].numel() <= LONGEST_ROW for part in layers)
+
+
+def _kernels(weight: Tensor) -> Kernels:
+    kernels = find_kernels(weight.dtype)
+    assert kernels is not None
+    return kernels
+
+
+class _LayerSums:
+    """Gradients of one layer, which each thread adds up on its own."""
+
+    def __init__(self, weight: Tensor, threads: int) -> None:
+        outputs, inputs = len(weight), weight[0].numel()
+        height = -(-outputs // TILE) * TILE
+        self.weight = weight
+        self.of_weight = torch.zeros(threads, height, pad_size(inputs), dtype=weight.dtype)
+        self.of_shift = torch.zeros(threads, outputs, dtype=weight.dtype)
+        self.structure = _LayerGradients(self.of_weight.data_ptr(), self.of_shift.data_ptr())
+
+    def collect(self) -> tuple[Tensor, Tensor]:
+        """Gradients of the weight and of the bias."""
+        outputs, inputs = len(self.weight), self.weight[0].numel()
+        of_weight = self.of_weight.sum(0) if len(self.of_weight) > 1 else self.of_weight[0]
+        return of_weight[:outputs, :inputs].reshape(self.weight.shape), self.of_shift.sum(0)
+
+
+class _Encoded(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, frames: Tensor, *layers: Tensor) -> Tensor:
+        kernels, layers = _kernels(layers[0]), tuple(layer.contiguous() for layer in layers)
+        patches, shift, linear, bias, *rest = layers
+        structure = _Encoder(
+            describe_layer(patches, None, shift), describe_layer(linear, None, bias), num_convolutions=len(rest) // 2
+        )
+        side, kept = 16, 16 * 16 * len(patches)
+        for index, (weight, bias) in enumerate(zip(rest[::2], rest[1::2], strict=True)):
+            structure.convolutions[index] = _describe_convolution(weight, bias, side, stride=2)
+            side //= 2
+            kept += side * side * len(weight)
+        structure.rows = len(frames)
+        embeddings = torch.empty(len(frames), len(linear), dtype=kernels.real)
+        ctx.kept = torch.empty(len(frames), kept, dtype=kernels.half)
+        point_to(structure, frames=frames, embeddings=embeddings, kept=ctx.kept)
+        check_called(kernels.library.encode(ctypes.addressof(structure), None, torch.get_num_threads()))
+        ctx.structure, ctx.kernels, ctx.layers, ctx.frames = structure, kernels, layers, frames
+        return embeddings
+
+    @staticmethod
+    def backward(ctx: Any, outer: Tensor) -> tuple[Tensor | None, ...]:
+        gradients, threads, outer = _EncoderGradients(), torch.get_num_threads(), outer.contiguous()
+        sums = [_LayerSums(weight, threads) for weight in ctx.layers[::2]]
+        gradients.patches, gradients.linear = sums[0].structure, sums[1].structure
+        for index, part in enumerate(sums[2:]):
+            gradients.convolutions[index] = part.structure
+        point_to(gradients, of_embeddings=outer)
+        addresses = ctypes.addressof(ctx.structure), ctypes.addressof(gradients)
+        check_called(ctx.kernels.library.encode(*addresses, threads))
+        return None, *(part for layer in sums for part in layer.collect())
+
+
+class _Reconstructed(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, features: Tensor, frames: Tensor, *layers: Tensor) -> Tensor:
+        kernels, layers = _kernels(layers[0]), tuple(layer.contiguous() for layer in layers)
+        features = features.to(kernels.real).contiguous()
+        tokens, tokens_bias, paint, paint_bias, mix, mix_bias = layers
+        structure = _Decoder(
+            describe_layer(tokens, None, tokens_bias),
+            describe_layer(paint, None, paint_bias),
+            _describe_convolution(mix, mix_bias, 8, stride=1),
+            len(features),
+        )
+        rows, places = len(features), 8 * 8
+        errors = torch.empty(rows, dtype=kernels.real)
+        ctx.kept = torch.empty(rows, len(tokens) + places * len(mix), dtype=kernels.half)
+        ctx.differences = torch.empty(rows, places, len(paint), dtype=kernels.half)
+        point_to(
+            structure, features=features, frames=frames, errors=errors, kept=ctx.kept, differences=ctx.differences
+        )
+        check_called(kernels.library.decode(ctypes.addressof(structure), None, torch.get_num_threads()))
+        ctx.structure, ctx.kernels, ctx.layers, ctx.given = structure, kernels, layers, (features, frames)
+        return errors
+
+    @staticmethod
+    def backward(ctx: Any, outer: Tensor) -> tuple[Tensor | None, ...]:
+        threads, outer, of_features = torch.get_num_threads(), outer.contiguous(), torch.empty_like(ctx.given[0])
+        sums = [_LayerSums(weight, threads) for weight in ctx.layers[::2]]
+        gradients = _DecoderGradients()
+        gradients.tokens, gradients.paint, gradients.mix = (part.structure for part in sums)
+        point_to(gradients, of_errors=outer, of_features=of_features)
+        addresses = ctypes.addressof(ctx.structure), ctypes.addressof(gradients)
+        check_called(ctx.kernels.library.decode(*addresses, threads))
+        return of_features, None, *(part for layer in sums for part in layer.collect())
+
+
+def _describe_convolution(weight: Tensor, bias: Tensor, side: int, stride: int) -> _Convolution:
+    """The convolution with weights (out, kernel, kernel, in) over a grid."""
+    _, kernel, _, channels = weight.shape
+    return _Convolution(describe_layer(weight.flatten(1), None, bias), side, channels, kernel, stride)
