@@ -107,10 +107,6 @@ class TurnedModel:
         """The probability that the episode continues, mean over turns, (batch,)."""
         return mean_over_turns(self.model.continues(flat(state)), state)
 
-    def surprise(self, state: State) -> Tensor:
-        """The surprise in nats, mean over turns, (batch,)."""
-        return mean_over_turns(self.model.surprise(flat(state)), state)
-
     def policy(self, state: State, generator: torch.Generator | None = None) -> Tensor:
         """The action (batch, action), mean over turns: of samples with a generator, of modes without."""
         return mean_over_turns(self.model.policy(flat(state), generator), state)

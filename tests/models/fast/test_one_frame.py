@@ -1,6 +1,9 @@
 """Decisions about single frames: the compiled path and the path by calls of torch, against the reference."""
 
 import copy
+import ctypes
+import platform
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -10,7 +13,7 @@ from latentplan.agents.actor import ActorAgent
 from latentplan.config import Config, ModelConfig
 from latentplan.models import State, WorldModel
 from latentplan.models.backend import Backend, FrameFunctions
-from latentplan.models.fast import CpuBackend, native_frame
+from latentplan.models.fast import CpuBackend, library, native_frame
 from latentplan.models.fast.backends import ConvertedWeights
 from latentplan.models.fast.native_frame import NativeFrameFunctions
 from latentplan.models.fast.one_frame import TorchFrameFunctions
@@ -200,6 +203,27 @@ def test_compiled_decision_raises_for_inputs_that_do_not_fit_the_model(native, w
     frames = frames[:, :32] if wrong == "frames" else frames.float() if wrong == "dtype" else frames
     with pytest.raises(ValueError, match="the model needs"):
         functions.infer(state, action, frames, is_first)
+
+
+def run_on(march):
+    """Whether this machine runs code for an architecture of the x86-64 family."""
+    flags = Path("/proc/cpuinfo").read_text() if Path("/proc/cpuinfo").exists() else ""
+    return platform.machine() == "x86_64" and (
+        march == "x86-64" or all(f" {each} " in flags for each in ("avx2", "fma"))
+    )
+
+
+@pytest.mark.parametrize("march", ["x86-64", "x86-64-v3"])
+def test_compiled_decision_equals_the_reference_on_older_processors(native, march, tmp_path, monkeypatch):
+    if not run_on(march):
+        pytest.skip(f"the machine does not run code for {march}")
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    older = ctypes.CDLL(str(library._compile(("frame.c",), [f"-march={march}"])))
+    older.decide.argtypes = library.load().decide.argtypes
+    monkeypatch.setattr(native_frame, "load", lambda: older)
+    model, (_, inputs) = make_model((32, 48, 64)), native
+    with torch.no_grad():
+        assert_near(call_all(NativeFrameFunctions(model), *inputs), call_all(FrameFunctions(model), *inputs))
 
 
 def path_of(model):
