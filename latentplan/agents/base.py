@@ -65,6 +65,7 @@ class ModelAgent:
     last_source: str | list[str] = "actor"
     steps_ahead: int = 0
     _frame_functions: FrameFunctions  # with the weights of the present decision
+    _without_gradients: type[torch.no_grad] | type[torch.inference_mode] = torch.no_grad
 
     def __init__(
         self,
@@ -105,7 +106,6 @@ class ModelAgent:
                 raise ValueError(f"got a mask of {len(forget)} for {len(self.state.deter)} environments")
             self._is_reset = forget if self._is_reset is None else self._is_reset | forget
 
-    @torch.no_grad()
     def act(self, frame: np.ndarray) -> np.ndarray:
         """The action for a new frame.
 
@@ -119,15 +119,16 @@ class ModelAgent:
             ValueError: The frame has another shape or dtype, or the batch changed without a reset.
         """
         single = frame.ndim == 3
-        frames = self._check_frames(frame[None] if single else frame)
-        self._frame_functions = self.model.backend.frame_functions(self.model)
-        state = self._update_belief(frames)
-        action = self._choose(state)
-        if self.noise_std > 0.0:
-            noise = self.noise.draw(action, self.generator, self._is_reset)
-            action = (action + self.noise_std * noise).clamp(-1.0, 1.0)
-        self.state, self._action, self._is_reset = state, action, None
-        result = action.float().cpu().numpy()
+        with self._without_gradients():
+            frames = self._check_frames(frame[None] if single else frame)
+            self._frame_functions = self.model.backend.frame_functions(self.model)
+            state = self._update_belief(frames)
+            action = self._choose(state)
+            if self.noise_std > 0.0:
+                noise = self.noise.draw(action, self.generator, self._is_reset)
+                action = (action + self.noise_std * noise).clamp(-1.0, 1.0)
+            self.state, self._action, self._is_reset = state, action, None
+            result = action.float().cpu().numpy()
         return result[0] if single else result
 
     @torch.no_grad()
