@@ -90,6 +90,22 @@ static void act(const Block *block, long step) {
     }
 }
 
+// The part `chunk` of the gates' norm, from place i of `size` on.
+static inline wide gate_of(const Norm *norm, long chunk, long i, long size) {
+    long at = chunk * size;
+    Norm part = {norm->row + at, norm->scale + at, norm->shift + at, norm->mean, norm->factor};
+    return normed_of(&part, i, size);
+}
+
+// The next state of the GRU.
+static inline void gate_row(real *after, const Norm *norm, const real *before, long size) {
+    FOR_LANES(i, size) {
+        wide candidate = tanh_of(sigmoid_of(gate_of(norm, 0, i, size)) * gate_of(norm, 1, i, size));
+        wide update = sigmoid_of(gate_of(norm, 2, i, size) - 1), old = load(before + i, size - i);
+        store(after + i, old + update * (candidate - old), size - i);
+    }
+}
+
 // The deters of a step, the `index`th with an action.
 static void advance(const Block *block, long step, long index) {
     const Unroll *u = block->unroll;
@@ -117,7 +133,7 @@ static void advance(const Block *block, long step, long index) {
         const real *before = deter_before(block, step, r);
         real *after = u->deters + row_of(block, step, r) * u->deter;
         Norm norm = compute_norm(products + r * gates, u->gates.scale, u->gates.shift, u->gates.outputs);
-        VECTOR() for (long i = 0; i < u->deter; i++) after[i] = gated(&norm, i, u->deter, before[i]);
+        gate_row(after, &norm, before, u->deter);
     }
 }
 
@@ -204,14 +220,15 @@ static void gates_back(half *to, real *gradient, const real *before, const real 
                        real *sums) {
     real of_scaled[LONGEST_ROW];
     Norm norm = compute_norm(product, layer->scale, layer->shift, layer->outputs);
-    VECTOR() for (long i = 0; i < size; i++) {
-        real reset = sigmoid(normed(&norm, i)), raw = normed(&norm, size + i);
-        real update = sigmoid(normed(&norm, 2 * size + i) - 1), candidate = hyperbolic_tangent(reset * raw);
-        real inner = gradient[i] * update * (1 - candidate * candidate);
-        of_scaled[i] = inner * raw * reset * (1 - reset);
-        of_scaled[size + i] = inner * reset;
-        of_scaled[2 * size + i] = gradient[i] * (candidate - before[i]) * update * (1 - update);
-        gradient[i] *= 1 - update;
+    FOR_LANES(i, size) {
+        long left = size - i;
+        wide reset = sigmoid_of(gate_of(&norm, 0, i, size)), raw = gate_of(&norm, 1, i, size);
+        wide update = sigmoid_of(gate_of(&norm, 2, i, size) - 1), candidate = tanh_of(reset * raw);
+        wide of_next = load(gradient + i, left), inner = of_next * update * (1 - candidate * candidate);
+        store(of_scaled + i, inner * raw * reset * (1 - reset), left);
+        store(of_scaled + size + i, inner * reset, left);
+        store(of_scaled + 2 * size + i, of_next * (candidate - load(before + i, left)) * update * (1 - update), left);
+        store(gradient + i, of_next * (1 - update), left);
     }
     norm_back(to, of_scaled, &norm, 3 * size, sums);
 }
