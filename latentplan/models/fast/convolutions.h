@@ -22,8 +22,6 @@ typedef struct {
     real *weights, *shift;
 } LayerGradients;
 
-static inline long larger(long a, long b) { return a > b ? a : b; }
-static inline long smaller(long a, long b) { return a < b ? a : b; }
 static inline long padded_to_tile(long size) { return (size + TILE - 1) / TILE * TILE; }
 static inline long count_places(const Convolution *c) { return (c->side / c->stride) * (c->side / c->stride); }
 static inline long grid_size(const Convolution *c) { return (c->side + 2) * (c->side + 2) * c->channels; }

@@ -17,6 +17,9 @@ typedef struct {
     long inputs, outputs;
 } Layer;
 
+static inline long larger(long a, long b) { return a > b ? a : b; }
+static inline long smaller(long a, long b) { return a < b ? a : b; }
+
 static void *allocate(size_t size) { return aligned_alloc(64, (size + 63) / 64 * 64); }
 
 static inline size_t packed_size(const Layer *layer) {
@@ -25,6 +28,10 @@ static inline size_t packed_size(const Layer *layer) {
 
 static inline void write_row(half *to, const real *from, long length) {
     FOR_LANES(i, length) store_half(to + i, load(from + i, length - i), length - i);
+}
+
+static inline void read_row(real *to, const half *from, long length) {
+    FOR_LANES(i, length) store(to + i, load_half(from + i, length - i), length - i);
 }
 
 static inline void clear_row(half *to, long from, long until) {
