@@ -12,7 +12,16 @@ from torch import Tensor, nn
 
 from latentplan.models.backend import Backend, FrameFunctions, lambda_return
 from latentplan.models.dynamics import Gaussian, Rssm, State
-from latentplan.models.fast import compiled, native, native_heads, native_pictures, native_unroll, one_frame, pointwise, unroll
+from latentplan.models.fast import (
+    compiled,
+    native,
+    native_heads,
+    native_pictures,
+    native_unroll,
+    one_frame,
+    pointwise,
+    unroll,
+)
 from latentplan.models.fast import frames as sliced_frames
 from latentplan.models.fast import rollout as rollouts
 from latentplan.models.heads import Mlp, ScalarHead, action_distribution

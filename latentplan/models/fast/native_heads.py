@@ -109,7 +109,7 @@ class _Applied(torch.autograd.Function):
         outer = pad_rows(outer.reshape(-1, outer.shape[-1]), 0)
         learns = kept["inputs"] is not None
         sizes = [pad_size(layer.outputs) for layer in (network.output, network.second, network.first)]
-        factors = {
+        factors: dict[str, Any] = {
             name: torch.empty(len(outer), size, dtype=kernels.half) if learns else None
             for name, size in zip(_FACTORS, sizes, strict=True)
         }

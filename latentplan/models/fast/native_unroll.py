@@ -48,7 +48,10 @@ class _Unroll(ctypes.Structure):
     _fields_ = (
         *((name, Layer) for name in ("input", "gates", "hidden", "output")),
         ("actor", Layer * 3),
-        *((name, Count) for name in ("rows", "steps", "action", "latent", "deter", "has_frames", "keeps_inputs", "has_actor")),
+        *(
+            (name, Count)
+            for name in ("rows", "steps", "action", "latent", "deter", "has_frames", "keeps_inputs", "has_actor")
+        ),
         ("decay", ctypes.c_double),
         *((name, Place) for name in _GIVEN),
         ("state_stride", Count * 2),
@@ -196,9 +199,7 @@ class _Call:
         point_to(structure, **self.given, **others)
         return structure
 
-    def backward(
-        self, outer: tuple[Tensor | None, ...]
-    ) -> tuple[Tensor | None, Tensor | None, tuple[Tensor, ...]]:
+    def backward(self, outer: tuple[Tensor | None, ...]) -> tuple[Tensor | None, Tensor | None, tuple[Tensor, ...]]:
         """Gradients of embeddings, actions and weights, given those of deters, stochs, means and stds."""
         weights, results, kernels = self.weights, self.results, self.kernels
         laid = [None if part is None else lay_rows(part, kernels.real) for part in outer]
@@ -214,7 +215,15 @@ class _Call:
         gradients = _Gradients()
         gradients.state_stride = (Count * 2)(*(0 if part is None else part.stride(1) for part in laid[:2]))
         gradients.of_deters, gradients.of_stochs = (None if part is None else part.data_ptr() for part in laid[:2])
-        point_to(gradients, of_means=laid[2], of_stds=laid[3], **factors, of_actions=of_actions, of_embeddings=of_embeddings, norms=norms)
+        point_to(
+            gradients,
+            of_means=laid[2],
+            of_stds=laid[3],
+            **factors,
+            of_actions=of_actions,
+            of_embeddings=of_embeddings,
+            norms=norms,
+        )
         addresses = ctypes.addressof(self.structure), ctypes.addressof(gradients)
         check_called(kernels.library.unroll_back(*addresses, torch.get_num_threads()))
         of_embeddings, of_actions = (
