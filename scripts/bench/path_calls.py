@@ -42,7 +42,7 @@ def frame_calls(model: WorldModel) -> Calls:
 
 
 def learner_calls(model: WorldModel, learning: LearningConfig) -> Calls:
-    """Forward and backward passes of the recurrence, and the slow copies of weights."""
+    """Forward and backward passes of a learner, and the slow copies of weights."""
     batch, time, sizes, device = learning.batch_size, learning.sequence_length, model.config, model.device
     embeddings = torch.randn(batch, time + 1, sizes.hidden_dim, device=device, requires_grad=True)
     noise = torch.randn(batch, time + 1, sizes.latent_dim, device=device)
@@ -53,6 +53,9 @@ def learner_calls(model: WorldModel, learning: LearningConfig) -> Calls:
     first, horizon = _states(model, learning.imagination_starts), learning.imagination_horizon
     action_noise = torch.randn(horizon, len(first.deter), model.action_dim, device=device)
     latent_noise = torch.randn(horizon, len(first.deter), sizes.latent_dim, device=device)
+    frames = torch.randint(0, 256, (batch * (time + 1), 64, 64, 3), dtype=torch.uint8, device=device)
+    features = torch.cat(_states(model, len(frames)), -1).requires_grad_()
+    imagined = torch.cat(_states(model, horizon * len(first.deter)), -1).requires_grad_()
     slow = [parameter.detach().clone() for parameter in model.parameters()]
     latest = [parameter.detach() for parameter in model.parameters()]
 
@@ -66,12 +69,32 @@ def learner_calls(model: WorldModel, learning: LearningConfig) -> Calls:
     def imagine(model: WorldModel) -> None:
         _run_backward(model.backend.imagine(model, first, action_noise, latent_noise, learning.gradient_decay))
 
-    return {
-        "observation, gradients written out": observe,
-        "open-loop prediction, gradients written out": predict,
-        "imagination, gradients written out": imagine,
-        "moving averages, all tensors at once": lambda model: model.backend.move_towards(slow, latest, 0.01),
+    def encode(model: WorldModel) -> None:
+        with model.trunk_precision():
+            embedded = model.backend.encode(model, frames)
+        _run_backward((embedded,))
+
+    def reconstruct(model: WorldModel) -> None:
+        with model.trunk_precision():
+            errors = model.backend.reconstruction_errors(model, features, frames)
+        _run_backward((errors,))
+
+    def value(model: WorldModel) -> None:
+        with model.trunk_precision():
+            logits = model.backend.apply(model.value_head.mlp, imagined)
+        _run_backward((model.backend.mean(model.value_head, logits),))
+
+    calls: Calls = {
+        "encoder, with gradients": encode,
+        "reconstruction, with gradients": reconstruct,
+        "observation, with gradients": observe,
+        "open-loop prediction, with gradients": predict,
+        "imagination, with gradients": imagine,
+        "values of imagined states, with gradients": value,
     }
+    if device.type == "cuda":
+        calls["moving averages, all tensors at once"] = lambda model: model.backend.move_towards(slow, latest, 0.01)
+    return calls
 
 
 def augmentation_calls(model: WorldModel, learning: LearningConfig) -> Calls:

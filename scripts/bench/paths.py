@@ -126,7 +126,7 @@ def _paths(
 
     from bench.path_calls import augmentation_calls, frame_calls, learner_calls, planner_calls
     from latentplan.models.backend import Backend
-    from latentplan.models.fast import GpuBackend, accelerate
+    from latentplan.models.fast import accelerate
     from latentplan.models.fast.native_frame import NativeFrameFunctions
 
     precision = accelerate(model).trunk_dtype
@@ -153,8 +153,7 @@ def _paths(
     for name, call in augmentation_calls(model, learning).items() if device.type == "cpu" else ():
         yield name, call, Backend(precision), backend(), nullcontext
     for name, call in learner_calls(model, learning).items():
-        # Reference and fast path in float32, as on a GPU, so that only the path differs.
-        yield name, call, Backend(), GpuBackend(), nullcontext
+        yield name, call, Backend(precision), backend(), nullcontext
 
 
 def _without_compiled() -> AbstractContextManager[Any]:
@@ -174,5 +173,5 @@ def _without_kernels() -> AbstractContextManager[Any]:
 
     stack = ExitStack()
     stack.enter_context(_without_compiled())
-    stack.enter_context(patch.object(library, "load", lambda: None))
+    stack.enter_context(patch.object(library, "load", lambda **_: None))
     return stack

@@ -16,6 +16,7 @@ from torch.utils.flop_counter import FlopCounterMode
 from bench.machine import read_clock
 from latentplan.config import Config
 from latentplan.models import WorldModel
+from latentplan.models.backend import Backend
 from latentplan.models.fast import accelerate
 from latentplan.replay.buffer import Batch, Replay, Rows
 from latentplan.training.learner.graphed import WARM_UP_UPDATES as GRAPH_WARM_UP_UPDATES
@@ -179,6 +180,9 @@ def _measure_laps(learner: StandaloneLearner, alone: Parts, device: torch.device
 
 
 def _count_lap(learner: StandaloneLearner, alone: Parts) -> Lap:
+    """Operations of each part, counted on the reference, because torch does not see into compiled functions."""
+    for model in (learner.model, learner.snapshot.model):
+        model.backend = Backend(model.trunk_dtype)
     with FlopCounterMode(display=False) as counter:
         meter = PhaseMeter(learner, lambda: float(counter.get_total_flops()))
         lap = _measure_lap(learner, alone, meter, np.random.default_rng(2))
@@ -228,15 +232,14 @@ def _parts_alone(model: WorldModel, batch: Batch) -> Parts:
 
     def encode() -> Tensor:
         with model.trunk_precision():
-            return model.encoder(frames)
+            return model.backend.encode(model, frames)
 
     def recur() -> Any:
         return model.backend.observe(model, embeddings.requires_grad_(), batch.actions, batch.deter, noise)
 
     def decode() -> Tensor:
         with model.trunk_precision():
-            patches = model.decoder(features.requires_grad_())
-        return model.decoder.loss(patches, frames)
+            return model.backend.reconstruction_errors(model, features.requires_grad_(), frames)
 
     return {"encode": encode, "recurrence": recur, "decode": decode}
 

@@ -22,8 +22,6 @@ typedef struct {
     real *weights, *shift;
 } LayerGradients;
 
-static inline long larger(long a, long b) { return a > b ? a : b; }
-static inline long smaller(long a, long b) { return a < b ? a : b; }
 static inline long padded_to_tile(long size) { return (size + TILE - 1) / TILE * TILE; }
 static inline long count_places(const Convolution *c) { return (c->side / c->stride) * (c->side / c->stride); }
 static inline long grid_size(const Convolution *c) { return (c->side + 2) * (c->side + 2) * c->channels; }
@@ -67,33 +65,40 @@ static void add_rows(real *grid, const real *from, const Convolution *c) {
         for (long y = 0; y < c->kernel; y++) {
             real *row = to + y * (c->side + 2) * c->channels;
             const real *gradient = from + place * width + y * strip;
-            VECTOR() for (long i = 0; i < strip; i++) row[i] += gradient[i];
+            FOR_LANES(i, strip) store(row + i, load(row + i, strip - i) + load(gradient + i, strip - i), strip - i);
         }
     }
 }
 
 // Adds the bias to a product, keeps the sum, and writes its SiLU.
 static inline void activate(half *to, half *kept, const real *product, const real *bias, long length) {
-    VECTOR() for (long i = 0; i < length; i++) {
-        kept[i] = write_half(product[i] + bias[i]);
-        to[i] = write_half(silu(read_half(kept[i])));
+    FOR_LANES(i, length) {
+        long left = length - i;
+        wide sum = load(product + i, left) + load(bias + i, left);
+        store_half(kept + i, sum, left);
+        store_half(to + i, sum * sigmoid_of(sum), left);
     }
 }
 
 // Writes the SiLU of kept sums, and its slope.
 static inline void activate_again(half *to, real *slope, const half *kept, long length) {
-    VECTOR() for (long i = 0; i < length; i++) {
-        real value = read_half(kept[i]), gate = sigmoid(value);
-        to[i] = write_half(value * gate);
-        slope[i] = gate * (1 + value * (1 - gate));
+    FOR_LANES(i, length) {
+        wide value = load_half(kept + i, length - i), gate = sigmoid_of(value);
+        store_half(to + i, value * gate, length - i);
+        store(slope + i, gate * (1 + value * (1 - gate)), length - i);
     }
+}
+
+// Writes the products of two rows.
+static inline void multiply_row(half *to, const real *left, const real *right, long length) {
+    FOR_LANES(i, length) store_half(to + i, load(left + i, length - i) * load(right + i, length - i), length - i);
 }
 
 // Passes the gradient of a grid through the SiLU before it, whose slopes are given, to rows of `stride` numbers.
 static void grid_back(half *to, const real *of_grid, const real *slopes, const Convolution *c, long stride) {
     for (long place = 0; place < c->side * c->side; place++) {
         const real *gradient = of_grid + place_in_grid(c, place), *slope = slopes + place * c->channels;
-        VECTOR() for (long i = 0; i < c->channels; i++) to[place * stride + i] = write_half(gradient[i] * slope[i]);
+        multiply_row(to + place * stride, gradient, slope, c->channels);
         clear_row(to + place * stride, c->channels, stride);
     }
 }
@@ -159,8 +164,12 @@ static void accumulate(const LayerGradients *to, const Layer *layer, const half 
         for (long r = 0; r < rows; r += 8) turn_8(turned + n * rows + r, rows, of_outputs + r * outputs + n, outputs);
     pack_rows(packed, inputs, rows, width);
     multiply(turned, rows, height, packed, rows, width, to->weights, width, 1);
-    for (long r = 0; r < rows; r++)
-        VECTOR() for (long i = 0; i < layer->outputs; i++) to->shift[i] += read_half(of_outputs[r * outputs + i]);
+    FOR_LANES(i, layer->outputs) {
+        long left = layer->outputs - i;
+        wide sum = load(to->shift + i, left);
+        for (long r = 0; r < rows; r++) sum += load_half(of_outputs + r * outputs + i, left);
+        store(to->shift + i, sum, left);
+    }
 }
 
 // The gradients that this thread adds to.

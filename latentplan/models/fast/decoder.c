@@ -139,8 +139,8 @@ static void decode_row_back(const Decoder *d, const DecoderGradients *g, const D
     for (long place = 0; place < PLACES; place++) {
         const half *difference = d->differences + (row * PLACES + place) * PIXELS;
         half *to = s->of_pixels + place * pixels;
-        VECTOR() for (long i = 0; i < PIXELS; i++)
-            to[i] = write_half(2 * g->of_errors[row] * read_half(difference[i]));
+        FOR_LANES(i, PIXELS)
+            store_half(to + i, 2 * g->of_errors[row] * load_half(difference + i, PIXELS - i), PIXELS - i);
         clear_row(to, PIXELS, pixels);
         const half *sums = kept + d->tokens.outputs + place * mix->outputs;
         activate_again(s->hidden + place * hidden, s->slopes + place * mix->outputs, sums, mix->outputs);
@@ -151,7 +151,7 @@ static void decode_row_back(const Decoder *d, const DecoderGradients *g, const D
     for (long place = 0; place < PLACES; place++) {
         const real *gradient = s->product + place * hidden, *slope = s->slopes + place * mix->outputs;
         half *to = s->of_hidden + place * hidden;
-        VECTOR() for (long i = 0; i < mix->outputs; i++) to[i] = write_half(gradient[i] * slope[i]);
+        multiply_row(to, gradient, slope, mix->outputs);
         clear_row(to, mix->outputs, hidden);
     }
     fill_grid(s->grids, s->slopes, kept, &d->mix);

@@ -179,7 +179,7 @@ static void linear_back(const Encoder *e, const EncoderGradients *g, const Encod
         for (long place = 0; place < places; place++) {
             const real *gradient = s->product + f * flat + place * channels, *slope = s->slopes + f * flat + place * channels;
             half *row = s->of_outputs + (f * places + place) * stride;
-            VECTOR() for (long i = 0; i < channels; i++) row[i] = write_half(gradient[i] * slope[i]);
+            multiply_row(row, gradient, slope, channels);
             clear_row(row, channels, stride);
         }
 }

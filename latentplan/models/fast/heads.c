@@ -7,12 +7,13 @@ typedef struct {
     long rows;
     const real *features;  // (rows, inputs)
     real *results;         // (rows, outputs)
-    // Written, and read by the backward pass; arrays of `half` have padded sizes.
-    half *inputs, *hidden, *last;
-    real *products, *last_products;
+    // Written, and read by the backward pass, with padded sizes: sums before the norms, and the inputs of the layers.
+    // The inputs are NULL if the weights need no gradient.
+    half *products, *last_products, *inputs, *hidden, *last;
 } Network;
 
-// `norms` holds the gradients of scale and shift of the first and the second layer, side by side.
+// `norms` holds the gradients of scale and shift of the first and the second layer, side by side. The factors of the
+// weights' gradients are NULL if the weights need none.
 typedef struct {
     const real *of_results;
     half *of_output, *of_second, *of_first;
@@ -35,61 +36,70 @@ static half *allocate_network(const Network *n) {
     return allocate(packed_size(&n->first) + packed_size(&n->second) + 2 * packed_size(&n->output));
 }
 
-static void hide(half *to, const real *products, const Layer *layer, long count) {
+// Keeps the sums of a layer, and writes the SiLU of their norm.
+static void hide(half *to, half *kept, const real *sums, const Layer *layer, long count) {
     long outputs = padded(layer->outputs);
     for (long r = 0; r < count; r++) {
-        norm_silu(to + r * outputs, products + r * outputs, layer);
+        write_row(kept + r * outputs, sums + r * outputs, layer->outputs);
+        norm_silu(to + r * outputs, sums + r * outputs, layer);
         clear_row(to + r * outputs, layer->outputs, outputs);
     }
 }
 
 static void apply_block(const Network *n, half *const weights[4], long from, long count) {
     long inputs = padded(n->first.inputs), hidden = padded(n->first.outputs), last = padded(n->second.outputs);
-    long outputs = padded(n->output.outputs);
-    real raw[BLOCK * outputs], error[BLOCK * outputs];
-    half *rows = n->inputs + from * inputs, *middle = n->hidden + from * hidden, *end = n->last + from * last;
-    real *products = n->products + from * hidden, *last_products = n->last_products + from * last;
+    long outputs = padded(n->output.outputs), widest = larger(hidden, larger(last, outputs));
+    real sums[BLOCK * widest], error[BLOCK * outputs];
+    half own_rows[BLOCK * inputs], own_middle[BLOCK * hidden], own_end[BLOCK * last];
+    half *rows = n->inputs == NULL ? own_rows : n->inputs + from * inputs;
+    half *middle = n->inputs == NULL ? own_middle : n->hidden + from * hidden;
+    half *end = n->inputs == NULL ? own_end : n->last + from * last;
     for (long r = 0; r < count; r++) {
         write_row(rows + r * inputs, n->features + (from + r) * n->first.inputs, n->first.inputs);
         clear_row(rows + r * inputs, n->first.inputs, inputs);
     }
-    multiply(rows, inputs, count, weights[0], inputs, hidden, products, hidden, 0);
-    hide(middle, products, &n->first, count);
-    multiply(middle, hidden, count, weights[1], hidden, last, last_products, last, 0);
-    hide(end, last_products, &n->second, count);
-    multiply(end, last, count, weights[2], last, outputs, raw, outputs, 0);
+    multiply(rows, inputs, count, weights[0], inputs, hidden, sums, hidden, 0);
+    hide(middle, n->products + from * hidden, sums, &n->first, count);
+    multiply(middle, hidden, count, weights[1], hidden, last, sums, last, 0);
+    hide(end, n->last_products + from * last, sums, &n->second, count);
+    multiply(end, last, count, weights[2], last, outputs, sums, outputs, 0);
     // The last layer is as precise as its inputs: a second product has what rounding took from the weights.
     multiply(end, last, count, weights[3], last, outputs, error, outputs, 0);
     for (long r = 0; r < count; r++) {
         real *row = n->results + (from + r) * n->output.outputs;
         VECTOR() for (long i = 0; i < n->output.outputs; i++)
-            row[i] = raw[r * outputs + i] + error[r * outputs + i] + n->output.shift[i];
+            row[i] = sums[r * outputs + i] + error[r * outputs + i] + n->output.shift[i];
+    }
+}
+
+// Passes gradients through the SiLU and the norm of a layer, whose sums were kept.
+static void hide_back(half *to, const real *gradient, const half *kept, const Layer *layer, real *sums, long count) {
+    long outputs = padded(layer->outputs);
+    for (long r = 0; r < count; r++) {
+        real row[LONGEST_ROW];
+        read_row(row, kept + r * outputs, layer->outputs);
+        norm_silu_back(to + r * outputs, gradient + r * outputs, row, layer, sums);
+        clear_row(to + r * outputs, layer->outputs, outputs);
     }
 }
 
 static void apply_block_back(const Network *n, const Gradients *g, half *const weights[4], real *sums, long from,
                              long count) {
     long inputs = padded(n->first.inputs), hidden = padded(n->first.outputs), last = padded(n->second.outputs);
-    long outputs = padded(n->output.outputs), widest = inputs > hidden ? inputs : hidden;
-    real gradient[BLOCK * (widest > last ? widest : last)];
-    half *of_output = g->of_output + from * outputs, *of_second = g->of_second + from * last;
-    half *of_first = g->of_first + from * hidden;
+    long outputs = padded(n->output.outputs);
+    real gradient[BLOCK * larger(inputs, larger(hidden, last))];
+    half own_output[BLOCK * outputs], own_second[BLOCK * last], own_first[BLOCK * hidden];
+    half *of_output = n->inputs == NULL ? own_output : g->of_output + from * outputs;
+    half *of_second = n->inputs == NULL ? own_second : g->of_second + from * last;
+    half *of_first = n->inputs == NULL ? own_first : g->of_first + from * hidden;
     for (long r = 0; r < count; r++) {
         write_row(of_output + r * outputs, g->of_results + (from + r) * n->output.outputs, n->output.outputs);
         clear_row(of_output + r * outputs, n->output.outputs, outputs);
     }
     multiply(of_output, outputs, count, weights[2], outputs, last, gradient, last, 0);
-    for (long r = 0; r < count; r++) {
-        const real *product = n->last_products + (from + r) * last;
-        norm_silu_back(of_second + r * last, gradient + r * last, product, &n->second, sums + 2 * n->first.outputs);
-        clear_row(of_second + r * last, n->second.outputs, last);
-    }
+    hide_back(of_second, gradient, n->last_products + from * last, &n->second, sums + 2 * n->first.outputs, count);
     multiply(of_second, last, count, weights[1], last, hidden, gradient, hidden, 0);
-    for (long r = 0; r < count; r++) {
-        const real *product = n->products + (from + r) * hidden;
-        norm_silu_back(of_first + r * hidden, gradient + r * hidden, product, &n->first, sums);
-        clear_row(of_first + r * hidden, n->first.outputs, hidden);
-    }
+    hide_back(of_first, gradient, n->products + from * hidden, &n->first, sums, count);
     if (g->of_features == NULL) return;
     multiply(of_first, hidden, count, weights[0], hidden, inputs, gradient, inputs, 0);
     for (long r = 0; r < count; r++)

@@ -5,7 +5,7 @@
 
 #include <stdlib.h>
 
-#include "products.h"
+#include "wide.h"
 
 #define BLOCK 32         // rows that a thread computes before the next rows
 #define LONGEST_ROW 4096
@@ -17,6 +17,9 @@ typedef struct {
     long inputs, outputs;
 } Layer;
 
+static inline long larger(long a, long b) { return a > b ? a : b; }
+static inline long smaller(long a, long b) { return a < b ? a : b; }
+
 static void *allocate(size_t size) { return aligned_alloc(64, (size + 63) / 64 * 64); }
 
 static inline size_t packed_size(const Layer *layer) {
@@ -24,7 +27,11 @@ static inline size_t packed_size(const Layer *layer) {
 }
 
 static inline void write_row(half *to, const real *from, long length) {
-    VECTOR() for (long i = 0; i < length; i++) to[i] = write_half(from[i]);
+    FOR_LANES(i, length) store_half(to + i, load(from + i, length - i), length - i);
+}
+
+static inline void read_row(real *to, const half *from, long length) {
+    FOR_LANES(i, length) store(to + i, load_half(from + i, length - i), length - i);
 }
 
 static inline void clear_row(half *to, long from, long until) {
@@ -75,26 +82,31 @@ static void pack_back(half *to, const Layer *layer) {
 static inline void norm_silu(half *to, const real *row, const Layer *layer) {
     long length = layer->outputs;
     Norm norm = compute_norm(row, layer->scale, layer->shift, length);
-    VECTOR() for (long i = 0; i < length; i++) to[i] = write_half(silu(normed(&norm, i)));
+    FOR_LANES(i, length) {
+        wide scaled = normed_of(&norm, i, length);
+        store_half(to + i, scaled * sigmoid_of(scaled), length - i);
+    }
 }
 
 // The gradient of a row before its norm, given the gradient of the scaled norm in `of_scaled`, which is overwritten.
 // Adds the gradients of scale and shift to `sums`, which holds them side by side.
 static inline void norm_back(half *to, real *of_scaled, const Norm *norm, long length, real *sums) {
-    real total = 0, along = 0;
-    VECTOR(reduction(+ : total, along)) for (long i = 0; i < length; i++) {
-        real centred = (norm->row[i] - norm->mean) * norm->factor;
-        sums[i] += of_scaled[i] * centred;
-        sums[length + i] += of_scaled[i];
-        of_scaled[i] *= norm->scale[i];
-        total += of_scaled[i];
-        along += of_scaled[i] * centred;
+    wide totals = {0}, alongs = {0};
+    FOR_LANES(i, length) {
+        long left = length - i;
+        wide centred = (load(norm->row + i, left) - norm->mean) * norm->factor, gradient = load(of_scaled + i, left);
+        store(sums + i, load(sums + i, left) + gradient * centred, left);
+        store(sums + length + i, load(sums + length + i, left) + gradient, left);
+        gradient *= load(norm->scale + i, left);
+        store(of_scaled + i, gradient, left);
+        totals += gradient;
+        alongs += gradient * centred;
     }
-    total /= (real)length;
-    along /= (real)length;
-    VECTOR() for (long i = 0; i < length; i++) {
-        real centred = (norm->row[i] - norm->mean) * norm->factor;
-        to[i] = write_half(norm->factor * (of_scaled[i] - total - centred * along));
+    real total = sum_of(totals) / (real)length, along = sum_of(alongs) / (real)length;
+    FOR_LANES(i, length) {
+        long left = length - i;
+        wide centred = (load(norm->row + i, left) - norm->mean) * norm->factor;
+        store_half(to + i, norm->factor * (load(of_scaled + i, left) - total - centred * along), left);
     }
 }
 
@@ -103,9 +115,9 @@ static inline void norm_silu_back(half *to, const real *gradient, const real *ro
     long length = layer->outputs;
     real of_scaled[LONGEST_ROW];
     Norm norm = compute_norm(row, layer->scale, layer->shift, length);
-    VECTOR() for (long i = 0; i < length; i++) {
-        real scaled = normed(&norm, i), gate = sigmoid(scaled);
-        of_scaled[i] = gradient[i] * gate * (1 + scaled * (1 - gate));
+    FOR_LANES(i, length) {
+        wide scaled = normed_of(&norm, i, length), gate = sigmoid_of(scaled);
+        store(of_scaled + i, load(gradient + i, length - i) * gate * (1 + scaled * (1 - gate)), length - i);
     }
     norm_back(to, of_scaled, &norm, length, sums);
 }

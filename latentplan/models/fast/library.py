@@ -24,7 +24,7 @@ from torch import Tensor
 from latentplan.models.fast import pointwise
 
 FOLDER = Path(__file__).parent
-HEADERS = ("rows.h", "vectors.h", "products.h", "layers.h", "convolutions.h")
+HEADERS = ("rows.h", "vectors.h", "products.h", "wide.h", "layers.h", "convolutions.h")
 LEARNED = ("unroll.c", "heads.c", "encoder.c", "decoder.c")  # with gradients
 PLANNED = ("kernels.c", "imagine.c", "frame.c")
 # Sums may be reordered, because compilers cannot vectorize them otherwise; all other rules of IEEE 754 hold.

@@ -80,6 +80,18 @@ def pad_rows(tensor: Tensor, dim: int) -> Tensor:
     return tensor.contiguous()
 
 
+def lay_rows(tensor: Tensor, real: torch.dtype) -> Tensor:
+    """A tensor (step, rows, size) in a format, whose rows begin `stride(1)` numbers apart in every step.
+
+    Rows of zeros follow the last, up to a multiple of `TILE`.
+    """
+    tensor = tensor.to(real)
+    if tensor.shape[1] % TILE:
+        return pad_rows(tensor, 1)
+    is_regular = tensor.stride(2) == 1 and tensor.stride(0) == tensor.shape[1] * tensor.stride(1)
+    return tensor if is_regular else tensor.contiguous()
+
+
 def weight_gradient(of_outputs: Tensor, inputs: Tensor, weight: Tensor) -> Tensor:
     """The gradient of a layer's weight (out, in), from padded factors (..., padded size)."""
     product = of_outputs.flatten(0, -2).t() @ inputs.flatten(0, -2)

@@ -24,8 +24,8 @@ from latentplan.models.fast.native import (
 )
 from latentplan.models.heads import Mlp, NormedLinear, ScalarHead
 
-_HALVES = ("inputs", "hidden", "last")
-_REALS = ("products", "last_products")
+_SUMS = ("products", "last_products")
+_INPUTS = ("inputs", "hidden", "last")
 _FACTORS = ("of_output", "of_second", "of_first")
 
 
@@ -33,7 +33,7 @@ class _Network(ctypes.Structure):
     _fields_ = (
         *((name, Layer) for name in ("first", "second", "output")),
         ("rows", Count),
-        *((name, Place) for name in ("features", "results", *_HALVES, *_REALS)),
+        *((name, Place) for name in ("features", "results", *_SUMS, *_INPUTS)),
     )
 
 
@@ -90,11 +90,10 @@ class _Applied(torch.autograd.Function):
         kernels, layers = _kernels(parameters[0]), describe_network(parameters)
         flat = pad_rows(features.to(kernels.real).reshape(-1, features.shape[-1]), 0)
         sizes = [pad_size(size) for size in (layers[0].inputs, layers[0].outputs, layers[1].outputs)]
+        learns = any(ctx.needs_input_grad[1:])
         kept = {
-            name: torch.empty(len(flat), size, dtype=kernels.half) for name, size in zip(_HALVES, sizes, strict=True)
-        }
-        kept |= {
-            name: torch.empty(len(flat), size, dtype=kernels.real) for name, size in zip(_REALS, sizes[1:], strict=True)
+            name: torch.empty(len(flat), size, dtype=kernels.half) if learns or name in _SUMS else None
+            for name, size in zip((*_SUMS, *_INPUTS), (*sizes[1:], *sizes), strict=True)
         }
         results = torch.empty(len(flat), layers[2].outputs, dtype=kernels.real)
         ctx.network = network = _Network(*layers, len(flat))
@@ -108,9 +107,11 @@ class _Applied(torch.autograd.Function):
     def backward(ctx: Any, outer: Tensor) -> tuple[Tensor | None, ...]:
         network, kernels, kept, parameters = ctx.network, ctx.kernels, ctx.kept, ctx.parameters
         outer = pad_rows(outer.reshape(-1, outer.shape[-1]), 0)
-        sizes = [pad_size(network.output.outputs), *(kept[name].shape[1] for name in ("last", "hidden"))]
-        factors = {
-            name: torch.empty(len(outer), size, dtype=kernels.half) for name, size in zip(_FACTORS, sizes, strict=True)
+        learns = kept["inputs"] is not None
+        sizes = [pad_size(layer.outputs) for layer in (network.output, network.second, network.first)]
+        factors: dict[str, Any] = {
+            name: torch.empty(len(outer), size, dtype=kernels.half) if learns else None
+            for name, size in zip(_FACTORS, sizes, strict=True)
         }
         widths = [network.first.outputs, network.second.outputs]
         norms = torch.zeros(2 * sum(widths), dtype=kernels.real)
@@ -121,7 +122,7 @@ class _Applied(torch.autograd.Function):
         check_called(kernels.library.apply_network_back(*addresses, torch.get_num_threads()))
         if of_features is not None:
             of_features = of_features[: ctx.shape[:-1].numel()].view(ctx.shape)
-        if not any(ctx.needs_input_grad[1:]):
+        if not learns:
             return of_features, *([None] * len(parameters))
         norm = split_norms(norms, widths)
         return (

@@ -1,7 +1,7 @@
 """Encoder and decoder in one compiled call each way, for processors.
 
-Convolutions are products of rows that hold the inputs of one place, as `encoder.c` and `decoder.c` compute them frame by
-frame in the cache.
+`encoder.c` and `decoder.c` compute frame after frame in the cache. A convolution is a product of rows, each of which
+holds the inputs of one place.
 """
 
 from __future__ import annotations
@@ -79,16 +79,17 @@ def encode(encoder: Encoder, frames: Tensor) -> Tensor:
     shift = encoder.patches.bias - 0.5 * encoder.patches.weight.sum(-1)  # see `Encoder._project`
     layers = [weight, shift, encoder.linear.weight, encoder.linear.bias]
     for part in encoder.convolutions:
-        layers += [part.weight.permute(0, 2, 3, 1), part.bias]
+        kernel, bias = part.parameters()
+        layers += [kernel.permute(0, 2, 3, 1), bias]
     embeddings: Tensor = _Encoded.apply(frames.contiguous(), *layers)
     return embeddings
 
 
 def reconstruction_errors(decoder: Decoder, features: Tensor, frames: Tensor) -> Tensor:
     """Squared errors (rows,) of decoded pictures; gradients reach features (rows, feature) and weights."""
-    mix = decoder.mix
+    kernel, bias = decoder.mix.parameters()
     layers = [decoder.tokens.weight, decoder.tokens.bias, decoder.paint.weight, decoder.paint.bias]
-    layers += [mix.weight.permute(0, 2, 3, 1), mix.bias]
+    layers += [kernel.permute(0, 2, 3, 1), bias]
     errors: Tensor = _Reconstructed.apply(features, frames.contiguous(), *layers)
     return errors
 
@@ -173,9 +174,7 @@ class _Reconstructed(torch.autograd.Function):
         errors = torch.empty(rows, dtype=kernels.real)
         ctx.kept = torch.empty(rows, len(tokens) + places * len(mix), dtype=kernels.half)
         ctx.differences = torch.empty(rows, places, len(paint), dtype=kernels.half)
-        point_to(
-            structure, features=features, frames=frames, errors=errors, kept=ctx.kept, differences=ctx.differences
-        )
+        point_to(structure, features=features, frames=frames, errors=errors, kept=ctx.kept, differences=ctx.differences)
         check_called(kernels.library.decode(ctypes.addressof(structure), None, torch.get_num_threads()))
         ctx.structure, ctx.kernels, ctx.layers, ctx.given = structure, kernels, layers, (features, frames)
         return errors

@@ -22,6 +22,7 @@ from latentplan.models.fast.native import (
     check_called,
     describe_layer,
     find_kernels,
+    lay_rows,
     pad_rows,
     pad_size,
     point_to,
@@ -37,29 +38,33 @@ if TYPE_CHECKING:
     from latentplan.models.heads import Actor
 
 _GIVEN = ("start_deter", "start_stoch", "embeddings", "noise", "action_noise", "actions")
+_STATES = ("deters", "stochs")
 _RESULTS = ("deters", "stochs", "means", "stds")
-_HALVES = ("inputs", "gate_inputs", "afters", "hiddens")
-_REALS = ("first", "gate_products", "second", "raw")
+_SUMS = ("first", "gate_products", "second", "raw")
+_INPUTS = ("inputs", "gate_inputs", "afters", "hiddens")
 
 
 class _Unroll(ctypes.Structure):
     _fields_ = (
         *((name, Layer) for name in ("input", "gates", "hidden", "output")),
         ("actor", Layer * 3),
-        *((name, Count) for name in ("rows", "steps", "action", "latent", "deter", "has_frames", "has_actor")),
+        *(
+            (name, Count)
+            for name in ("rows", "steps", "action", "latent", "deter", "has_frames", "keeps_inputs", "has_actor")
+        ),
         ("decay", ctypes.c_double),
-        *((name, Place) for name in (*_GIVEN, *_RESULTS, *_HALVES, *_REALS)),
+        *((name, Place) for name in _GIVEN),
+        ("state_stride", Count * 2),
+        *((name, Place) for name in (*_RESULTS, *_SUMS, *_INPUTS)),
     )
 
 
 class _Gradients(ctypes.Structure):
-    _fields_ = tuple(
-        (name, Place)
-        for name in (
-            *("of_deters", "of_stochs", "of_means", "of_stds"),
-            *("of_first", "of_gates", "of_second", "of_raw"),
-            *("of_actions", "of_embeddings", "norms"),
-        )
+    _fields_ = (
+        ("state_stride", Count * 2),
+        *((name, Place) for name in ("of_deters", "of_stochs", "of_means", "of_stds")),
+        *((name, Place) for name in ("of_first", "of_gates", "of_second", "of_raw")),
+        *((name, Place) for name in ("of_actions", "of_embeddings", "norms")),
     )
 
 
@@ -101,8 +106,7 @@ def imagine(
     weights = collect_weights(dynamics, prior=True)
     with torch.no_grad():
         call = _Call(weights, start.deter, start.stoch, None, None, noise, (actor, action_noise), decay)
-        following = torch.cat([call.results["deters"], call.results["stochs"]], -1)[:, : len(start.deter)]
-        features = torch.cat([start.features[None], following])
+        features = call.features[:, : len(start.deter)]
     # The actor runs once more on all states at once, because its gradient needs no recurrence.
     mean, std = apply_actor(features[:-1])
     return _Imagined.apply(sample_action(mean, std, action_noise), features, call), std
@@ -136,8 +140,8 @@ class _Call:
         kernels = find_kernels(weights.gates.dtype)
         assert kernels is not None
         self.kernels: Kernels = kernels
-        self.weights = weights
-        self.rows = len(deter)
+        self.weights, self.rows = weights, len(deter)
+        self.learns = policy is None  # in imagined rollouts the weights get no gradient
         has_frames, draws = embeddings is not None, None if policy is None else policy[1]
         example = actions if actions is not None else draws
         assert example is not None
@@ -157,15 +161,19 @@ class _Call:
         weights, kernels, has_frames = self.weights, self.kernels, self.given["embeddings"] is not None
         deter, latent = weights.gates.shape[0] // 3, weights.output.shape[0] // 2
         first, gates, second = len(weights.input), len(weights.gates), len(weights.hidden)
-        sizes = (weights.input.shape[1], weights.gates.shape[1], deter, second, first, gates, second, 2 * latent)
+        sizes = (first, gates, second, 2 * latent, weights.input.shape[1], weights.gates.shape[1], deter, second)
         results = {
             name: torch.empty(steps, rows, size, dtype=kernels.real)
             for name, size in zip(_RESULTS, (deter, latent, latent, latent), strict=True)
         }
-        for name, size in zip((*_HALVES, *_REALS), sizes, strict=True):
+        if not self.learns:  # imagined states lie side by side, as the features that heads read
+            self.features = torch.empty(steps + 1, rows, deter + latent, dtype=kernels.real)
+            torch.cat([self.given["start_deter"], self.given["start_stoch"]], -1, out=self.features[0])  # type: ignore[list-item]
+            results["deters"], results["stochs"] = self.features[1:].split([deter, latent], -1)
+        for name, size in zip((*_SUMS, *_INPUTS), sizes, strict=True):
             count = steps - (has_frames and name in ("inputs", "gate_inputs", "first", "gate_products"))
-            dtype = kernels.half if name in _HALVES else kernels.real
-            results[name] = torch.empty(count, rows, pad_size(size), dtype=dtype)
+            kept = count if name in _SUMS or self.learns else 1
+            results[name] = torch.empty(kept, rows, pad_size(size), dtype=kernels.half)
         return results
 
     def _describe(
@@ -182,34 +190,46 @@ class _Call:
             structure.actor = (Layer * 3)(*describe_network(collect_parameters(policy[0].mlp)))
         structure.rows, structure.steps, structure.action, structure.decay = rows, steps, action, decay
         structure.latent, structure.deter = len(weights.output) // 2, len(weights.gates) // 3
+        structure.keeps_inputs = self.learns
         structure.has_frames, structure.has_actor = self.given["embeddings"] is not None, policy is not None
-        point_to(structure, **self.given, **self.results)
+        states = [self.results[name] for name in _STATES]
+        structure.state_stride = (Count * 2)(*(part.stride(1) for part in states))
+        structure.deters, structure.stochs = (part.data_ptr() for part in states)
+        others = {name: part for name, part in self.results.items() if name not in _STATES}
+        point_to(structure, **self.given, **others)
         return structure
 
-    def backward(
-        self, outer: tuple[Tensor | None, ...], *, with_actions: bool, with_weights: bool
-    ) -> tuple[Tensor | None, Tensor | None, tuple[Tensor, ...]]:
+    def backward(self, outer: tuple[Tensor | None, ...]) -> tuple[Tensor | None, Tensor | None, tuple[Tensor, ...]]:
         """Gradients of embeddings, actions and weights, given those of deters, stochs, means and stds."""
         weights, results, kernels = self.weights, self.results, self.kernels
-        outer = tuple(None if part is None else pad_rows(part.to(kernels.real), 1) for part in outer)
+        laid = [None if part is None else lay_rows(part, kernels.real) for part in outer]
         factors = {
-            f"of_{name}": torch.empty_like(results[like], dtype=kernels.half)
-            for name, like in zip(("first", "gates", "second", "raw"), _REALS, strict=True)
+            f"of_{name}": torch.empty_like(results[like] if self.learns else results[like][:1])
+            for name, like in zip(("first", "gates", "second", "raw"), _SUMS, strict=True)
         }
         sizes = [len(weights.input), len(weights.gates), len(weights.hidden)]
         norms = torch.zeros(2 * sum(sizes), dtype=kernels.real)
         embeddings, actions = self.given["embeddings"], self.given["actions"]
         of_embeddings = None if embeddings is None else torch.empty_like(embeddings)
-        of_actions = torch.empty_like(actions) if with_actions and actions is not None else None
+        of_actions = None if self.learns or actions is None else torch.empty_like(actions)
         gradients = _Gradients()
-        point_to(gradients, **dict(zip(("of_deters", "of_stochs", "of_means", "of_stds"), outer, strict=True)))
-        point_to(gradients, **factors, of_actions=of_actions, of_embeddings=of_embeddings, norms=norms)
+        gradients.state_stride = (Count * 2)(*(0 if part is None else part.stride(1) for part in laid[:2]))
+        gradients.of_deters, gradients.of_stochs = (None if part is None else part.data_ptr() for part in laid[:2])
+        point_to(
+            gradients,
+            of_means=laid[2],
+            of_stds=laid[3],
+            **factors,
+            of_actions=of_actions,
+            of_embeddings=of_embeddings,
+            norms=norms,
+        )
         addresses = ctypes.addressof(self.structure), ctypes.addressof(gradients)
         check_called(kernels.library.unroll_back(*addresses, torch.get_num_threads()))
         of_embeddings, of_actions = (
             None if part is None else part[:, : self.rows] for part in (of_embeddings, of_actions)
         )
-        return of_embeddings, of_actions, self._collect(factors, norms, sizes) if with_weights else ()
+        return of_embeddings, of_actions, self._collect(factors, norms, sizes) if self.learns else ()
 
     def _collect(self, factors: dict[str, Tensor], norms: Tensor, sizes: list[int]) -> tuple[Tensor, ...]:
         """Gradients of all parameters, in the order of `Weights`."""
@@ -244,7 +264,7 @@ class _Unrolled(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, *outer: Tensor | None) -> tuple[Tensor | None, ...]:
-        of_embeddings, _, of_weights = ctx.call.backward(outer, with_actions=False, with_weights=True)
+        of_embeddings, _, of_weights = ctx.call.backward(outer)
         return (of_embeddings, None, None, None, None, *of_weights)
 
 
@@ -261,7 +281,7 @@ class _Imagined(torch.autograd.Function):
         call: _Call = ctx.call
         deter = len(call.weights.gates) // 3
         parts = (outer[1:, :, :deter], outer[1:, :, deter:], None, None)
-        return call.backward(parts, with_actions=True, with_weights=False)[1], None, None
+        return call.backward(parts)[1], None, None
 
 
 def _by_time(tensor: Tensor) -> Tensor:

@@ -1,4 +1,4 @@
-"""Belief update and actor for one frame or a few, in float32 calls of torch, where compiled C (`native_frame`) is missing.
+"""Belief update and actor for one frame or a few by float32 calls of torch, where `native_frame` has no compiler.
 
 The result equals `WorldModel.infer` followed by the actor, up to rounding. For one row the overhead of calls costs more
 than the arithmetic. The weights are therefore collected once, convolutions are matrix products of patches (torch spends

@@ -9,20 +9,23 @@ typedef struct {
     Layer actor[3];                      // the policy of imagined steps
     long rows, steps, action, latent, deter;
     long has_frames;  // the first step then has a frame and no action; else it takes an action from the start
+    long keeps_inputs;  // the weights need gradients
     long has_actor;   // the actor then chooses the actions, for the draws in `action_noise`
     double decay;     // share of a state's gradient that a step passes back to the step before
     // Read. `embeddings` (without frames) and `noise` (for the mean of the latent) may be NULL.
     const real *start_deter, *start_stoch, *embeddings, *noise, *action_noise;
     real *actions;  // written by the actor
-    // Written, and read by the backward pass.
+    // Written, and read by the backward pass. Rows of deters and stochs begin `state_stride` numbers apart.
+    long state_stride[2];
     real *deters, *stochs, *means, *stds;
-    half *inputs, *gate_inputs, *afters, *hiddens;
-    real *first, *gate_products, *second, *raw;
+    half *first, *gate_products, *second, *raw;       // sums before the norms, and of the output
+    half *inputs, *gate_inputs, *afters, *hiddens;    // inputs of the layers, of one step if not `keeps_inputs`
 } Unroll;
 
 // Gradients of the results, any of which may be NULL; then what the backward pass writes. `norms` holds the gradients
 // of scale and shift of input, gates and hidden, side by side.
 typedef struct {
+    long state_stride[2];  // of the gradients of deters and stochs
     const real *of_deters, *of_stochs, *of_means, *of_stds;
     half *of_first, *of_gates, *of_second, *of_raw;
     real *of_actions, *of_embeddings, *norms;
@@ -41,14 +44,20 @@ typedef struct {
 
 static inline long row_of(const Block *block, long step, long r) { return step * block->unroll->rows + block->first + r; }
 
+// The row of inputs and of factors of gradients, which only the weights need at every step.
+static inline long input_row_of(const Block *block, long step) {
+    return row_of(block, block->unroll->keeps_inputs ? step : 0, 0);
+}
+
 static const real *deter_before(const Block *block, long step, long r) {
     const Unroll *u = block->unroll;
-    return step > 0 ? u->deters + row_of(block, step - 1, r) * u->deter : u->start_deter + (block->first + r) * u->deter;
+    return step > 0 ? u->deters + row_of(block, step - 1, r) * u->state_stride[0]
+                    : u->start_deter + (block->first + r) * u->deter;
 }
 
 static const real *stoch_before(const Block *block, long step, long r) {
     const Unroll *u = block->unroll;
-    return step > 0 ? u->stochs + row_of(block, step - 1, r) * u->latent
+    return step > 0 ? u->stochs + row_of(block, step - 1, r) * u->state_stride[1]
                     : u->start_stoch + (block->first + r) * u->latent;
 }
 
@@ -90,15 +99,30 @@ static void act(const Block *block, long step) {
     }
 }
 
+// The part `chunk` of the gates' norm, from place i of `size` on.
+static inline wide gate_of(const Norm *norm, long chunk, long i, long size) {
+    long at = chunk * size;
+    Norm part = {norm->row + at, norm->scale + at, norm->shift + at, norm->mean, norm->factor};
+    return normed_of(&part, i, size);
+}
+
+// The next state of the GRU.
+static inline void gate_row(real *after, const Norm *norm, const real *before, long size) {
+    FOR_LANES(i, size) {
+        wide candidate = tanh_of(sigmoid_of(gate_of(norm, 0, i, size)) * gate_of(norm, 1, i, size));
+        wide update = sigmoid_of(gate_of(norm, 2, i, size) - 1), old = load(before + i, size - i);
+        store(after + i, old + update * (candidate - old), size - i);
+    }
+}
+
 // The deters of a step, the `index`th with an action.
 static void advance(const Block *block, long step, long index) {
     const Unroll *u = block->unroll;
     long inputs = padded(u->input.inputs), hidden = padded(u->input.outputs);
     long gate_inputs = padded(u->gates.inputs), gates = padded(u->gates.outputs);
-    half *input_rows = u->inputs + row_of(block, index, 0) * inputs;
-    half *gate_rows = u->gate_inputs + row_of(block, index, 0) * gate_inputs;
-    real *first = u->first + row_of(block, index, 0) * hidden;
-    real *products = u->gate_products + row_of(block, index, 0) * gates;
+    half *input_rows = u->inputs + input_row_of(block, index) * inputs;
+    half *gate_rows = u->gate_inputs + input_row_of(block, index) * gate_inputs;
+    real first[BLOCK * hidden], products[BLOCK * gates];
     for (long r = 0; r < block->count; r++) {
         half *row = input_rows + r * inputs;
         write_row(row, stoch_before(block, step, r), u->latent);
@@ -108,6 +132,7 @@ static void advance(const Block *block, long step, long index) {
     apply(block, input_rows, block->weights->input, &u->input, first);
     for (long r = 0; r < block->count; r++) {
         half *row = gate_rows + r * gate_inputs;
+        write_row(u->first + row_of(block, index, r) * hidden, first + r * hidden, u->input.outputs);
         norm_silu(row, first + r * hidden, &u->input);
         write_row(row + u->input.outputs, deter_before(block, step, r), u->deter);
         clear_row(row, u->gates.inputs, gate_inputs);
@@ -115,9 +140,10 @@ static void advance(const Block *block, long step, long index) {
     apply(block, gate_rows, block->weights->gates, &u->gates, products);
     for (long r = 0; r < block->count; r++) {
         const real *before = deter_before(block, step, r);
-        real *after = u->deters + row_of(block, step, r) * u->deter;
+        real *after = u->deters + row_of(block, step, r) * u->state_stride[0];
+        write_row(u->gate_products + row_of(block, index, r) * gates, products + r * gates, u->gates.outputs);
         Norm norm = compute_norm(products + r * gates, u->gates.scale, u->gates.shift, u->gates.outputs);
-        VECTOR() for (long i = 0; i < u->deter; i++) after[i] = gated(&norm, i, u->deter, before[i]);
+        gate_row(after, &norm, before, u->deter);
     }
 }
 
@@ -125,11 +151,11 @@ static void advance(const Block *block, long step, long index) {
 static void read_latent(const Block *block, long step) {
     const Unroll *u = block->unroll;
     long deter = padded(u->deter), hidden = padded(u->hidden.outputs), outputs = padded(u->output.outputs);
-    half *afters = u->afters + row_of(block, step, 0) * deter;
-    half *hiddens = u->hiddens + row_of(block, step, 0) * hidden;
-    real *second = u->second + row_of(block, step, 0) * hidden, *raw = u->raw + row_of(block, step, 0) * outputs;
+    half *afters = u->afters + input_row_of(block, step) * deter;
+    half *hiddens = u->hiddens + input_row_of(block, step) * hidden;
+    real second[BLOCK * hidden], raw[BLOCK * outputs];
     for (long r = 0; r < block->count; r++) {
-        write_row(afters + r * deter, u->deters + row_of(block, step, r) * u->deter, u->deter);
+        write_row(afters + r * deter, u->deters + row_of(block, step, r) * u->state_stride[0], u->deter);
         clear_row(afters + r * deter, u->deter, deter);
     }
     apply(block, afters, block->weights->hidden, &u->hidden, second);
@@ -139,6 +165,7 @@ static void read_latent(const Block *block, long step) {
             const real *embedding = u->embeddings + row_of(block, step, r) * u->hidden.outputs;
             VECTOR() for (long i = 0; i < u->hidden.outputs; i++) row[i] += embedding[i];
         }
+        write_row(u->second + row_of(block, step, r) * hidden, row, u->hidden.outputs);
         norm_silu(hiddens + r * hidden, row, &u->hidden);
         clear_row(hiddens + r * hidden, u->hidden.outputs, hidden);
     }
@@ -146,12 +173,14 @@ static void read_latent(const Block *block, long step) {
     for (long r = 0; r < block->count; r++) {
         real *row = raw + r * outputs;
         long place = row_of(block, step, r) * u->latent;
+        real *stoch = u->stochs + row_of(block, step, r) * u->state_stride[1];
         VECTOR() for (long i = 0; i < 2 * u->latent; i++) row[i] += u->output.shift[i];
+        write_row(u->raw + row_of(block, step, r) * outputs, row, 2 * u->latent);
         VECTOR() for (long i = 0; i < u->latent; i++) {
             real std = 2 * sigmoid(row[u->latent + i] / 2) + (real)0.1;
             u->means[place + i] = row[i];
             u->stds[place + i] = std;
-            u->stochs[place + i] = row[i] + (u->noise == NULL ? 0 : std * u->noise[place + i]);
+            stoch[i] = row[i] + (u->noise == NULL ? 0 : std * u->noise[place + i]);
         }
     }
 }
@@ -166,15 +195,16 @@ static void read_latent_back(const Block *block, const Gradients *g, Passed *pas
     const Unroll *u = block->unroll;
     long deter = padded(u->deter), hidden = padded(u->hidden.outputs), outputs = padded(u->output.outputs);
     long inputs = padded(u->input.inputs);
-    half *of_raw = g->of_raw + row_of(block, step, 0) * outputs;
-    half *of_second = g->of_second + row_of(block, step, 0) * hidden;
+    half *of_raw = g->of_raw + input_row_of(block, step) * outputs;
+    half *of_second = g->of_second + input_row_of(block, step) * hidden;
     for (long r = 0; r < block->count; r++) {
         long place = row_of(block, step, r) * u->latent;
-        const real *raw = u->raw + row_of(block, step, r) * outputs;
+        const half *raw = u->raw + row_of(block, step, r) * outputs;
+        const real *outer = g->of_stochs == NULL ? NULL : g->of_stochs + row_of(block, step, r) * g->state_stride[1];
         half *row = of_raw + r * outputs;
         VECTOR() for (long i = 0; i < u->latent; i++) {
-            real gate = sigmoid(raw[u->latent + i] / 2);
-            real of_stoch = g->of_stochs == NULL ? 0 : g->of_stochs[place + i];
+            real gate = sigmoid(read_half(raw[u->latent + i]) / 2);
+            real of_stoch = outer == NULL ? 0 : outer[i];
             if (has_later) of_stoch += (real)u->decay * passed->of_inputs[r * inputs + i];
             real of_std = u->noise == NULL ? 0 : of_stoch * u->noise[place + i];
             if (g->of_stds != NULL) of_std += g->of_stds[place + i];
@@ -185,7 +215,8 @@ static void read_latent_back(const Block *block, const Gradients *g, Passed *pas
     }
     multiply(of_raw, outputs, block->count, block->weights->output, outputs, hidden, passed->of_hidden, hidden, 0);
     for (long r = 0; r < block->count; r++) {
-        const real *second = u->second + row_of(block, step, r) * hidden;
+        real second[LONGEST_ROW];
+        read_row(second, u->second + row_of(block, step, r) * hidden, u->hidden.outputs);
         half *row = of_second + r * hidden;
         real *sums = passed->sums + 2 * (u->input.outputs + u->gates.outputs);
         norm_silu_back(row, passed->of_hidden + r * hidden, second, &u->hidden, sums);
@@ -204,14 +235,15 @@ static void gates_back(half *to, real *gradient, const real *before, const real 
                        real *sums) {
     real of_scaled[LONGEST_ROW];
     Norm norm = compute_norm(product, layer->scale, layer->shift, layer->outputs);
-    VECTOR() for (long i = 0; i < size; i++) {
-        real reset = sigmoid(normed(&norm, i)), raw = normed(&norm, size + i);
-        real update = sigmoid(normed(&norm, 2 * size + i) - 1), candidate = hyperbolic_tangent(reset * raw);
-        real inner = gradient[i] * update * (1 - candidate * candidate);
-        of_scaled[i] = inner * raw * reset * (1 - reset);
-        of_scaled[size + i] = inner * reset;
-        of_scaled[2 * size + i] = gradient[i] * (candidate - before[i]) * update * (1 - update);
-        gradient[i] *= 1 - update;
+    FOR_LANES(i, size) {
+        long left = size - i;
+        wide reset = sigmoid_of(gate_of(&norm, 0, i, size)), raw = gate_of(&norm, 1, i, size);
+        wide update = sigmoid_of(gate_of(&norm, 2, i, size) - 1), candidate = tanh_of(reset * raw);
+        wide of_next = load(gradient + i, left), inner = of_next * update * (1 - candidate * candidate);
+        store(of_scaled + i, inner * raw * reset * (1 - reset), left);
+        store(of_scaled + size + i, inner * reset, left);
+        store(of_scaled + 2 * size + i, of_next * (candidate - load(before + i, left)) * update * (1 - update), left);
+        store(gradient + i, of_next * (1 - update), left);
     }
     norm_back(to, of_scaled, &norm, 3 * size, sums);
 }
@@ -221,17 +253,18 @@ static void advance_back(const Block *block, const Gradients *g, Passed *passed,
     const Unroll *u = block->unroll;
     long inputs = padded(u->input.inputs), hidden = padded(u->input.outputs), deter = padded(u->deter);
     long gate_inputs = padded(u->gates.inputs), gates = padded(u->gates.outputs);
-    half *of_gates = g->of_gates + row_of(block, index, 0) * gates;
-    half *of_first = g->of_first + row_of(block, index, 0) * hidden;
+    half *of_gates = g->of_gates + input_row_of(block, index) * gates;
+    half *of_first = g->of_first + input_row_of(block, index) * hidden;
     for (long r = 0; r < block->count; r++) {
         real *direct = passed->directly + r * deter, *of_deter = passed->of_deter + r * deter;
         const real *later = passed->of_gate_inputs + r * gate_inputs + u->input.outputs;
-        const real *outer = g->of_deters == NULL ? NULL : g->of_deters + row_of(block, step, r) * u->deter;
+        const real *outer = g->of_deters == NULL ? NULL : g->of_deters + row_of(block, step, r) * g->state_stride[0];
         VECTOR() for (long i = 0; i < u->deter; i++) {
             real gradient = of_deter[i] + (outer == NULL ? 0 : outer[i]);
             direct[i] = gradient + (has_later ? (real)u->decay * (direct[i] + later[i]) : 0);
         }
-        const real *product = u->gate_products + row_of(block, index, r) * gates;
+        real product[LONGEST_ROW];
+        read_row(product, u->gate_products + row_of(block, index, r) * gates, u->gates.outputs);
         real *sums = passed->sums + 2 * u->input.outputs;
         gates_back(of_gates + r * gates, direct, deter_before(block, step, r), product, &u->gates, u->deter, sums);
         clear_row(of_gates + r * gates, 3 * u->deter, gates);
@@ -239,7 +272,8 @@ static void advance_back(const Block *block, const Gradients *g, Passed *passed,
     multiply(of_gates, gates, block->count, block->weights->gates, gates, gate_inputs, passed->of_gate_inputs,
              gate_inputs, 0);
     for (long r = 0; r < block->count; r++) {
-        const real *first = u->first + row_of(block, index, r) * hidden;
+        real first[LONGEST_ROW];
+        read_row(first, u->first + row_of(block, index, r) * hidden, u->input.outputs);
         norm_silu_back(of_first + r * hidden, passed->of_gate_inputs + r * gate_inputs, first, &u->input, passed->sums);
         clear_row(of_first + r * hidden, u->input.outputs, hidden);
     }
@@ -252,8 +286,8 @@ static void advance_back(const Block *block, const Gradients *g, Passed *passed,
 
 static void unroll_block(const Unroll *u, const Weights *weights, long first, long count) {
     Block block = {u, weights, first, count};
-    if (u->has_frames)
-        memcpy(u->deters + first * u->deter, u->start_deter + first * u->deter, (size_t)(count * u->deter) * sizeof(real));
+    for (long r = first; u->has_frames && r < first + count; r++)
+        memcpy(u->deters + r * u->state_stride[0], u->start_deter + r * u->deter, (size_t)u->deter * sizeof(real));
     for (long step = 0; step < u->steps; step++) {
         if (u->has_actor) act(&block, step);
         if (step >= u->has_frames) advance(&block, step, step - u->has_frames);

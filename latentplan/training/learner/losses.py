@@ -27,12 +27,14 @@ class Imagination(NamedTuple):
 
     Attributes:
         features: Features of the states, the start first, (horizon + 1, rows, feature).
+        following: Features of the states but the start, (horizon, rows, feature).
         rewards: rewards[t] arrives with features[t + 1], (horizon, rows).
         continues: Probability that the episode continues after features[t + 1], (horizon, rows).
         entropies: Entropy in nats of the action taken at features[t], (horizon, rows).
     """
 
     features: Tensor
+    following: Tensor
     rewards: Tensor
     continues: Tensor
     entropies: Tensor
@@ -261,10 +263,10 @@ def imagine(
         decay: Share of a state's gradient that a step passes back to the state before.
     """
     features, std = model.backend.imagine(model, start, *draw_noise(model, horizon, len(start.deter), generator), decay)
-    backend = model.backend
-    rewards = backend.mean(model.reward_head, backend.apply(model.reward_head.mlp, features[1:]))
-    continues = torch.sigmoid(backend.apply(model.continue_head, features[1:])).squeeze(-1)
-    return Imagination(features, rewards, continues, entropy(std))
+    backend, following = model.backend, features[1:]  # one slice, so that its gradients are summed before they pass
+    rewards = backend.mean(model.reward_head, backend.apply(model.reward_head.mlp, following))
+    continues = torch.sigmoid(backend.apply(model.continue_head, following)).squeeze(-1)
+    return Imagination(features, following, rewards, continues, entropy(std))
 
 
 def draw_noise(model: WorldModel, horizon: int, rows: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:
@@ -342,7 +344,7 @@ def mean_within(values: Tensor, within: Tensor) -> Tensor:
 def _probe_errors(model: WorldModel, features: Tensor, labels: Tensor) -> Tensor:
     """Mean squared error of the quantities read from features, in typical sizes, (...); features get no gradient."""
     with model.trunk_precision(cache=False):
-        predicted = model.backend.apply(model.probe_head, features.detach())
+        predicted = model.backend.apply(model.probe_head, features.detach()) * model.label_scales
     return ((predicted - labels) / model.label_scales).square().mean(-1)
 
 

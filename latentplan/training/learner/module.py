@@ -173,7 +173,7 @@ class Learner(lightning.LightningModule):
                 generator,
                 config.gradient_decay,
             )
-            values = self._target_values(imagined.features[1:])
+            values = self._target_values(imagined.following)
         discounts = self.discount * imagined.continues
         returns = self.model.backend.lambda_return(imagined.rewards, discounts, values, config.lambda_)
         reach = torch.cat([torch.ones_like(discounts[:1]), discounts[:-1]]).cumprod(0).detach()

@@ -165,7 +165,7 @@ def test_cpu_backend_is_as_near_to_float32_as_the_reference_in_bfloat16(call, pa
             monkeypatch.setattr(rollout.compiled, "pack", lambda *_: None)
             fast.backend = CpuBackend()
         if path == "torch":
-            monkeypatch.setattr(library, "load", lambda: None)
+            monkeypatch.setattr(library, "load", lambda **_: None)
         parts = zip(*(flat(call(model)) for model in (fast, rounded, exact)), strict=True)
         for found, by_reference, truth in parts:
             error, reference_error = ((part - truth).square().mean().sqrt() for part in (found, by_reference))

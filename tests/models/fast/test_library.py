@@ -119,7 +119,7 @@ def test_load_returns_none_without_a_home_directory(monkeypatch):
 def test_compiled_builds_the_library_once_and_keeps_it(tmp_path, monkeypatch):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     monkeypatch.setattr(library, "FLAGS", ("-O0", "-fopenmp", "-shared", "-fPIC"))  # compiles quickly
-    first = library._compile()
+    first = library._compile(library.PLANNED, [])
     made = first.stat().st_mtime_ns
-    assert library._compile() == first and first.stat().st_mtime_ns == made
+    assert library._compile(library.PLANNED, []) == first and first.stat().st_mtime_ns == made
     assert [path.name for path in (tmp_path / "latentplan").iterdir()] == [first.name]

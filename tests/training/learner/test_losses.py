@@ -4,7 +4,8 @@ import pytest
 import torch
 
 from latentplan.models import Gaussian, State, WorldModel, kl_divergence
-from latentplan.training.learner.losses import draw_noise, imagine, imitation_loss, lambda_return, world_model_loss
+from latentplan.models.backend import lambda_return
+from latentplan.training.learner.losses import draw_noise, imagine, imitation_loss, world_model_loss
 from latentplan.training.learner.optimization import return_scale
 
 

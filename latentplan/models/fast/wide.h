@@ -1,0 +1,93 @@
+// Vectors of sixteen numbers for elementwise work that learns. The compiler splits them where registers are narrower.
+// `left` is how many numbers a row still has: beyond them, loads give zeros and stores write nothing.
+
+#ifndef LATENTPLAN_WIDE_H
+#define LATENTPLAN_WIDE_H
+
+#include "products.h"
+
+#define LANES 16
+
+typedef real wide __attribute__((vector_size(LANES * sizeof(real))));
+
+#define FOR_LANES(INDEX, LENGTH) for (long INDEX = 0; INDEX < (LENGTH); INDEX += LANES)
+
+#if PAIR == 2
+
+static inline __mmask16 mask_of(long left) { return left >= LANES ? 0xffff : (__mmask16)((1u << left) - 1); }
+static inline wide load(const real *from, long left) { return (wide)_mm512_maskz_loadu_ps(mask_of(left), from); }
+static inline void store(real *to, wide values, long left) { _mm512_mask_storeu_ps(to, mask_of(left), (__m512)values); }
+
+static inline wide load_half(const half *from, long left) {
+    __m512i bits = _mm512_cvtepu16_epi32(_mm256_maskz_loadu_epi16(mask_of(left), from));
+    return (wide)_mm512_slli_epi32(bits, 16);
+}
+
+static inline void store_half(half *to, wide values, long left) {
+    _mm256_mask_storeu_epi16(to, mask_of(left), (__m256i)_mm512_cvtneps_pbh((__m512)values));
+}
+
+static inline real sum_of(wide values) { return _mm512_reduce_add_ps((__m512)values); }
+
+// 2^x = 2^n 2^f with |f| <= 1/2; the polynomial is Taylor's of degree 5, relative error 3e-6.
+static inline wide power_of_two_of(wide x) {
+    __m512 n = _mm512_roundscale_ps((__m512)x, _MM_FROUND_TO_NEAREST_INT | _MM_FROUND_NO_EXC);
+    wide f = x - (wide)n, p = f * 1.33335581e-3f + 9.61812911e-3f;
+    p = p * f + 5.55041087e-2f;
+    p = p * f + 2.40226507e-1f;
+    p = p * f + 6.93147181e-1f;
+    p = p * f + 1.0f;
+    return (wide)_mm512_scalef_ps((__m512)p, n);
+}
+
+// The reciprocal with a step of Newton's method; 0 for infinity.
+static inline wide reciprocal_of(wide x) {
+    wide first = (wide)_mm512_rcp14_ps((__m512)x);
+    return first + first * (wide)_mm512_fnmadd_ps((__m512)x, (__m512)first, _mm512_set1_ps(1.0f));
+}
+
+static inline wide sigmoid_of(wide x) {
+    // Beyond 80 the sigmoid is 0 or 1 in float32; infinite powers would give NaN.
+    wide limited = (wide)_mm512_max_ps(_mm512_set1_ps(-80.0f), (__m512)x);
+    return reciprocal_of(power_of_two_of(limited * -1.44269504f) + 1.0f);
+}
+
+#else
+
+static inline wide load(const real *from, long left) {
+    wide values = {0};
+    memcpy(&values, from, left >= LANES ? sizeof values : (size_t)left * sizeof(real));
+    return values;
+}
+
+static inline void store(real *to, wide values, long left) {
+    memcpy(to, &values, left >= LANES ? sizeof values : (size_t)left * sizeof(real));
+}
+
+static inline wide load_half(const half *from, long left) { return load(from, left); }
+static inline void store_half(half *to, wide values, long left) { store(to, values, left); }
+
+static inline real sum_of(wide values) {
+    real sum = 0;
+    for (int i = 0; i < LANES; i++) sum += values[i];
+    return sum;
+}
+
+static inline wide sigmoid_of(wide x) {
+    real rows[LANES];
+    memcpy(rows, &x, sizeof rows);
+    VECTOR() for (int i = 0; i < LANES; i++) rows[i] = sigmoid(rows[i]);
+    memcpy(&x, rows, sizeof rows);
+    return x;
+}
+
+#endif
+
+static inline wide tanh_of(wide x) { return 2 * sigmoid_of(2 * x) - 1; }
+
+static inline wide normed_of(const Norm *norm, long i, long length) {
+    wide centred = (load(norm->row + i, length - i) - norm->mean) * norm->factor;
+    return centred * load(norm->scale + i, length - i) + load(norm->shift + i, length - i);
+}
+
+#endif
