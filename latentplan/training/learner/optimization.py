@@ -38,12 +38,16 @@ def descend(optimizer: torch.optim.Optimizer, loss: Tensor, max_norm: float, upd
 
 
 def descend_if_finite(optimizer: torch.optim.Optimizer, loss: Tensor, max_norm: float) -> Tensor:
-    """Makes one step of a fused optimizer without reading values back; a gradient that is not finite changes nothing.
+    """Makes one step of a fused optimizer without reading values back.
+
+    A loss or a gradient that is not finite changes nothing.
 
     Returns:
-        The norm of the gradient before clipping; the step was made if and only if the norm is finite.
+        The norm of the gradient before clipping, NaN for a loss that is not finite; the step was made if and only if
+        the norm is finite.
     """
     norm = _clipped_gradient(optimizer, loss, max_norm)
+    norm = torch.where(torch.isfinite(loss.detach()), norm, torch.nan)
     optimizer.found_inf = (~torch.isfinite(norm)).float()  # type: ignore[attr-defined]  # 1 skips the step
     optimizer.step()
     return norm
