@@ -16,6 +16,7 @@ import lightning
 import numpy as np
 import torch
 from lightning.pytorch.loggers import TensorBoardLogger
+from lightning.pytorch.utilities.exceptions import SIGTERMException
 
 from latentplan.agents.checkpoint import load_model
 from latentplan.config import USER_DOMAIN, Config, Device, UserError, derive_seed
@@ -257,7 +258,7 @@ class _Run:
         optimizers = [] if saved is None else saved.optimizers
         facts = self._agent_facts()
         save = SaveRun(self.folder, config, collect, state, self.saves, self.files, facts, optimizers)
-        stop = Stop(config, state)
+        stop = Stop(config, state, self.signals)
         record = Record(self.folder / METRICS_FILE, state, collect, self.console)
         callbacks = [collect, self.curriculum, record, Guard(self.folder), save, stop]
         trainer = self._trainer([Restore(optimizers), *callbacks])
@@ -287,7 +288,8 @@ class _Run:
         batches = ReplayBatches(self.replay, self.config, self.curriculum, self.learner)
         self.console.start(self.learner.updates)
         try:
-            trainer.fit(self.learner, datamodule=ReplayData(batches))
+            with contextlib.suppress(SIGTERMException):  # of a signal before `Stop` has begun; `signals` has it too
+                trainer.fit(self.learner, datamodule=ReplayData(batches))
         finally:
             self.console.stop()
 

@@ -23,6 +23,7 @@ from latentplan.training.callbacks import Collect
 from latentplan.training.collection.episodes import to_tensors
 from latentplan.training.learner.optimization import load_optimizer_state
 from latentplan.training.learner.skips import LONGEST_STREAK, NotFiniteError
+from latentplan.training.signals import Signals
 from latentplan.training.state import METRICS_FILE, RunState, SavedRun, write_state
 
 if TYPE_CHECKING:
@@ -220,10 +221,15 @@ class Stop(lightning.Callback):
     Args:
         config: Settings of the run, with its budget.
         state: Clocks of the run, and whether a signal interrupted it.
+        signals: Handles signals, also while Lightning runs.
     """
 
-    def __init__(self, config: Config, state: RunState) -> None:
-        self.run, self.state = config.run, state
+    def __init__(self, config: Config, state: RunState, signals: Signals) -> None:
+        self.run, self.state, self.signals = config.run, state, signals
+
+    def on_train_start(self, trainer: lightning.Trainer, learner: lightning.LightningModule) -> None:
+        """Handle signals in place of Lightning, whose handler would lose the run."""
+        self.signals.install()
 
     def on_train_batch_end(self, trainer: lightning.Trainer, *_: Any) -> None:  # type: ignore[override]
         """Stop between two updates when the minutes are spent or a signal has arrived."""

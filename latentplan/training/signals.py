@@ -39,8 +39,14 @@ class Signals:
         if threading.current_thread() is threading.main_thread():
             for number in STOPPING:
                 if number != signal.SIGHUP or signal.getsignal(number) != signal.SIG_IGN:
-                    self._previous[number] = signal.signal(number, self._handle)
+                    self._previous[number] = signal.getsignal(number)
+            self.install()
         return self
+
+    def install(self) -> None:
+        """Take the signals back from a library that has set handlers of its own."""
+        for number in self._previous:
+            signal.signal(number, self._handle)
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, _: TracebackType | None) -> None:
         for number, handler in self._previous.items():
