@@ -1,7 +1,7 @@
 """Commits: saves of which each is there as a whole or not at all, and of which any damage is noticed.
 
-A save is a folder `save-000012` with a manifest: the sizes and SHA-256 checksums of its files, of the committed parts of
-append-only logs, and of the manifest itself. `Saves.commit` writes a save in this order: logs are appended and flushed
+A save is a folder `save-000012` with a manifest: the sizes and SHA-256 checksums of its files, of the committed parts
+of append-only logs, and of the manifest itself. `Saves.commit` writes a save in this order: logs are appended and flushed
 to the disk, the other files are written beside under the name `save-000012.part` and flushed, the manifest is written
 last, the folder is renamed, and its parent is flushed. Only after the new save was read again are older saves removed,
 except the one before, to which `Saves.newest` falls back if the new one is damaged.
@@ -83,6 +83,14 @@ class Saves:
         """Whether the folder holds a save, damaged or not."""
         return bool(self._numbers())
 
+    def kinds(self) -> set[str]:
+        """What the saves in the folder say that they are, whatever their state."""
+        kinds = set()
+        for number in self._numbers():
+            with contextlib.suppress(OSError, ValueError, TypeError, KeyError):
+                kinds.add(str(json.loads((self.folder / f"save-{number:06d}" / MANIFEST).read_text())["kind"]))
+        return kinds
+
     def commit(self, write: Callable[[Path], Mapping[str, Extent]], note: Mapping[str, Any]) -> Save:
         """Adds a save.
 
@@ -120,7 +128,7 @@ class Saves:
         Raises:
             UserError: There is no save, or none is whole, or the newest has another format.
         """
-        problems = []
+        problems: list[str] = []
         for number in sorted(self._numbers(), reverse=True):
             try:
                 self._last = self._open(self.folder / f"save-{number:06d}", check_logs=True)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -38,7 +39,8 @@ class ReplayFiles:
         Returns:
             The committed part of each log.
         """
-        replay, extents = self.replay, {}
+        replay = self.replay
+        extents: dict[str, Extent] = {}
         for lane, log in enumerate(self._logs):
             first, end = int(replay.first[lane]), int(replay.written[lane])
             if (start := max(first, log.end)) < end:
@@ -103,7 +105,7 @@ class ReplayFiles:
             raise UserError(f"the logs in {self.folder} are damaged: they must hold {end - start:,} frames")
 
 
-def save_replay(replay: Replay, folder: Path, note: Mapping[str, str | int | float | bool]) -> None:
+def save_replay(replay: Replay, folder: Path, note: Mapping[str, Any]) -> None:
     """Saves a replay alone; `load_replay` restores it."""
     Saves(folder, "replay", FORMAT).commit(ReplayFiles(folder, replay).write, note)
 

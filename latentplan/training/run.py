@@ -50,6 +50,7 @@ from latentplan.training.state import (
     refuse_used,
     restore_learner,
     restore_metrics,
+    warn_of_loss,
 )
 
 if TYPE_CHECKING:
@@ -106,7 +107,7 @@ def train(config: Config, make_env: EnvFactory | None = None) -> Result:
     if config.run.run_dir == "":
         raise UserError("--run-dir must name a folder, got an empty text")
     folder = Path(str(config.run.run_dir))
-    refuse_used(folder, RUN_FILE, "--run-dir")
+    refuse_used(folder, "run", "--run-dir")
     return _start(config, folder, make_env, resume=False)
 
 
@@ -201,14 +202,7 @@ class _Run:
     def _find_save(self) -> Save:
         """The newest save that is whole; warns of newer ones that are not."""
         save, problems = self.saves.newest()
-        for problem in problems:
-            frames, minutes = save.note["env_frames"], save.note["minutes"]
-            warnings.warn(
-                f"{problem}: the run continues from the save before, of {frames:,} frames and {minutes:.1f} minutes; "
-                "what it learned and collected after that is lost, and is done again",
-                RuntimeWarning,
-                stacklevel=2,
-            )
+        warn_of_loss(save, problems)
         return save
 
     def _build(self, save: Save | None) -> None:

@@ -195,21 +195,22 @@ class Guard(lightning.Callback):
             self._keep(learner, name, skips.rows)
             if int(skips.longest) >= LONGEST_STREAK:
                 raise NotFiniteError(
-                    f"the loss or gradient of the {name} was not finite in {LONGEST_STREAK} steps in a row, up to update "
-                    f"{learner.updates}; their batches are in {self.folder}; a lower learning rate may help",
+                    f"the loss or gradient of the {name} was not finite in {LONGEST_STREAK} steps in a row, up to "
+                    f"update {learner.updates}; batches are kept in {self.folder}; a lower learning rate may help",
                     learner.updates,
                 )
 
     def _keep(self, learner: Learner, name: str, rows: torch.Tensor) -> None:
         path = self.folder / f"{name}-{learner.updates:09d}.pt"
         kept = len(list(self.folder.glob("*.pt")))
-        where = "as many batches as are kept are there already"
+        where = f"{KEPT_BATCHES} batches are kept already"
         if kept < KEPT_BATCHES and not path.exists():
             self.folder.mkdir(exist_ok=True)
             torch.save({part: value.cpu() for part, value in learner.replay.gather(rows)._asdict().items()}, path)
             where = f"its batch is kept in {path}"
         warnings.warn(
-            f"the loss or gradient of the {name} was not finite at update {learner.updates}: the step was skipped; {where}",
+            f"the loss or gradient of the {name} was not finite at update {learner.updates}: "
+            f"the step was skipped; {where}",
             RuntimeWarning,
             stacklevel=2,
         )

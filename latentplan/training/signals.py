@@ -19,20 +19,27 @@ def exit_code(number: int) -> int:
     return 128 + number
 
 
+def raise_interrupt(number: int) -> None:
+    """Raises `KeyboardInterrupt`, for a program whose work is repeated from its last save."""
+    raise KeyboardInterrupt
+
+
 class Signals:
     """While its context is open, handles the signals that stop a program.
 
     SIGHUP stays ignored if it was ignored before, as under `nohup`. Outside of the main thread, where Python handles no
     signals, the context changes nothing.
 
+    Args:
+        receive: Called with the number of the first signal.
+
     Attributes:
         received: Number of the first signal; 0 before it.
-        receive: Called with the number of the first signal.
+        receive: As given.
     """
 
-    def __init__(self) -> None:
-        self.received = 0
-        self.receive: Callable[[int], None] = lambda number: None
+    def __init__(self, receive: Callable[[int], None] = lambda number: None) -> None:
+        self.received, self.receive = 0, receive
         self._previous: dict[int, Any] = {}
 
     def __enter__(self) -> Signals:

@@ -6,7 +6,8 @@ import contextlib
 import fcntl
 import os
 import time
-from collections.abc import Iterator
+import warnings
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -15,8 +16,8 @@ import torch
 
 from latentplan.agents.checkpoint import INFO
 from latentplan.config import UserError, make_folder
-from latentplan.config.commit import DamageError, Save, write_synced
-from latentplan.config.run_folder import RUN_FILE
+from latentplan.config.commit import DamageError, Extent, Save, Saves, write_synced
+from latentplan.config.run_folder import RUN_FILE, SAVES_FOLDER
 from latentplan.replay.buffer import read_saved
 
 if TYPE_CHECKING:
@@ -24,9 +25,7 @@ if TYPE_CHECKING:
 
 
 LOCK_FILE = ".lock"
-GOALS_FILE = "goals.pt"
-DISTILLATION_FILE = Path("resume") / "distill.pt"
-CONTENTS = {RUN_FILE: "a run", INFO: "an agent", GOALS_FILE: "an agent", str(DISTILLATION_FILE): "an agent"}
+CONTENTS = {RUN_FILE: "a run", INFO: "an agent", f"{SAVES_FOLDER}/save-*[0-9]": "an agent"}
 STATE_FILE = "state.pt"
 METRICS_FILE = "metrics.csv"
 
@@ -129,12 +128,41 @@ def read_state(save: Save) -> SavedRun:
         raise DamageError(f"{path} is damaged: {str(error)[:160]}") from None
 
 
-def save_atomically(saved: dict[str, Any], path: Path) -> None:
-    """Writes a file with `torch.save`; an earlier file stays whole until the new one replaces it in one step."""
-    make_folder(path.parent)
-    part = path.with_name(f"{path.name}.part")
-    torch.save(saved, part)
-    part.replace(path)
+def save_values(saves: Saves, values: dict[str, Any], note: Mapping[str, Any]) -> None:
+    """Saves tensors and plain values as one commit; `load_values` restores them."""
+
+    def write(part: Path) -> dict[str, Extent]:
+        torch.save(values, part / STATE_FILE)
+        return {}
+
+    saves.commit(write, note)
+
+
+def load_values(saves: Saves, keys: Sequence[str]) -> dict[str, Any]:
+    """The values of the newest save that is whole; a warning names newer ones that are not.
+
+    Args:
+        saves: The saves.
+        keys: Names that the values must have.
+
+    Raises:
+        UserError: There is no save, or none is whole.
+    """
+    save, problems = saves.newest()
+    warn_of_loss(save, problems)
+    values: dict[str, Any] = read_saved(save.folder / STATE_FILE, keys=keys)
+    return values
+
+
+def warn_of_loss(save: Save, problems: Sequence[str]) -> None:
+    """Warn of saves that are damaged, and say what the save that takes their place holds."""
+    clocks = ", ".join(f"{name.replace('_', ' ')} {value}" for name, value in save.note.items())
+    for problem in problems:
+        warnings.warn(
+            f"{problem}: the save before takes its place ({clocks}); what was done after it is lost, and is done again",
+            RuntimeWarning,
+            stacklevel=3,
+        )
 
 
 def restore_learner(learner: Learner, saved: dict[str, Any], folder: Path) -> None:
@@ -170,20 +198,20 @@ def restore_metrics(save: Save, folder: Path) -> None:
     part.replace(path)
 
 
-def refuse_used(folder: Path, own_file: str, flag: str) -> None:
+def refuse_used(folder: Path, kind: str, flag: str) -> None:
     """Refuses a folder that already holds a run or an agent.
 
     Args:
         folder: Where a new run or agent is about to be written.
-        own_file: The file in `CONTENTS` from which the caller can resume; if it exists, the message names `--resume`.
+        kind: Kind of saves from which the caller can resume; if there are any, the message names `--resume`.
         flag: The flag that chooses another folder.
 
     Raises:
-        UserError: The folder holds one of the files in `CONTENTS`.
+        UserError: The folder holds something that `CONTENTS` describes.
     """
-    for name, content in CONTENTS.items():
-        if (folder / name).exists():
-            can_resume = (folder / own_file).exists()
+    for pattern, content in CONTENTS.items():
+        if any(folder.glob(pattern)):
+            can_resume = Saves(folder / SAVES_FOLDER, kind, 0).kinds() == {kind}
             advice = f"resume it with --resume {folder} (or from Python), or " if can_resume else ""
             raise UserError(f"{folder} already holds {content}: {advice}choose another {flag}")
 

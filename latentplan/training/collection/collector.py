@@ -349,8 +349,8 @@ class RewardCheck:
         return {"sums": self._sums.copy(), "has_warned": self._has_warned}
 
     def set_memory(self, memory: dict[str, Any]) -> None:
-        """Continue with what another check knew of the running episodes."""
-        self._sums, self._has_warned = np.array(memory["sums"]), memory["has_warned"]
+        """Continue with what another check knew of the running episodes; arrays are tensors now."""
+        self._sums, self._has_warned = memory["sums"].numpy().copy(), memory["has_warned"]
 
     def __call__(self, rewards: np.ndarray, is_first: np.ndarray) -> None:
         """Check one step's rewards.

@@ -33,6 +33,7 @@ class Episodes:
         self._begun = [0] * envs.num_envs  # episodes so far, of each environment
         self._actions: list[list[np.ndarray]] = [[] for _ in range(envs.num_envs)]
         self._is_started = False
+        self._over = np.zeros(envs.num_envs, dtype=bool)  # while episodes are repeated
 
     def restart(self, where: np.ndarray) -> tuple[np.ndarray, dict[str, Any]]:
         """Begins the next episode in some environments.
@@ -88,7 +89,7 @@ class Episodes:
         frames, info = self._reset(np.ones(len(records), dtype=bool))
         for time in range(longest := int(lengths.max(initial=0))):
             place = time - (longest - lengths)  # of each episode; before 0 the environment waits and plays anything
-            begins = (place == 0) | (self._over if time else False)
+            begins = (place == 0) | (self._over)
             if time and begins.any():
                 frames, _ = self._reset(begins)
             taken = [
@@ -111,7 +112,7 @@ class Episodes:
         return frames, info.get("labels"), is_same
 
     def _reset(self, where: np.ndarray) -> tuple[np.ndarray, dict[str, Any]]:
-        seeds = [derive_seed(self.seed, f"episodes {lane}", begun) for lane, begun in enumerate(self._begun)]
+        seeds: Any = [derive_seed(self.seed, f"episodes {lane}", begun) for lane, begun in enumerate(self._begun)]
         self._over = np.zeros(len(seeds), dtype=bool)
         if not self._is_started:
             self._is_started = True

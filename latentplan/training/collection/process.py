@@ -42,7 +42,11 @@ class LocalWorker:
     """
 
     def __init__(
-        self, config: Config, make_user_env: EnvFactory | None, device: str, should_stop: Callable[[], bool]
+        self,
+        config: Config,
+        make_user_env: EnvFactory | None,
+        device: str,
+        should_stop: Callable[[], bool] = lambda: False,
     ) -> None:
         self._collector = Collector(config, make_user_env, device)
         self._collector.should_stop = should_stop
@@ -123,9 +127,9 @@ class RemoteWorker:
                 raise Stopped
             kind, value = future.result()
         except (EOFError, OSError):
+            self._process.join(timeout=5.0)
             if self._should_stop():
                 raise Stopped from None
-            self._process.join(timeout=5.0)
             code = self._process.exitcode
             raise WorkerEnded(f"the collection process ended unexpectedly (exit code {code})") from None
         if kind == "user_error":
