@@ -17,7 +17,7 @@ import json
 import os
 import re
 import shutil
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -303,9 +303,15 @@ class Manifest:
 
 
 def write_manifest(
-    folder: Path, kind: str, version: int, note: Mapping[str, Any], logs: Mapping[str, Extent], suffix: str = ""
+    folder: Path,
+    kind: str,
+    version: int,
+    note: Mapping[str, Any],
+    logs: Mapping[str, Extent],
+    names: Sequence[str] | None = None,
+    suffix: str = "",
 ) -> None:
-    """Flushes every file of a folder to the disk, and writes their manifest last.
+    """Flushes files of a folder to the disk, and writes their manifest last.
 
     Args:
         folder: Folder of the files.
@@ -313,12 +319,13 @@ def write_manifest(
         version: Number of the format.
         note: Says in a few plain values what is saved.
         logs: Committed part of each log.
-        suffix: End of the manifest's own name, and of the names of the files that it describes.
+        names: The files; None takes all files of the folder.
+        suffix: End of the names of the files and of the manifest as they are now; the manifest leaves it out.
     """
-    paths = [path for path in folder.iterdir() if path.name.endswith(suffix) and path.name != MANIFEST + suffix]
-    for path in paths:
-        sync(path)
-    files = {path.name.removesuffix(suffix): measure_file(path) for path in sorted(paths)}
+    names = [path.name for path in folder.iterdir() if path.name != MANIFEST] if names is None else names
+    for name in names:
+        sync(folder / f"{name}{suffix}")
+    files = {name: measure_file(folder / f"{name}{suffix}") for name in sorted(names)}
     text = _manifest_text(Manifest(kind, version, note, files, logs))
     write_synced(folder / (MANIFEST + suffix), text.encode())
 
