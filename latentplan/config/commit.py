@@ -117,7 +117,7 @@ class Saves:
             shutil.rmtree(part, ignore_errors=True)
             raise
         sync(self.folder)
-        saved = self._open(final, check_logs=False)
+        saved = self.verify(final, check_logs=False)
         previous, self._last = self._last, saved
         self._prune(saved, previous)
         return saved
@@ -131,7 +131,7 @@ class Saves:
         problems: list[str] = []
         for number in sorted(self._numbers(), reverse=True):
             try:
-                self._last = self._open(self.folder / f"save-{number:06d}", check_logs=True)
+                self._last = self.verify(self.folder / f"save-{number:06d}")
                 return self._last, problems
             except DamageError as error:
                 problems.append(str(error))
@@ -155,7 +155,17 @@ class Saves:
         for path in self.folder.glob(f"*{PART}"):
             shutil.rmtree(path, ignore_errors=True)
 
-    def _open(self, folder: Path, *, check_logs: bool) -> Save:
+    def verify(self, folder: Path, *, check_logs: bool = True) -> Save:
+        """Compares the files of a save with its manifest.
+
+        Args:
+            folder: Folder of the save.
+            check_logs: Whether the committed parts of logs are compared too.
+
+        Raises:
+            DamageError: A file is missing or differs.
+            UserError: The save has another format.
+        """
         manifest = read_manifest(folder, self.kind, self.version)
         check_files(folder, manifest)
         for name, extent in manifest.logs.items():
