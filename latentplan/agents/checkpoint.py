@@ -115,9 +115,8 @@ def _parse_info(folder: Path, content: bytes) -> dict[str, Any]:
         raise UserError(f"{folder} is not a latentplan checkpoint: {INFO} lacks {', '.join(missing)}")
     for key in info:
         if key not in ALLOWED:
-            raise UserError(
-                f"{folder / INFO} holds the unknown key {key[:60]!r}{_suggestion(key, {name: name for name in ALLOWED})}"
-            )
+            known = {name: name for name in ALLOWED}
+            raise UserError(f"{folder / INFO} holds the unknown key {key[:60]!r}{_suggestion(key, known)}")
     for key, (allows, allowed) in ALLOWED.items():
         if key in info and not allows(info[key]):
             raise UserError(f"{folder / INFO} cannot be used: {key} must be {allowed}, got {str(info[key])[:60]!r}")

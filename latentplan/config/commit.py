@@ -1,8 +1,8 @@
 """Commits: saves of which each is there as a whole or not at all, and of which any damage is noticed.
 
 A save is a folder `save-000012` with a manifest: the sizes and SHA-256 checksums of its files, of the committed parts
-of append-only logs, and of the manifest itself. `Saves.commit` writes a save in this order: logs are appended and flushed
-to the disk, the other files are written beside under the name `save-000012.part` and flushed, the manifest is written
+of append-only logs, and of the manifest itself. `Saves.commit` writes a save in this order: logs are appended and
+flushed to the disk, the other files are written beside under the name `save-000012.part` and flushed, the manifest is written
 last, the folder is renamed, and its parent is flushed. Only after the new save was read again are older saves removed,
 except the one before, to which `Saves.newest` falls back if the new one is damaged.
 

@@ -2,9 +2,9 @@
 
 A toy run trains in a folder of its own, on a small file system in memory where the user may mount one. After a minute
 of calibration its budget of frames is set to what takes about the time that was asked for. Then one fault follows
-another in random order: kill -9 of the trainer and of its collection process, SIGTERM, a full disk, a flipped byte in
-the newest save, a batch of NaN, an exception in the environment, and an environment that hangs. Whenever the trainer has
-ended, the same command starts it again. In the end the folder must hold the promised frames, every evaluation that was
+another in random order: kill -9 of the trainer and of its collection process, SIGTERM, a full disk, a flipped bit in
+the newest save, a batch of NaN, an exception in the environment, and an environment that hangs. Whenever the trainer
+has ended, the same command starts it again. In the end the folder must hold the promised frames, every evaluation that was
 due, and an agent that loads.
 """
 

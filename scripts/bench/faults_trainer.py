@@ -10,6 +10,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import torch
+
 from bench.toy import FaultyDot, take, toy_config
 from latentplan.commands.shell import run_guarded
 from latentplan.config import ReplayConfig
@@ -31,7 +32,7 @@ def main(folder: Path, frames: int, triggers: Path) -> int:
         batch = unchanged(curriculum, batch)
         return batch._replace(rewards=batch.rewards * torch.nan) if take(triggers / "nan") else batch
 
-    Curriculum.__call__ = poison  # type: ignore[method-assign]
+    Curriculum.__call__ = poison  # type: ignore[method-assign,assignment]
     make_env = FaultyDot(triggers)
     if (folder / "config.yaml").exists():
         return resume(folder, frames=frames, make_env=make_env).exit_code

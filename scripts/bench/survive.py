@@ -76,9 +76,7 @@ def run(request: Request) -> int:
             "kill -9 of the trainer": lambda: kill_runs(folder, reference, request.trainer, seconds, rng, False),
             "kill -9 of the worker": lambda: kill_runs(folder, reference, request.worker, seconds, rng, True),
             "kill -9 within a save": lambda: kill_saves(folder / "saves", request.saves, rng),
-            "kill -9 within a checkpoint": lambda: kill_checkpoints(
-                folder / "agent", reference, request.checkpoints, rng
-            ),
+            "kill -9 within a checkpoint": lambda: kill_agents(folder / "agent", reference, request.checkpoints, rng),
             "flipped bits": lambda: flip_bits(reference, request.flips, rng),
         }
         for part, measure in parts.items():
@@ -114,7 +112,7 @@ def kill_runs(
         own = folder / f"run{index}"
         process, killed = _train(own, overlap=is_worker), 0
         while killed < KILLS_PER_RUN:
-            _await(lambda: bool(list((own / "resume").glob("save-*[0-9]"))) or _has_ended(process))
+            _await_save(own / "resume", process)
             if _has_ended(process, rng.uniform(0.0, seconds)):
                 break
             target = _child_of(process) if is_worker else process
@@ -143,7 +141,7 @@ def kill_saves(folder: Path, tries: int, rng: random.Random) -> dict[str, Any]:
     survived = within = 0
     for _ in range(tries):
         process = _fork(lambda: _save_for_ever(folder))
-        _await(lambda: bool(list(folder.glob("save-*[0-9]"))))
+        _await_save(folder, process)
         time.sleep(rng.uniform(0.0, 0.3))
         os.kill(process, signal.SIGKILL)
         _wait(process)
@@ -153,7 +151,7 @@ def kill_saves(folder: Path, tries: int, rng: random.Random) -> dict[str, Any]:
     return {"tries": tries, "survived": survived, "with an unfinished save": within}
 
 
-def kill_checkpoints(folder: Path, reference: Path, tries: int, rng: random.Random) -> dict[str, Any]:
+def kill_agents(folder: Path, reference: Path, tries: int, rng: random.Random) -> dict[str, Any]:
     """Kills a process that replaces a checkpoint, again and again."""
     from latentplan.agents.checkpoint import load_model, save_checkpoint
 
@@ -166,7 +164,8 @@ def kill_checkpoints(folder: Path, reference: Path, tries: int, rng: random.Rand
 
     for _ in range(tries):
         process = _fork(save_for_ever)
-        _await(lambda: (folder / "manifest.json").exists())
+        while not (folder / "manifest.json").exists():
+            time.sleep(0.002)
         time.sleep(rng.uniform(0.0, 0.05))
         os.kill(process, signal.SIGKILL)
         _wait(process)
@@ -364,9 +363,9 @@ def _has_ended(process: int, seconds: float = 0.0) -> bool:
     return True
 
 
-def _await(holds: Callable[[], bool], seconds: float = 120.0) -> None:
-    end = time.monotonic() + seconds
-    while not holds() and time.monotonic() < end:
+def _await_save(folder: Path, process: int) -> None:
+    """Wait for the first save of a process that has not ended."""
+    while not list(folder.glob("save-*[0-9]")) and not _has_ended(process):
         time.sleep(0.002)
 
 
