@@ -2,8 +2,8 @@
 
 A checkpoint keeps its place and the names of its files, so a new one cannot be renamed as a folder. New files are
 written beside the old ones under the suffix `.part`; the commit is the renaming of the new manifest, and the other
-files are renamed after it. A reader takes of each file the one that the manifest names, with or without the suffix, so that a
-checkpoint is whole at every moment, also after a crash between two renamings.
+files are renamed after it. A reader takes of each file the one that the manifest names, with or without the suffix, so
+that a checkpoint is whole at every moment, also after a crash between two renamings.
 """
 
 from __future__ import annotations

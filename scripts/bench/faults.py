@@ -4,8 +4,8 @@ A toy run trains in a folder of its own, on a small file system in memory where 
 of calibration its budget of frames is set to what takes about the time that was asked for. Then one fault follows
 another in random order: kill -9 of the trainer and of its collection process, SIGTERM, a full disk, a flipped bit in
 the newest save, a batch of NaN, an exception in the environment, and an environment that hangs. Whenever the trainer
-has ended, the same command starts it again. In the end the folder must hold the promised frames, every evaluation that was
-due, and an agent that loads.
+has ended, the same command starts it again. In the end the folder must hold the promised frames, every evaluation that
+was due, and an agent that loads.
 """
 
 from __future__ import annotations
