@@ -3,8 +3,8 @@
 A save is a folder `save-000012` with a manifest: the sizes and SHA-256 checksums of its files, of the committed parts
 of append-only logs, and of the manifest itself. `Saves.commit` writes a save in this order: logs are appended and
 flushed to the disk, the other files are written beside under the name `save-000012.part` and flushed, the manifest is
-written last, the folder is renamed, and its parent is flushed. Only after the new save was read again are older saves removed,
-except the one before, to which `Saves.newest` falls back if the new one is damaged.
+written last, the folder is renamed, and its parent is flushed. Only after the new save was read again are older saves
+removed, except the one before, to which `Saves.newest` falls back if the new one is damaged.
 
 Logs are appended in place: a save names how many bytes of each log belong to it, so that later bytes do not harm it.
 """

@@ -201,16 +201,15 @@ class Guard(lightning.Callback):
                 )
 
     def _keep(self, learner: Learner, name: str, rows: torch.Tensor) -> None:
+        """Keep a batch and warn; after some batches a run only counts, because one reason would fill its log."""
         path = self.folder / f"{name}-{learner.updates:09d}.pt"
-        kept = len(list(self.folder.glob("*.pt")))
-        where = f"{KEPT_BATCHES} batches are kept already"
-        if kept < KEPT_BATCHES and not path.exists():
-            self.folder.mkdir(exist_ok=True)
-            torch.save({part: value.cpu() for part, value in learner.replay.gather(rows)._asdict().items()}, path)
-            where = f"its batch is kept in {path}"
+        if path.exists() or len(list(self.folder.glob("*.pt"))) >= KEPT_BATCHES:
+            return
+        self.folder.mkdir(exist_ok=True)
+        torch.save({part: value.cpu() for part, value in learner.replay.gather(rows)._asdict().items()}, path)
         warnings.warn(
-            f"the loss or gradient of the {name} was not finite at update {learner.updates}: "
-            f"the step was skipped; {where}",
+            f"the loss or gradient of the {name} was not finite at update {learner.updates}: the step was skipped, and "
+            f"its batch is kept in {path}",
             RuntimeWarning,
             stacklevel=2,
         )
