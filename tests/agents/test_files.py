@@ -46,7 +46,7 @@ def die_at(call):
 
 @pytest.mark.parametrize("has_old", [True, False])
 def test_read_files_finds_one_whole_pair_wherever_writing_is_killed(tmp_path, has_old):
-    old, new = ({name: f"{name} {age}".encode() for name in NAMES} for age in ("old", "new"))
+    old, new, third = ({name: f"{name} {age}".encode() for name in NAMES} for age in ("old", "new", "third"))
 
     def write():
         die_at(call)
@@ -59,7 +59,6 @@ def test_read_files_finds_one_whole_pair_wherever_writing_is_killed(tmp_path, ha
         is_finished = in_child(write)
         if has_old or (folder / "manifest.json").exists():
             assert read_files(folder, NAMES) in (old, new), call
-        third = {name: f"{name} third".encode() for name in NAMES}
         for again in range(20):  # killed in the next commit too
             own = shutil.copytree(folder, tmp_path / f"{call}-{again}")
 
