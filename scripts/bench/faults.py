@@ -1,11 +1,11 @@
 """`benchmark.py faults`: a run that is disturbed once a minute, and is only ever started again.
 
-A toy run trains in a folder of its own, on a small file system in memory where the user may mount one. After a minute
-of calibration its budget of frames is set to what takes about the time that was asked for. Then one fault follows
-another in random order: kill -9 of the trainer and of its collection process, SIGTERM, a full disk, a flipped bit in
-the newest save, a batch of NaN, an exception in the environment, and an environment that hangs. Whenever the trainer
-has ended, the same command starts it again. In the end the folder must hold the promised frames, every evaluation that
-was due, and an agent that loads.
+A toy run trains in a folder of its own, on a small file system in memory where the user may mount one. One fault
+follows another in random order: kill -9 of the trainer and of its collection process, SIGTERM, a full disk, a flipped
+bit in the newest save, a batch of NaN, an exception in the environment, and an environment that hangs. Whenever the
+trainer has ended, the same command starts it again. After a quarter of the time the budget of frames is set to what the
+rest of the time allows, and when the time is over no more faults happen. In the end the folder must hold the promised
+frames, every evaluation that was due, and an agent that loads.
 """
 
 from __future__ import annotations
@@ -27,17 +27,16 @@ from pathlib import Path
 from typing import Any
 
 from bench.report import format_table, write_json
-from bench.toy import EVERY_FRAMES
-from latentplan.config import UserError
+from bench.toy import EVERY_FRAMES, ROUND_FRAMES
 from latentplan.config.checks import above_zero
 from latentplan.config.parsing import option
 
 DISK_MEGABYTES = 192
 DEAF_SECONDS = 120.0  # without a row of metrics, the trainer counts as hanging unnoticed
 SETTLING_FRAMES = 60  # after which a run counts as going on: results of two rounds may be under way
-CALIBRATION_SECONDS = 60.0
-CALIBRATION_FRAMES = 10**8
-TRAINING_SHARE = 0.6  # of the time; the rest is lost to faults and starts
+CALIBRATING_SHARE = 0.25  # of the time, after which the budget of frames is set
+CAUTION = 0.9  # share of the frames that the rate so far predicts
+UNLIMITED_FRAMES = 10**8
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -45,7 +44,7 @@ class Request:
     """Flags of `benchmark.py faults`.
 
     Attributes:
-        minutes: Minutes of training that the budget of frames stands for.
+        minutes: Minutes in which faults happen.
         every: Seconds between two faults.
         seed: Seed of the order and the times of the faults.
         log: Everything that the trainer and the faults said.
@@ -88,7 +87,7 @@ def run(request: Request) -> int:
         disk, is_small = stack.enter_context(_small_disk())
         log = stack.enter_context(request.log.open("w"))
         trainer = stack.enter_context(Trainer(disk, log))
-        trainer.calibrate(request.minutes)
+        trainer.start()
         faults = dict(FAULTS)
         if not is_small:
             del faults["full disk"]
@@ -96,10 +95,12 @@ def run(request: Request) -> int:
         tallies = {name: Tally() for name in faults}
         started = time.monotonic()
         order: list[str] = []
-        while not trainer.is_complete() and time.monotonic() - started < 120.0 * request.minutes:
+        while not trainer.is_complete() and (minutes := (time.monotonic() - started) / 60.0) < 2.0 * request.minutes:
+            if trainer.frames == UNLIMITED_FRAMES and minutes >= CALIBRATING_SHARE * request.minutes:
+                trainer.promise(60.0 * minutes, 60.0 * (request.minutes - minutes))
             trainer.wait(request.every * rng.uniform(0.5, 1.0))
-            if trainer.is_complete():
-                break
+            if trainer.is_complete() or minutes >= request.minutes:
+                continue
             order = order or rng.sample(sorted(faults), len(faults))
             name = order.pop()
             disturb(trainer, name, faults[name], tallies[name], rng)
@@ -123,7 +124,7 @@ class Trainer:
     def __init__(self, disk: Path, log: Any) -> None:
         self.disk, self.folder, self.log = disk, disk / "run", log
         self.triggers = Path(tempfile.mkdtemp(prefix="faults-"))
-        self.frames = CALIBRATION_FRAMES
+        self.frames = UNLIMITED_FRAMES
         self.process: subprocess.Popen[bytes] | None = None
 
     def __enter__(self) -> Trainer:
@@ -159,19 +160,17 @@ class Trainer:
         """The exit code of an ended process as a shell counts it."""
         return 128 - status if status < 0 else status
 
-    def calibrate(self, minutes: float) -> None:
-        """Train for a minute without faults, and set the budget of frames."""
-        self.start()
-        self.wait(CALIBRATION_SECONDS)
-        first = self.clock()
-        began = time.monotonic()
-        self.wait(CALIBRATION_SECONDS)
-        rate = (self.clock() - first) / (time.monotonic() - began)
-        if rate <= 0.0:
-            raise UserError("the toy run collected nothing in the second minute: this machine is too busy")
+    def promise(self, seconds: float, left: float) -> None:
+        """Set the budget of frames to what is likely to be reached in the time that is left, and start again with it.
+
+        Args:
+            seconds: Time since the first start, in which faults happened as often as they will happen.
+            left: Time that is left.
+        """
         self.stop(signal.SIGTERM)
-        self.frames = self.clock() + int(rate * 60.0 * minutes * TRAINING_SHARE) // 15 * 15
-        self.say(f"{rate:.1f} frames per second: the run is promised {self.frames:,} frames")
+        rate = self.clock() / seconds
+        self.frames = self.clock() + max(1, int(CAUTION * rate * left / ROUND_FRAMES)) * ROUND_FRAMES
+        self.say(f"{rate:.1f} frames per second so far: the run is promised {self.frames:,} frames")
         self.start()
 
     def clock(self) -> int:
@@ -215,7 +214,7 @@ class Trainer:
         rows = self.rows()
         evaluated = [int(row["env_frames"]) for row in rows if row["planner_return"]]
         updates = [int(row["updates"]) for row in rows if row["reconstruction"]]
-        due = range(EVERY_FRAMES, self.frames - 15, EVERY_FRAMES)
+        due = range(EVERY_FRAMES, self.frames - ROUND_FRAMES, EVERY_FRAMES)
         final = json.loads((self.folder / "final.json").read_text()) if self.is_complete() else {}
         for name in ("best", "last"):
             load_agent(self.folder / "checkpoints" / name)

@@ -24,6 +24,7 @@ from latentplan.config import (
 )
 
 EVERY_FRAMES = 600  # between evaluations
+ROUND_FRAMES = 15
 
 
 class Dot(gymnasium.Env[np.ndarray, np.ndarray]):
@@ -98,7 +99,7 @@ def toy_config(folder: Path, frames: int, *, overlap: bool, every_frames: int = 
         ),
         learning=LearningConfig(batch_size=4, sequence_length=5, imagination_horizon=3, imagination_starts=8),
         collection=CollectionConfig(
-            prefill_decisions=45, round_decisions=15, updates_per_decision=0.4, overlap=overlap
+            prefill_decisions=45, round_decisions=ROUND_FRAMES, updates_per_decision=0.4, overlap=overlap
         ),
         evaluation=EvaluationConfig(every_frames=every_frames, episodes=1, final_episodes=2, video=False),
         run=RunConfig(frames=frames, device="cpu", threads=1, run_dir=str(folder)),
