@@ -14,9 +14,10 @@ from safetensors import SafetensorError
 from safetensors.torch import load, save
 
 from latentplan.agents.base import Agent
-from latentplan.agents.files import is_checkpoint, read_files, write_files
+from latentplan.agents.files import is_checkpoint, read_files, seal, write_files
 from latentplan.agents.modes import MODES, make_agent
 from latentplan.config import Config, PlannerConfig, UserError, from_dict, to_dict
+from latentplan.config.commit import MANIFEST
 from latentplan.config.planner import override_planner
 from latentplan.models import WorldModel
 from latentplan.models.fast import accelerate
@@ -89,6 +90,21 @@ def save_checkpoint(folder: Path, model: WorldModel, config: Config, info: dict[
     sizes = {"action_dim": model.action_dim, "labels": model.labels, "goal_dim": model.goal_dim}
     facts = info | sizes | {"config": to_dict(config), "sha256": hashlib.sha256(content).hexdigest()}
     write_files(folder, {WEIGHTS: content, INFO: (json.dumps(facts, indent=1) + "\n").encode()})
+
+
+def seal_checkpoint(path: str | Path) -> None:
+    """Writes a new manifest for a checkpoint whose `info.json` was edited on purpose.
+
+    Args:
+        path: A checkpoint, or a run folder.
+
+    Raises:
+        UserError: The checkpoint cannot be used as it is now.
+    """
+    folder = resolve_checkpoint(path)
+    (folder / MANIFEST).unlink(missing_ok=True)
+    load_model(folder)
+    seal(folder, (INFO, WEIGHTS))
 
 
 def read_info(path: str | Path) -> dict[str, Any]:

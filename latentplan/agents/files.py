@@ -40,6 +40,11 @@ def write_files(folder: Path, contents: Mapping[str, bytes]) -> None:
     sync(folder)
 
 
+def seal(folder: Path, names: Sequence[str]) -> None:
+    """Writes the manifest of a checkpoint whose files were changed on purpose, or that has none."""
+    write_manifest(folder, KIND, FORMAT, {}, {}, names=names)
+
+
 def read_files(folder: Path, names: Sequence[str]) -> dict[str, bytes]:
     """The content of files of a checkpoint, by name; compared with the manifest if there is one.
 
@@ -74,8 +79,8 @@ def _find(folder: Path, name: str, manifest: Manifest) -> tuple[Path, bytes]:
             if hashlib.sha256(content).hexdigest() == manifest.files[name].sha256:
                 return path, content
     raise DamageError(
-        f"{folder / name} is damaged: its checksum differs from the checksum in {MANIFEST}, which has to be deleted "
-        "after a deliberate change"
+        f"{folder / name} is damaged: its checksum differs from the checksum in {MANIFEST}; after a deliberate change, "
+        "delete that file"
     )
 
 

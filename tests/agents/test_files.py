@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from latentplan.agents.checkpoint import load_model, read_info, save_checkpoint
+from latentplan.agents.checkpoint import load_model, read_info, save_checkpoint, seal_checkpoint
 from latentplan.agents.files import read_files, write_files
 from latentplan.config import UserError
 from tests.agents.small_agents import make_plain_model
@@ -105,7 +105,11 @@ def test_load_model_says_what_to_do_after_a_deliberate_change(agent, tmp_path):
     info = json.loads((folder / "info.json").read_text())
     info["config"]["planner"]["horizon"] = 2
     (folder / "info.json").write_text(json.dumps(info))
-    assert_refused(lambda: read_info(folder), "info.json is damaged", "manifest.json", "deleted")
+    assert_refused(lambda: read_info(folder), "info.json is damaged", "manifest.json", "delete")
+    seal_checkpoint(folder)
+    assert load_model(folder)[1].planner.horizon == 2
+    (folder / "info.json").write_text(json.dumps(info) + " ")
+    assert_refused(lambda: read_info(folder), "damaged")
     unseal(folder)
     assert load_model(folder)[1].planner.horizon == 2
 
