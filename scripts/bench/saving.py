@@ -147,7 +147,7 @@ def time_guards(config: Config, request: Request) -> dict[str, Any]:
     times: dict[str, list[float]] = {"without_ms": [], "with_ms": []}
     for block in range(1 + request.blocks):
         for name, descend in (("without_ms", unguarded), ("with_ms", guarded)):
-            Learner._descend = descend  # type: ignore[method-assign]
+            Learner._descend = descend  # type: ignore[method-assign,assignment]
             started = time.process_time()
             for _ in range(BLOCK):
                 rows = learner.replay.draw(size.batch_size, size.sequence_length, rng)
@@ -157,7 +157,7 @@ def time_guards(config: Config, request: Request) -> dict[str, Any]:
                     sum(int(half.total) for half in learner.skips)  # as `Guard` looks at them
             if block:  # the first block warms up
                 times[name].append(1000.0 * (time.process_time() - started) / BLOCK)
-    Learner._descend = guarded  # type: ignore[method-assign]
+    Learner._descend = guarded  # type: ignore[method-assign,assignment]
     return {name: median(values) for name, values in times.items()} | {"blocks": times}
 
 
