@@ -206,7 +206,13 @@ class Guard(lightning.Callback):
         if path.exists() or len(list(self.folder.glob("*.pt"))) >= KEPT_BATCHES:
             return
         self.folder.mkdir(exist_ok=True)
-        torch.save({part: value.cpu() for part, value in learner.replay.gather(rows)._asdict().items()}, path)
+        torch.save(
+            {
+                part: value.cpu()
+                for part, value in learner.replay.gather(rows.to(learner.replay.device))._asdict().items()
+            },
+            path,
+        )
         warnings.warn(
             f"the loss or gradient of the {name} was not finite at update {learner.updates}: the step was skipped, and "
             f"its batch is kept in {path}",

@@ -76,8 +76,7 @@ class Learner(lightning.LightningModule):
         self.updates = 0
         self.metrics: dict[str, Tensor] = {}
         shape = config.batch_size, config.sequence_length + 1
-        device = model.device
-        self.skips = tuple(Skips(shape, device, replay.device) for _ in (MODEL, BEHAVIOUR))
+        self.skips = tuple(Skips(shape, model.device) for _ in (MODEL, BEHAVIOUR))
         self._thread = ThreadPoolExecutor(1, thread_name_prefix="behaviour")
         self._waiting: tuple[Learned, Batch, torch.Generator] | None = None
 

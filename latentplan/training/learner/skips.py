@@ -32,12 +32,11 @@ class Skips:
     Args:
         shape: Batch size and frames per sequence.
         device: Device of the learner.
-        rows_device: Device of the replay's rows.
     """
 
-    def __init__(self, shape: tuple[int, int], device: torch.device, rows_device: torch.device) -> None:
+    def __init__(self, shape: tuple[int, int], device: torch.device) -> None:
         self.total, self.streak, self.longest = (torch.zeros((), dtype=torch.long, device=device) for _ in range(3))
-        self.rows = torch.zeros(shape, dtype=torch.long, device=rows_device)
+        self.rows = torch.zeros(shape, dtype=torch.long, device=device)
 
     def record(self, norm: Tensor, rows: Tensor) -> None:
         """Count a step whose gradient had this norm: the step was skipped if the norm is not finite.
@@ -50,7 +49,7 @@ class Skips:
         self.total += is_skipped
         self.streak.copy_(torch.where(is_skipped, self.streak + 1, 0))
         torch.maximum(self.longest, self.streak, out=self.longest)
-        self.rows.copy_(torch.where(is_skipped.to(self.rows.device), rows.to(self.rows.device), self.rows))
+        self.rows.copy_(torch.where(is_skipped, rows.to(self.rows.device), self.rows))
 
     def to_list(self) -> list[int]:
         """The counts as plain values, for `load`."""
