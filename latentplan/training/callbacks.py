@@ -133,7 +133,7 @@ class Collect(lightning.Callback):
             try:
                 return self._store_results()
             except WorkerEnded as error:
-                self._replace_worker(error)
+                self.replace_worker(error)
             except RuntimeError:  # a signal to the whole process group also ends the environments
                 if self.state.interrupted:
                     raise Stopped from None
@@ -184,8 +184,12 @@ class Collect(lightning.Callback):
             self.state.next_evaluation = (entry["env_frames"] // every + 1) * every
             self.requests["evaluate"] = None
 
-    def _replace_worker(self, error: WorkerEnded) -> None:
-        """Start a new collection process in place of one that ended, and repeat the requests."""
+    def replace_worker(self, error: WorkerEnded) -> None:
+        """Start a new collection process in place of one that ended, and repeat the requests.
+
+        Raises:
+            WorkerEnded: Too many processes have ended.
+        """
         state = self.state
         if state.worker_restarts >= WORKER_RESTARTS or not isinstance(self.worker, RemoteWorker):
             raise error
@@ -206,7 +210,7 @@ class Collect(lightning.Callback):
         try:
             self.continue_requests()
         except WorkerEnded as error:
-            self._replace_worker(error)
+            self.replace_worker(error)
         return True
 
     def _next_round(self) -> dict[str, Any] | None:

@@ -31,7 +31,7 @@ from latentplan.replay.disk import ReplayFiles, count_saved
 from latentplan.training.callbacks import Collect, Record, copy_weights
 from latentplan.training.collection.collector import Description, EnvFactory
 from latentplan.training.collection.episodes import Stopped, to_arrays
-from latentplan.training.collection.process import Worker, make_worker
+from latentplan.training.collection.process import Worker, WorkerEnded, make_worker
 from latentplan.training.console import Progress
 from latentplan.training.learner.batches import ReplayBatches, ReplayData
 from latentplan.training.learner.curriculum import Curriculum
@@ -167,6 +167,8 @@ def _start(config: Config, folder: Path, make_env: EnvFactory | None, *, resume:
                 warnings.warn(f"{error}: the run goes back to its last save", RuntimeWarning, stacklevel=2)
             except Stopped:  # while the run was being set up, from which nothing is lost
                 return Result(folder, exit_code(signals.received), {})
+            except WorkerEnded as error:
+                raise UserError(f"{error}; the run has stopped, and --resume {folder} continues it") from error
             except OSError as error:
                 is_own = str(error.filename or "").startswith(str(folder))
                 if not is_own and error.errno not in DISK_ERRORS:
@@ -248,7 +250,7 @@ class _Run:
         videos = self.folder / "videos"
         videos.mkdir(exist_ok=True)
         resumed = () if saved is None else (to_arrays(saved.requests), to_arrays(saved.memory))
-        collect = Collect(config, self.replay, state, self.worker, videos, *resumed)
+        self.collect = collect = Collect(config, self.replay, state, self.worker, videos, *resumed)
         optimizers = [] if saved is None else saved.optimizers
         facts = self._agent_facts()
         save = SaveRun(self.folder, config, collect, state, self.saves, self.files, facts, optimizers)
@@ -327,8 +329,13 @@ class _Run:
         return summary
 
     def _evaluate(self, model: WorldModel, film: Path | None = None, actor: bool = True) -> dict[str, list[float]]:
-        self.worker.submit("evaluate", self.config.evaluation.final_episodes, film, copy_weights(model), actor)
-        returns: dict[str, list[float]] = self.worker.result()
+        returns: dict[str, list[float]] | None = None
+        while returns is None:
+            self.worker.submit("evaluate", self.config.evaluation.final_episodes, film, copy_weights(model), actor)
+            try:
+                returns = self.worker.result()
+            except WorkerEnded as error:
+                self.collect.replace_worker(error)
         if self.state.interrupted:
             raise Stopped
         return returns

@@ -97,16 +97,22 @@ def test_run_whose_collection_process_is_killed_equals_a_run_without(tiny, dot, 
             super().on_train_epoch_end(trainer, learner)
             worker = trainer.callbacks[1].worker
             if trainer.current_epoch in (0, 2):
-                killed.append(worker._process.pid)
-                os.kill(worker._process.pid, signal.SIGKILL)
+                self.kill(worker)
+
+        def on_train_end(self, trainer, learner):
+            self.kill(trainer.callbacks[1].worker)  # before the final evaluation
+
+        def kill(self, worker):
+            killed.append(worker._process.pid)
+            os.kill(worker._process.pid, signal.SIGKILL)
 
     train(tiny(tmp_path / "whole", **settings), dot)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("latentplan.training.run.Guard", Killing)
         run = train(tiny(tmp_path / "run", collection={"overlap": True}, **settings), dot)
-    assert run.exit_code == 0 and len(set(killed)) == 2
+    assert run.exit_code == 0 and len(set(killed)) == 3
     states = [read_state(tmp_path / name) for name in ("whole", "run")]
-    assert states[1]["run"]["worker_restarts"] == 2
+    assert states[1]["run"]["worker_restarts"] == 3
     weights = [state["learner"]["weights"] for state in states]
     assert all(torch.equal(value, weights[1][name]) for name, value in weights[0].items())
     assert states[0]["run"]["rounds"] == states[1]["run"]["rounds"]
