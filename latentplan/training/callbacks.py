@@ -191,16 +191,20 @@ class Collect(lightning.Callback):
             WorkerEnded: Too many processes have ended.
         """
         state = self.state
-        if state.worker_restarts >= WORKER_RESTARTS or not isinstance(self.worker, RemoteWorker):
-            raise error
-        state.worker_restarts += 1
-        warnings.warn(
-            f"{error}: it is started again ({state.worker_restarts} of {WORKER_RESTARTS} times), and repeats its round",
-            RuntimeWarning,
-            stacklevel=2,
-        )
-        self.worker.restart()
-        self.continue_requests()
+        while isinstance(self.worker, RemoteWorker) and state.worker_restarts < WORKER_RESTARTS:
+            state.worker_restarts += 1
+            warnings.warn(
+                f"{error}: it is started again ({state.worker_restarts} of {WORKER_RESTARTS} times), and repeats its "
+                "round",
+                RuntimeWarning,
+                stacklevel=2,
+            )
+            self.worker.restart()
+            try:
+                return self.continue_requests()
+            except WorkerEnded as again:  # the new process ended while it was being prepared
+                error = again
+        raise error
 
     def _continue(self) -> bool:
         """Make the requests of the save, if that was not done yet; returns whether it was done now."""
