@@ -1,6 +1,7 @@
 # `make train` and `make test` set up everything they need; `make train ARGS="--domain cartpole --minutes 5"`.
 # `make docs` builds the documentation into build/docs.
 # `make soak` fuzzes for long; `make soak ARGS="--checkpoint DIR"` counts missed deadlines on the wall clock.
+# `make soak-faults` disturbs a run for an hour: kills, a full disk, damaged saves, NaN, failing environments.
 
 PYTHON ?= python3 python3.11 python3.12 python3.13
 ARGS ?=
@@ -8,7 +9,7 @@ BIN := .venv/bin
 STAMP := .venv/.installed
 DOCS_STAMP := .venv/.docs-installed
 
-.PHONY: setup train test test-all check doctor bench soak docs clean
+.PHONY: setup train test test-all check doctor bench soak soak-faults docs clean
 
 setup: $(STAMP)
 
@@ -34,6 +35,9 @@ bench: $(STAMP)
 
 soak: $(STAMP)
 	@$(BIN)/python $(if $(ARGS),scripts/benchmark.py soak $(ARGS),-m pytest -m soak)
+
+soak-faults: $(STAMP)
+	@$(BIN)/python scripts/benchmark.py faults --minutes 60 $(ARGS)
 
 docs: $(DOCS_STAMP)
 	$(BIN)/sphinx-build -q -W --keep-going -b html docs build/docs

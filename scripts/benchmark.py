@@ -22,6 +22,9 @@ COMMANDS = {
     "zero-shot": Command("bench.zero_shot", "goals that an agent was not trained for: planner, actor, random actions"),
     "realtime": Command("bench.realtime", "return and time by iterations, control rates, prediction and re-planning"),
     "soak": Command("bench.soak", "deadlines that agents and an idle loop miss on the wall clock"),
+    "faults": Command("bench.faults", "a run that is killed, filled, corrupted and poisoned once a minute"),
+    "survive": Command("bench.survive", "kills, kills within a save and flipped bits: tries and survivals"),
+    "saving": Command("bench.saving", "share of the time of a training run that saves and guards take"),
     "learn": Command("bench.learn", "learning curves over tasks and seeds: frames and minutes to a return"),
 }
 

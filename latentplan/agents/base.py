@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 import torch
@@ -105,6 +105,25 @@ class ModelAgent:
             if len(forget) != len(self.state.deter):
                 raise ValueError(f"got a mask of {len(forget)} for {len(self.state.deter)} environments")
             self._is_reset = forget if self._is_reset is None else self._is_reset | forget
+
+    def memory(self) -> dict[str, Any]:
+        """A copy of what the agent knows of the running episodes: tensors on the CPU, None and plain values.
+
+        An agent with the same weights and settings to which `set_memory` gives it, and whose random stream is restarted
+        with the same seed, acts as this agent does from here on.
+        """
+        belief = None if self.state is None else [copy_tensor(part) for part in self.state]
+        parts = {"action": self._action, "is_reset": self._is_reset, "noise": self.noise.last}
+        return {"state": belief} | {name: copy_tensor(part) for name, part in parts.items()}
+
+    def set_memory(self, memory: dict[str, Any]) -> None:
+        """Gives the agent what another one knew of the running episodes; see `memory`."""
+        device, belief = self.model.device, memory["state"]
+        self.state = None if belief is None else State(*(part.to(device) for part in belief))
+        action, is_reset, noise = (memory[name] for name in ("action", "is_reset", "noise"))
+        self._action = None if action is None else action.to(device)
+        self._is_reset = None if is_reset is None else is_reset.to(device)
+        self.noise.last = None if noise is None else noise.to(device)
 
     def act(self, frame: np.ndarray) -> np.ndarray:
         """The action for a new frame.
@@ -211,6 +230,11 @@ class ModelAgent:
         if frames.dtype != np.uint8 or frames.shape[1:] != (64, 64, 3):
             raise ValueError(f"frames must be uint8 (64, 64, 3), got {frames.dtype} {frames.shape[1:]}")
         return torch.from_numpy(np.ascontiguousarray(frames)).to(self.generator.device)
+
+
+def copy_tensor(value: Tensor | None) -> Tensor | None:
+    """A copy of a tensor on the CPU; None for None."""
+    return None if value is None else value.detach().cpu().clone()
 
 
 class CorrelatedNoise:

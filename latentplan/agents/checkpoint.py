@@ -5,35 +5,74 @@ from __future__ import annotations
 import difflib
 import hashlib
 import json
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import torch
 from safetensors import SafetensorError
-from safetensors.torch import load_file, save
+from safetensors.torch import load, save
 
 from latentplan.agents.base import Agent
+from latentplan.agents.files import is_checkpoint, read_files, seal, write_files
 from latentplan.agents.modes import MODES, make_agent
 from latentplan.config import Config, PlannerConfig, UserError, from_dict, to_dict
+from latentplan.config.commit import MANIFEST
 from latentplan.config.planner import override_planner
 from latentplan.models import WorldModel
 from latentplan.models.fast import accelerate
 
 WEIGHTS = "weights.safetensors"
 INFO = "info.json"
-VALUE_TYPES = {
-    "env_frames": int,
-    "action_dim": int,
-    "discount": int | float,
-    "sha256": str,
-    "labels": dict | None,
-    "goal_dim": int | None,
+LARGEST_COUNT = 10**15  # of frames, updates and minutes; larger numbers are damage
+LARGEST_SIZE = 4096  # of actions, labels and goals
+
+
+def _is_number(low: float, high: float, kinds: Any = (int, float)) -> tuple[Callable[[Any], bool], str]:
+    """A check that a value is a number in [low, high], and the words for what is allowed."""
+
+    def holds(value: Any) -> bool:
+        return isinstance(value, kinds) and not isinstance(value, bool) and low <= value <= high
+
+    return holds, f"{'an integer' if kinds is int else 'a number'} in [{low:g}, {high:g}]"
+
+
+def _are_labels(value: Any) -> bool:
+    is_scale, _ = _is_number(1e-9, 1e9)
+    return value is None or (
+        isinstance(value, dict) and len(value) <= LARGEST_SIZE and all(is_scale(scale) for scale in value.values())
+    )
+
+
+def _is_kind(kind: Any, words: str) -> tuple[Callable[[Any], bool], str]:
+    return lambda value: isinstance(value, kind), words
+
+
+ALLOWED: dict[str, tuple[Callable[[Any], bool], str]] = {
+    "format": _is_number(1, 1, int),
+    "version": _is_kind(str, "a text"),
+    "domain": _is_kind(str, "a text"),
+    "task": _is_kind(str, "a text"),
+    "discount": _is_number(1e-3, 1.0),
+    "renderer": _is_kind(dict, "a dictionary"),
+    "env_frames": _is_number(0, LARGEST_COUNT, int),
+    "updates": _is_number(0, LARGEST_COUNT, int),
+    "minutes": _is_number(0, LARGEST_COUNT),
+    "metrics": _is_kind(list, "a list"),
+    "final_evaluation": _is_kind(dict, "a dictionary"),
+    "action_dim": _is_number(1, LARGEST_SIZE, int),
+    "labels": (_are_labels, "a dictionary of scales above 0"),
+    "goal_dim": (lambda value: value is None or _is_number(0, LARGEST_SIZE, int)[0](value), "a size"),
+    "config": _is_kind(object, "settings"),
+    "sha256": (lambda value: isinstance(value, str) and len(value) == 64, "a text of 64 digits"),
+    "distilled": _is_kind(dict, "a dictionary"),
+    "goals": _is_kind(dict, "a dictionary"),
 }
 REQUIRED_KEYS = ("domain", "task", "env_frames", "discount", "action_dim", "config", "sha256")
 
 
 def save_checkpoint(folder: Path, model: WorldModel, config: Config, info: dict[str, Any]) -> None:
-    """Writes a checkpoint: float16 weights and a description; each file is replaced whole.
+    """Writes a checkpoint: float16 weights, a description and a manifest, which replace earlier ones as one commit.
 
     Args:
         folder: Folder of the checkpoint; a missing folder is made.
@@ -44,19 +83,28 @@ def save_checkpoint(folder: Path, model: WorldModel, config: Config, info: dict[
     Raises:
         FloatingPointError: A weight is not finite in float16; the folder is not changed.
     """
-    folder.mkdir(parents=True, exist_ok=True)
-    part = folder / f"{WEIGHTS}.part"
     state = {name: value.detach().cpu().half().contiguous() for name, value in model.state_dict().items()}
     if broken := _first_not_finite(state):
         raise FloatingPointError(f"{broken} is not finite in float16: {folder} is left as it was")
     content = save(state)
-    part.write_bytes(content)
-    digest = hashlib.sha256(content).hexdigest()
     sizes = {"action_dim": model.action_dim, "labels": model.labels, "goal_dim": model.goal_dim}
-    facts = info | sizes | {"config": to_dict(config), "sha256": digest}
-    (folder / f"{INFO}.part").write_text(json.dumps(facts, indent=1) + "\n")
-    part.replace(folder / WEIGHTS)
-    (folder / f"{INFO}.part").replace(folder / INFO)
+    facts = info | sizes | {"config": to_dict(config), "sha256": hashlib.sha256(content).hexdigest()}
+    write_files(folder, {WEIGHTS: content, INFO: (json.dumps(facts, indent=1) + "\n").encode()})
+
+
+def seal_checkpoint(path: str | Path) -> None:
+    """Writes a new manifest for a checkpoint whose `info.json` was edited on purpose.
+
+    Args:
+        path: A checkpoint, or a run folder.
+
+    Raises:
+        UserError: The checkpoint cannot be used as it is now.
+    """
+    folder = resolve_checkpoint(path)
+    (folder / MANIFEST).unlink(missing_ok=True)
+    load_model(folder)
+    seal(folder, (INFO, WEIGHTS))
 
 
 def read_info(path: str | Path) -> dict[str, Any]:
@@ -69,16 +117,25 @@ def read_info(path: str | Path) -> dict[str, Any]:
         UserError: There is no checkpoint at the path, or another program wrote it.
     """
     folder = resolve_checkpoint(path)
+    return _parse_info(folder, read_files(folder, (INFO,))[INFO])
+
+
+def _parse_info(folder: Path, content: bytes) -> dict[str, Any]:
+    """The description of a checkpoint, checked."""
     try:
-        info = json.loads((folder / INFO).read_text())
-    except (OSError, ValueError) as error:
-        raise UserError(f"{folder / INFO} cannot be read: {error}") from None
+        info = json.loads(content)
+    except (ValueError, RecursionError) as error:
+        raise UserError(f"{folder / INFO} cannot be read: {str(error)[:120]}") from None
     missing = [key for key in REQUIRED_KEYS if not isinstance(info, dict) or key not in info]
     if missing:
         raise UserError(f"{folder} is not a latentplan checkpoint: {INFO} lacks {', '.join(missing)}")
-    for key, kinds in VALUE_TYPES.items():
-        if not isinstance(info.get(key), kinds):
-            raise UserError(f"{folder / INFO} cannot be used: {key} is {info.get(key)!r}")
+    for key in info:
+        if key not in ALLOWED:
+            known = {name: name for name in ALLOWED}
+            raise UserError(f"{folder / INFO} holds the unknown key {key[:60]!r}{_suggestion(key, known)}")
+    for key, (allows, allowed) in ALLOWED.items():
+        if key in info and not allows(info[key]):
+            raise UserError(f"{folder / INFO} cannot be used: {key} must be {allowed}, got {str(info[key])[:60]!r}")
     return info
 
 
@@ -92,21 +149,21 @@ def load_model(path: str | Path, device: str = "cpu") -> tuple[WorldModel, Confi
     Raises:
         UserError: The checkpoint is missing or damaged, another program wrote it, or the device cannot be used.
     """
-    info, folder = read_info(path), resolve_checkpoint(path)
-    weights = folder / WEIGHTS
-    try:
-        content = weights.read_bytes()
-    except OSError as error:
-        raise UserError(f"{weights} cannot be read: {error.strerror}") from None
+    folder = resolve_checkpoint(path)
+    contents = read_files(folder, (INFO, WEIGHTS))
+    info, weights, content = _parse_info(folder, contents[INFO]), folder / WEIGHTS, contents[WEIGHTS]
     if hashlib.sha256(content).hexdigest() != info["sha256"]:
         raise UserError(f"{weights} is damaged: its checksum differs from the checksum in {INFO}")
     try:
         config = from_dict(info["config"])
     except (AttributeError, TypeError, ValueError) as error:
         raise UserError(f"the settings in {folder / INFO} cannot be used: {error}") from None
+    sizes = info["action_dim"], info.get("labels"), info.get("goal_dim") or 0
     try:
-        model = WorldModel(config.model, info["action_dim"], info.get("labels"), info.get("goal_dim") or 0)
-        state = {name: value.float() for name, value in load_file(weights).items()}
+        state = {name: value.float() for name, value in load(content).items()}
+        with torch.device("meta"):  # compares shapes before a model is allocated whose size the file names
+            WorldModel(config.model, *sizes).load_state_dict(state, assign=True)
+        model = WorldModel(config.model, *sizes)
         model.load_state_dict(state)
     except (RuntimeError, SafetensorError, TypeError, ValueError) as error:
         raise UserError(f"{weights} does not fit its own settings: {str(error).splitlines()[-1].strip()}") from None
@@ -186,7 +243,7 @@ def _first_not_finite(state: dict[str, torch.Tensor]) -> str | None:
 def _find_checkpoint(root: Path) -> Path | None:
     """The root if it is a checkpoint, or else the best or last checkpoint of a run in the root; None without one."""
     for folder in (root, root / "checkpoints" / "best", root / "checkpoints" / "last"):
-        if (folder / INFO).is_file() and (folder / WEIGHTS).is_file():
+        if is_checkpoint(folder, (INFO, WEIGHTS)):
             return folder
     return None
 

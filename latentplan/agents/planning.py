@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 import torch
@@ -58,6 +59,15 @@ class PlanningAgent(ModelAgent):
         """Forgets past and last plan of all environments, or only of environments where mask (batch,) is true."""
         super().reset(mask)
         self.controller.reset(None if self.state is None else self._is_reset)
+
+    def memory(self) -> dict[str, Any]:
+        """As `ModelAgent.memory`, with the last plan."""
+        return super().memory() | {"controller": self.controller.memory()}
+
+    def set_memory(self, memory: dict[str, Any]) -> None:
+        """As `ModelAgent.set_memory`, with the last plan."""
+        super().set_memory(memory)
+        self.controller.set_memory(memory["controller"], self.model.device)
 
     def set_objective(
         self, objective: str | Expression | Term | None = None, constraints: str | Sequence[Constraint] = ()

@@ -45,7 +45,7 @@ COMMANDS = {
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run `latentplan COMMAND ...` and return the exit code: 0, 2 for bad input, 130 when interrupted."""
+    """Run `latentplan COMMAND ...` and return the exit code: 0, 2 for bad input, 128 and the number of a signal."""
     return run_guarded(_main, sys.argv[1:] if argv is None else argv)
 
 

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import contextlib
 import errno
 import os
+import signal
 import sys
-from collections.abc import Callable, Mapping, Sequence
+import threading
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
@@ -21,11 +24,13 @@ from latentplan.config.planner import override_planner
 def run_guarded(command: Callable[[Sequence[str]], int], argv: Sequence[str]) -> int:
     """The exit code of a command: 2 after a mistake of the user, which becomes one line on stderr.
 
-    An interrupt gives 130. A reader that closes the output early, as in `train.py --help | head`, gives 141.
+    Ctrl-C gives 130, SIGTERM 143 and SIGHUP 129. A reader that closes the output early, as in `train.py --help | head`,
+    gives 141.
     """
     try:
         try:
-            return command(argv)
+            with _ending_by_signals():
+                return command(argv)
         finally:
             sys.stdout.flush()
     except (UserError, FloatingPointError) as error:
@@ -130,6 +135,21 @@ def name_folder(kind: str, info: Mapping[str, Any]) -> Path:
         info: Content of the `info.json` of the agent.
     """
     return Path("runs") / f"{kind}-{info['domain']}-{info['task']}-{datetime.now():%Y%m%d-%H%M%S}"
+
+
+@contextlib.contextmanager
+def _ending_by_signals() -> Iterator[None]:
+    """Makes SIGTERM and SIGHUP end a command by an ordinary exit, so that it ends the processes that it has started."""
+    numbers = (signal.SIGTERM, signal.SIGHUP) if threading.current_thread() is threading.main_thread() else ()
+    previous = {number: signal.getsignal(number) for number in numbers}
+    for number, handler in previous.items():
+        if handler == signal.SIG_DFL:
+            signal.signal(number, lambda received, _: sys.exit(128 + received))
+    try:
+        yield
+    finally:
+        for number, handler in previous.items():
+            signal.signal(number, handler)
 
 
 def _refuse(message: str) -> int:

@@ -8,8 +8,9 @@ from typing import Any
 
 from latentplan.commands.flags import overrides
 from latentplan.config import Config, UserError
-from latentplan.config.files import Preset, compose, read_config, read_layer
+from latentplan.config.files import Preset, compose, read_layer
 from latentplan.config.parsing import option
+from latentplan.config.run_folder import read_run_config
 
 SHORT_FLAGS = {
     "env.domain": "--domain",
@@ -60,9 +61,9 @@ def resolve(request: Request) -> Config:
     """
     if request.resume is None:
         return compose(read_layer(request.config) if request.config else {}, request.settings, request.preset)
-    if not (request.resume / "config.yaml").is_file():
-        raise UserError(f"nothing to resume in {request.resume}: give the folder of a run, which holds config.yaml")
-    saved, changes = read_config(request.resume / "config.yaml"), request.settings.get("run", {})
+    if not request.resume.is_dir():
+        raise UserError(f"nothing to resume in {request.resume}: give the folder of a run")
+    saved, changes = read_run_config(request.resume)[0], request.settings.get("run", {})
     if "frames" in changes or "minutes" in changes:  # a new budget replaces the saved one, of either kind
         changes = {"frames": None, "minutes": None, **changes}
     try:

@@ -155,6 +155,21 @@ class ModelPredictiveController:
         if self.plan is not None:  # no further action of a plan for the old objective is executed
             self._is_stale = torch.ones_like(self.plan.is_warm)
 
+    def memory(self) -> dict[str, Any]:
+        """A copy of the plans in use: tensors on the CPU, None and plain values; see `set_memory`."""
+        stale = None if self._is_stale is None else self._is_stale.clone()
+        return {"plan": None if self.plan is None else self.plan.to_dict(), "is_stale": stale}
+
+    def set_memory(self, memory: dict[str, Any], device: torch.device) -> None:
+        """Continues with the plans that another controller had in use, as `memory` returned them.
+
+        Args:
+            memory: The plans.
+            device: Device of the plans' actions.
+        """
+        self.plan = None if memory["plan"] is None else Plan.from_dict(memory["plan"], device)
+        self._is_stale = memory["is_stale"]
+
     @property
     def source(self) -> str:
         """Where the first environment's last action came from, see `Plan.source`; "plan" before the first action."""

@@ -118,6 +118,26 @@ class Plan:
         """Returns these plans, in order, at the environments in mask (batch,) bool, and cold copies elsewhere."""
         return self.take((mask.cumsum(0) - 1).clamp_min(0)).forget(~mask)
 
+    def to_dict(self) -> dict[str, Any]:
+        """A copy as tensors on the CPU, None and plain values, for `from_dict`."""
+
+        def copy(value: Any) -> Any:
+            return value.detach().cpu().clone() if isinstance(value, Tensor) else value
+
+        info = {name: copy(value) for name, value in self.info.items()}
+        return {name: copy(getattr(self, name)) for name in TENSORS} | {"info": info}
+
+    @classmethod
+    def from_dict(cls, values: dict[str, Any], device: torch.device) -> Plan:
+        """The plan that `to_dict` copied; all but `is_warm` and `elapsed` moves to a device."""
+
+        def move(value: Any) -> Any:
+            return value.to(device) if isinstance(value, Tensor) else value
+
+        on_cpu = {name: values[name] for name in ("is_warm", "elapsed")}
+        moved = {name: move(values[name]) for name in TENSORS if name not in on_cpu}
+        return cls(info={name: move(value) for name, value in values["info"].items()}, **moved, **on_cpu)
+
     def updated(self, mask: Tensor, new: Plan) -> Plan:
         """Returns this plan, with the environments in mask (batch,) bool taken from a newer plan."""
 

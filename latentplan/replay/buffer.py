@@ -24,7 +24,6 @@ FRAME_SHAPE = (64, 64, 3)
 FRAME_BYTES = 64 * 64 * 3
 SAMPLING_ROUNDS = 1000
 COLUMNS = ("deter", "actions", "rewards", "continues", "labels")
-FRAMES_PER_READ = 1024
 
 
 @dataclass
@@ -81,6 +80,12 @@ class Batch(NamedTuple):
 class Replay:
     """A ring buffer of rows for each environment, allocated once.
 
+    The rows of a lane are numbered from 0 as they are added; row n lies at place n % `lane_size` of the lane.
+
+    Attributes:
+        first: Number of the oldest row that each lane holds, int64 (lane,).
+        written: Number of rows that were added to each lane, int64 (lane,).
+
     Args:
         capacity: Total number of rows, split evenly over lanes.
         action_dim: Size of the action.
@@ -115,19 +120,20 @@ class Replay:
         self.labels = torch.zeros(total, num_labels, device=device)
         self.episode = np.full((num_lanes, self.lane_size), -1, dtype=np.int64)
         self.is_end = np.zeros((num_lanes, self.lane_size), dtype=bool)  # rows whose action led to a terminal state
+        self.first = np.zeros(num_lanes, dtype=np.int64)
         self.written = np.zeros(num_lanes, dtype=np.int64)
-        self._saved = np.zeros(num_lanes, dtype=np.int64)
 
     def __len__(self) -> int:
         """Number of rows held."""
-        return int(np.minimum(self.written, self.lane_size).sum())
+        return int((self.written - self.first).sum())
 
     def add(self, lane: int, rows: Rows) -> None:
         """Appends consecutive rows to a lane; a full lane overwrites its oldest rows."""
         count = len(rows.frames)
         newest = np.arange(count)[-self.lane_size :]
         positions = (self.written[lane] + newest) % self.lane_size
-        previous = self.episode[lane, (self.written[lane] - 1) % self.lane_size] if self.written[lane] else -1
+        has_rows = self.written[lane] > self.first[lane]
+        previous = self.episode[lane, (self.written[lane] - 1) % self.lane_size] if has_rows else -1
         self.episode[lane, positions] = previous + np.cumsum(rows.is_first)[newest]
         self.is_end[lane, positions] = rows.continues[newest] == 0.0
         index = torch.as_tensor(positions + lane * self.lane_size, device=self.device)
@@ -135,6 +141,7 @@ class Replay:
             store = getattr(self, name)
             store[index] = torch.as_tensor(getattr(rows, name)[newest], device=self.device).to(store.dtype)
         self.written[lane] += count
+        self.first[lane] = max(self.first[lane], self.written[lane] - self.lane_size)
 
     def draw(self, batch_size: int, sequence_length: int, rng: np.random.Generator) -> Tensor:
         """Rows of uniformly drawn sequences, (batch, time + 1).
@@ -185,82 +192,14 @@ class Replay:
         newer = deter.flatten(0, 1).to(self.deter)[last]
         self.deter[index] = torch.where(is_chosen[last, None], newer, self.deter[index])
 
-    def save(self, folder: Path) -> None:
-        """Writes the rows that are new since the last save; `load` restores the last save that was completed.
-
-        Once the ring has overwritten rows, an interrupted save leaves new frames beside older rows. The first save
-        after a change of the capacity writes all rows.
-
-        Args:
-            folder: Folder of the replay; created if it is missing.
-        """
-        folder.mkdir(parents=True, exist_ok=True)
-        for lane in range(self.num_lanes):
-            first = max(self._saved[lane], self.written[lane] - self.lane_size)
-            path = folder / f"frames_{lane}.u8"
-            path.touch()
-            with path.open("r+b") as file:
-                for position in range(first, self.written[lane]):
-                    slot = position % self.lane_size
-                    file.seek(slot * FRAME_BYTES)
-                    file.write(self.frames[lane * self.lane_size + slot].cpu().numpy().tobytes())
-        parts = {name: getattr(self, name).cpu() for name in COLUMNS}
-        state = parts | {"episode": torch.from_numpy(self.episode), "written": torch.from_numpy(self.written)}
-        torch.save(state, folder / "rows.pt.part")
-        (folder / "rows.pt.part").replace(folder / "rows.pt")
-        self._saved = self.written.copy()
-
-    def load(self, folder: Path) -> None:
-        """Restores the rows that `save` wrote, or only the newest rows if the capacity is smaller now.
-
-        Raises:
-            UserError: The folder holds no complete replay, or its lanes, actions, beliefs or labels have other sizes.
-        """
-        if not (folder / "rows.pt").exists():
-            raise UserError(f"no replay found in {folder}")
-        state = read_saved(folder / "rows.pt", keys=(*COLUMNS, "episode", "written"))
-        columns = ("actions", "deter", "labels")
-        saved = (len(state["episode"]), *(state[name].shape[1] for name in columns))
-        own = (self.num_lanes, *(getattr(self, name).shape[1] for name in columns))
-        if saved != own:
-            raise UserError(f"the replay in {folder} has (environments, action, deter, labels) {saved}, this run {own}")
-        saved_size = state["episode"].shape[1]
-        for lane, written in enumerate(state["written"].numpy()):
-            held = min(written, saved_size, self.lane_size)
-            old = np.arange(written - held, written) % saved_size
-            new = old if saved_size == self.lane_size else np.arange(held)
-            self.written[lane] = written if saved_size == self.lane_size else held
-            self._saved[lane] = self.written[lane] if np.array_equal(old, new) else 0
-            self.episode[lane, new] = state["episode"].numpy()[lane, old]
-            self.is_end[lane, new] = state["continues"].numpy()[old + lane * saved_size] == 0.0
-            index = torch.from_numpy(new + lane * self.lane_size).to(self.device)
-            for name in COLUMNS:
-                store = getattr(self, name)
-                store[index] = state[name][old + lane * saved_size].to(self.device)
-            self._load_frames(folder / f"frames_{lane}.u8", min(written, saved_size), old, index)
-
-    def _load_frames(self, path: Path, count: int, slots: np.ndarray, index: Tensor) -> None:
-        """Copies frames of a file into this replay.
-
-        Args:
-            path: File of `count` frames.
-            count: Number of frames that the file must hold.
-            slots: Places of the copied frames in the file, (n,).
-            index: Rows of this replay that receive the frames, (n,).
-        """
-        if count == 0:
-            return
-        if not path.exists() or path.stat().st_size < count * FRAME_BYTES:
-            raise UserError(f"{path} is damaged: it must hold {count:,} frames")
-        stored = np.memmap(path, np.uint8, "r", shape=(count, *FRAME_SHAPE))
-        for start in range(0, len(slots), FRAMES_PER_READ):
-            part = slice(start, start + FRAMES_PER_READ)
-            self.frames[index[part]] = torch.from_numpy(stored[slots[part]]).to(self.device)
+    def held_rows(self, lane: int) -> Tensor:
+        """Rows of this replay that hold a lane's rows, from the oldest to the newest, int64 (n,)."""
+        numbers = torch.arange(int(self.first[lane]), int(self.written[lane]), device=self.device)
+        return numbers % self.lane_size + lane * self.lane_size
 
     def _draw_starts(self, count: int, length: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
         """Lane and first position of `count` sequences of `length` decisions, (count,) each."""
-        held = np.minimum(self.written, self.lane_size)
-        oldest = self.written - held
+        held, oldest = self.written - self.first, self.first
         lanes, starts = np.empty(0, np.int64), np.empty(0, np.int64)
         too_short = f"no episode in replay has sequence_length ({length}) decisions"
         if self.lane_size <= length:
@@ -300,8 +239,11 @@ def read_saved(path: Path, device: torch.device | str = "cpu", keys: Sequence[st
         if keys and not (isinstance(saved, dict) and set(keys) <= set(saved)):
             raise ValueError(f"it does not hold {', '.join(keys)}")
         return saved
-    except (OSError, RuntimeError, EOFError, KeyError, ValueError, UnpicklingError) as error:
-        raise UserError(f"{path} is damaged: {str(error).splitlines()[0]}") from None
+    except UnpicklingError:  # torch's message would advise to run what the file says
+        raise UserError(f"{path} is damaged: it holds more than tensors and plain values") from None
+    except (OSError, RuntimeError, EOFError, KeyError, IndexError, ValueError) as error:
+        reason = (str(error).splitlines() or ["it ends too early"])[0][:120]
+        raise UserError(f"{path} is damaged: {reason}") from None
 
 
 def count_replay_bytes(num_rows: int, action_dim: int, deter_dim: int, num_labels: int = 0) -> int:

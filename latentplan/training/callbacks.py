@@ -1,33 +1,31 @@
-"""The callbacks of a training run: collect, evaluate, write metrics, save, restore and stop."""
+"""The callbacks of a training run that collect, evaluate and write metrics."""
 
 from __future__ import annotations
 
-import copy
 import csv
-import signal
 import sys
-from collections.abc import Callable, Iterable, Mapping, Sequence
+import warnings
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import lightning
 import numpy as np
-import torch
 
-from latentplan.agents.checkpoint import save_checkpoint
 from latentplan.config import CollectionConfig, Config
 from latentplan.models import WorldModel
 from latentplan.replay.buffer import Replay
 from latentplan.training.collection.collector import Collected
-from latentplan.training.collection.process import Worker
-from latentplan.training.learner.optimization import load_optimizer_state
-from latentplan.training.state import INTERRUPTED, RunState, save_state
+from latentplan.training.collection.episodes import Stopped
+from latentplan.training.collection.process import RemoteWorker, Worker, WorkerEnded
+from latentplan.training.learner.batches import updates_per_epoch
+from latentplan.training.state import RunState
 
 if TYPE_CHECKING:
     from latentplan.training.console import Progress
     from latentplan.training.learner.module import Learner
 
-SAVE_MINUTES = 5.0
+WORKER_RESTARTS = 20  # collection processes that may end within a run before the run does
 CLOCKS = ("env_frames", "decisions", "updates", "minutes")
 COLUMNS = (*CLOCKS, "episode_return", "planner_return", "actor_return", "planner_minus_actor")  # the losses follow
 
@@ -37,7 +35,9 @@ class Collect(lightning.Callback):
 
     This callback requests a round from the worker when an epoch starts, and stores the result when the next epoch
     starts. A worker in another process therefore acts while the learner learns, with the averaged weights that the
-    learner had when the epoch started.
+    learner had when the epoch started. Requests without an answer are part of a save, with the weights they act with: a
+    resumed run makes the same requests again, from the same state of the collector. A worker whose process ended is
+    replaced in the same way.
 
     Args:
         config: Settings of the run.
@@ -45,81 +45,186 @@ class Collect(lightning.Callback):
         state: Clocks of the run, which this callback advances.
         worker: Collects and evaluates.
         videos: Folder for the films of evaluations.
+        requests: Requests of the save from which the run resumes; empty in a new run.
+        memory: State of the collector in that save; None in a new run.
 
     Attributes:
-        episode_returns: Returns of the episodes that ended since the last row of metrics.
+        requests: Arguments of the round (`collect`) and clocks of the evaluation (`evaluate`) that the worker was asked
+            for and has not answered, and the `weights` of both; an entry is None if there is no such request.
+        memory: State of the collector after the last round that was stored.
+        is_epoch_over: Whether the epoch that ended last was complete.
         evaluated_weights: Weights that the latest evaluation measured.
     """
 
-    def __init__(self, config: Config, replay: Replay, state: RunState, worker: Worker, videos: Path) -> None:
+    def __init__(
+        self,
+        config: Config,
+        replay: Replay,
+        state: RunState,
+        worker: Worker,
+        videos: Path,
+        requests: dict[str, Any] | None = None,
+        memory: dict[str, Any] | None = None,
+    ) -> None:
         self.config, self.replay, self.state, self.worker, self.videos = config, replay, state, worker, videos
-        self.episode_returns: list[float] = []
+        self.requests: dict[str, Any] = requests or {"collect": None, "evaluate": None, "weights": None}
+        self.memory = memory
+        self.is_epoch_over = False
         self.evaluated_weights: dict[str, np.ndarray] = {}
-        self._pending_evaluation: tuple[dict[str, Any], dict[str, np.ndarray]] | None = None  # its clocks and weights
-        self._is_round_pending = False
+        self._is_continued = requests is not None
 
     def on_train_epoch_start(self, trainer: lightning.Trainer, learner: Learner) -> None:  # type: ignore[override]
         """Store the results that were requested one epoch ago, and request the next round and evaluation."""
-        settings, state = self.config.collection, self.state
-        while (missing := min(settings.prefill_decisions - state.decisions, self._decisions_left())) > 0:
-            self.worker.submit("collect", None, "random", missing, state.rounds)
-            self._is_round_pending = True
-            self.store_results()
-            if state.interrupted:
-                trainer.should_stop = True
-                return
-        weights = copy_weights(learner.averaged)
-        has_new_rows = state.rounds != state.learned_rounds  # false when a run was resumed after a finished epoch
-        if not (self._is_round_pending or has_new_rows):
-            self._request_round(weights)
-        self.store_results()
-        if state.interrupted:
-            return
-        self._request_round(weights)
-        if self._is_round_pending and state.env_frames >= state.next_evaluation:
-            self._request_evaluation(learner.updates, weights)
+        self.is_epoch_over = False
+        try:
+            self._start_epoch(learner)
+        except Stopped:
+            pass
+        if self.state.interrupted:
+            trainer.should_stop = True
+
+    def on_train_batch_end(self, trainer: lightning.Trainer, *_: Any) -> None:  # type: ignore[override]
+        """Count the update."""
+        self.state.epoch_updates += 1
 
     def on_train_epoch_end(self, trainer: lightning.Trainer, learner: Learner) -> None:  # type: ignore[override]
-        """Make the outstanding behaviour update, before other callbacks read the learner."""
+        """Make the outstanding behaviour update, before other callbacks read the learner.
+
+        An epoch that a signal cut off stays open, and the resumed run completes it.
+        """
+        state = self.state
         learner.catch_up()
-        if not self.state.interrupted:
-            self.state.learned_rounds = self.state.rounds
+        is_complete = state.epoch_updates >= updates_per_epoch(self.config.collection)
+        if state.in_epoch and (is_complete or not state.interrupted):
+            state.learned_rounds, state.in_epoch, state.epoch_updates = state.rounds, False, 0
+            self.is_epoch_over = True
+
+    def has_requests(self) -> bool:
+        """Whether the worker was asked for something and has not answered."""
+        return self.requests["collect"] is not None or self.requests["evaluate"] is not None
+
+    def complete(self) -> None:
+        """Wait for all requests, at the end of a run; those of a save are made first.
+
+        Raises:
+            Stopped: The run was interrupted; requests without an answer stay.
+        """
+        self._continue()
+        self.store_results()
+
+    def continue_requests(self) -> None:
+        """Bring the worker to where it was, and make its requests again."""
+        if self.memory is not None:
+            self.worker.submit("restore", self.memory)
+            self.worker.result()
+        if self.requests["collect"] is not None:
+            self._submit_round()
+        if self.requests["evaluate"] is not None:
+            self._submit_evaluation()
 
     def store_results(self) -> None:
         """Wait for the requested round and evaluation, and store their results.
 
-        A signal to the whole process group also ends the worker. An interrupted run therefore drops requests that the
-        worker cannot answer; the resumed run makes the same requests again.
+        Raises:
+            Stopped: The run was interrupted; requests without an answer stay.
+            WorkerEnded: The collection process ended too often.
         """
-        try:
-            self._store_results()
-        except RuntimeError:
-            if not self.state.interrupted:
+        while True:
+            try:
+                return self._store_results()
+            except WorkerEnded as error:
+                self.replace_worker(error)
+            except RuntimeError:  # a signal to the whole process group also ends the environments
+                if self.state.interrupted:
+                    raise Stopped from None
                 raise
-            self._is_round_pending, self._pending_evaluation = False, None
+
+    def _start_epoch(self, learner: Learner) -> None:
+        settings, state = self.config.collection, self.state
+        if self._continue() and state.in_epoch:
+            return
+        while (missing := min(settings.prefill_decisions - state.decisions, self._decisions_left())) > 0:
+            if self.requests["collect"] is None:
+                arguments = {"behaviour": "random", "decisions": missing, "counter": state.rounds, "goal": None}
+                self.requests |= {"collect": arguments, "weights": None}
+                self._submit_round()
+            self.store_results()
+            if state.interrupted:
+                return
+        weights = copy_weights(learner.averaged)
+        has_new_rows = state.rounds != state.learned_rounds  # false when a finished run is extended
+        if self.requests["collect"] is None and not has_new_rows:
+            self.requests |= {"collect": self._next_round(), "weights": weights}
+            self._submit_round()
+        self.store_results()
+        if state.interrupted:
+            return
+        collect = self._next_round()
+        is_due = collect is not None and state.env_frames >= state.next_evaluation
+        clocks = {"env_frames": state.env_frames, "decisions": state.decisions, "updates": learner.updates}
+        evaluate = clocks | {"minutes": round(state.minutes, 3)} if is_due else None
+        self.requests = {"collect": collect, "evaluate": evaluate, "weights": weights}
+        state.in_epoch, state.epoch_updates = True, 0  # from here on, a resumed run makes these requests again
+        if collect is not None:
+            self._submit_round()
+        if evaluate is not None:
+            self._submit_evaluation()
 
     def _store_results(self) -> None:
-        if self._is_round_pending:
-            self._store_round()
-            self._is_round_pending = False
-        if self._pending_evaluation is not None:
+        if self.requests["collect"] is not None:
+            self._store_round(self.worker.result())
+            self.requests["collect"] = None
+        if self.requests["evaluate"] is not None:
             returns = self.worker.result()
-            clocks, self.evaluated_weights = self._pending_evaluation
+            clocks, self.evaluated_weights = self.requests["evaluate"], self.requests["weights"]
             entry = clocks | {mode: float(np.mean(values)) for mode, values in returns.items()}
             self.state.evaluations.append(entry)
             # Set only now, so that a resumed run repeats an evaluation that was interrupted.
             every = self.config.evaluation.every_frames
             self.state.next_evaluation = (entry["env_frames"] // every + 1) * every
-            self._pending_evaluation = None
+            self.requests["evaluate"] = None
 
-    def _request_round(self, weights: dict[str, np.ndarray]) -> None:
-        """Request the next round, if the budget has frames left."""
+    def replace_worker(self, error: WorkerEnded) -> None:
+        """Start a new collection process in place of one that ended, and repeat the requests.
+
+        Raises:
+            WorkerEnded: Too many processes have ended.
+        """
+        state = self.state
+        while isinstance(self.worker, RemoteWorker) and state.worker_restarts < WORKER_RESTARTS:
+            state.worker_restarts += 1
+            warnings.warn(
+                f"{error}: it is started again ({state.worker_restarts} of {WORKER_RESTARTS} times), and repeats its "
+                "round",
+                RuntimeWarning,
+                stacklevel=2,
+            )
+            self.worker.restart()
+            try:
+                return self.continue_requests()
+            except WorkerEnded as again:  # the new process ended while it was being prepared
+                error = again
+        raise error
+
+    def _continue(self) -> bool:
+        """Make the requests of the save, if that was not done yet; returns whether it was done now."""
+        if not self._is_continued:
+            return False
+        self._is_continued = False
+        try:
+            self.continue_requests()
+        except WorkerEnded as error:
+            self.replace_worker(error)
+        return True
+
+    def _next_round(self) -> dict[str, Any] | None:
+        """Arguments of the next round; None if the budget has no frames left."""
         settings, state = self.config.collection, self.state
         decisions = min(settings.round_decisions, self._decisions_left())
-        if decisions > 0:
-            behaviour, goal = choose_behaviour(settings, state.rounds, state.env_frames)
-            self.worker.submit("collect", weights, behaviour, decisions, state.rounds, goal)
-            self._is_round_pending = True
+        if decisions <= 0:
+            return None
+        behaviour, goal = choose_behaviour(settings, state.rounds, state.env_frames)
+        return {"behaviour": behaviour, "decisions": decisions, "counter": state.rounds, "goal": goal}
 
     def _decisions_left(self) -> int:
         frames = self.config.run.frames
@@ -127,21 +232,22 @@ class Collect(lightning.Callback):
             return sys.maxsize
         return -(-(frames - self.state.env_frames) // self.config.env.action_repeat)
 
-    def _request_evaluation(self, updates: int, weights: dict[str, np.ndarray]) -> None:
-        state, settings = self.state, self.config.evaluation
-        clocks = {"env_frames": state.env_frames, "decisions": state.decisions, "updates": updates}
-        self._pending_evaluation = clocks | {"minutes": round(state.minutes, 3)}, weights
-        film = self.videos / f"{state.env_frames:09d}.webm" if settings.video else None
-        self.worker.submit("evaluate", settings.episodes, film)
+    def _submit_round(self) -> None:
+        self.worker.submit("collect", self.requests["weights"], *self.requests["collect"].values())
 
-    def _store_round(self) -> None:
-        collected: Collected = self.worker.result()
+    def _submit_evaluation(self) -> None:
+        settings, frames = self.config.evaluation, self.requests["evaluate"]["env_frames"]
+        film = self.videos / f"{frames:09d}.webm" if settings.video else None
+        self.worker.submit("evaluate", settings.episodes, film, self.requests["weights"])
+
+    def _store_round(self, collected: Collected) -> None:
         for lane, rows in enumerate(collected.rows):
             self.replay.add(lane, rows)
         self.state.env_frames += collected.env_frames
         self.state.decisions += collected.decisions
         self.state.rounds += 1
-        self.episode_returns.extend(collected.episode_returns)
+        self.state.episode_returns.extend(collected.episode_returns)
+        self.memory = collected.memory
 
 
 def copy_weights(model: WorldModel) -> dict[str, np.ndarray]:
@@ -195,12 +301,6 @@ class MetricsFile:
         with self.path.open("a", newline="") as file:
             csv.DictWriter(file, columns).writerow(row)
 
-    def drop_rows(self, is_dropped: Callable[[dict[str, str]], bool]) -> None:
-        """Rewrite the file without some rows, and without a last row that was written only in part."""
-        if self.path.exists():
-            kept = [row for row in self._read_rows() if not is_dropped(row)]
-            self._write(self._read_header() or self.columns, kept)
-
     def _read_header(self) -> list[str]:
         if not self.path.exists():
             return []
@@ -230,7 +330,7 @@ class Record(lightning.Callback):
     Args:
         path: Path of metrics.csv.
         state: Clocks and evaluations of the run.
-        collect: Source of the returns of collected episodes.
+        collect: Says whether an epoch was complete.
         progress: Display of the run.
     """
 
@@ -238,27 +338,31 @@ class Record(lightning.Callback):
         self.file, self.state, self.collect, self.progress = MetricsFile(path, COLUMNS), state, collect, progress
         self._num_written_evaluations = len(state.evaluations)
 
-    def on_fit_start(self, trainer: lightning.Trainer, learner: Learner) -> None:  # type: ignore[override]
-        """Drop the rows that a killed run wrote after its last save, because the resumed run writes them again."""
-        clocks = {"env_frames": self.state.env_frames, "updates": learner.updates}
-        self.file.drop_rows(lambda row: any(int(row[name]) > now for name, now in clocks.items()))
+    def on_train_epoch_start(self, trainer: lightning.Trainer, learner: Learner) -> None:  # type: ignore[override]
+        """Append the row of an evaluation that has just finished."""
+        self.write_evaluations(trainer)
 
     def on_train_batch_end(self, trainer: lightning.Trainer, learner: Learner, *_: Any) -> None:  # type: ignore[override]
         """Update the progress display."""
         self.progress.update(self.state, learner.updates)
 
     def on_train_epoch_end(self, trainer: lightning.Trainer, learner: Learner) -> None:  # type: ignore[override]
-        """Append one row for the epoch, after the rows of finished evaluations."""
-        self.write_evaluations(trainer)
+        """Append one row for the epoch, unless a signal cut it off."""
+        if not self.collect.is_epoch_over:
+            return
         state = self.state
         clocks = {"env_frames": state.env_frames, "decisions": state.decisions, "updates": learner.updates}
         row: dict[str, float] = clocks | {"minutes": round(state.minutes, 3)}
-        if self.collect.episode_returns:
-            row["episode_return"] = float(np.mean(self.collect.episode_returns))
+        if state.episode_returns:
+            row["episode_return"] = float(np.mean(state.episode_returns))
             self.progress.episode_return = row["episode_return"]
-            self.collect.episode_returns.clear()
+            state.episode_returns.clear()
         for name in sorted(learner.metrics, key=lambda name: name.endswith("_grad_norm")):  # losses, then the norms
             row[name] = float(learner.metrics[name])
+        if skipped := sum(int(half.total) for half in learner.skips):
+            row["skipped_steps"] = skipped
+        if state.worker_restarts:
+            row["worker_restarts"] = state.worker_restarts
         self._append(trainer, row)
 
     def write_evaluations(self, trainer: lightning.Trainer) -> None:
@@ -274,135 +378,3 @@ class Record(lightning.Callback):
         if trainer.logger is not None:
             trainer.logger.log_metrics(row, step=int(row["env_frames"]))
         self.file.append(row)
-
-
-class Save(lightning.Callback):
-    """Saves the last agent, the best agent, and the state from which a run resumes.
-
-    Args:
-        folder: Folder of the run.
-        config: Settings of the run.
-        collect: Source of the evaluated weights and of the replay.
-        state: Clocks and evaluations of the run.
-        facts: Facts of the run that are saved with every agent.
-        optimizers: States that the optimizers were loaded with; saved again if the run ends before its first update.
-    """
-
-    def __init__(
-        self,
-        folder: Path,
-        config: Config,
-        collect: Collect,
-        state: RunState,
-        facts: dict[str, Any],
-        optimizers: list[Any],
-    ) -> None:
-        self.folder, self.config, self.collect, self.state, self.facts = folder, config, collect, state, facts
-        self._loaded_optimizers = optimizers
-        self._num_seen_evaluations = len(state.evaluations)
-        self._saved_minutes = state.minutes
-
-    def on_train_epoch_end(self, trainer: lightning.Trainer, learner: Learner) -> None:  # type: ignore[override]
-        """Save after every evaluation, and `SAVE_MINUTES` after the last save."""
-        if self.keep_best(learner) or self.state.minutes >= self._saved_minutes + SAVE_MINUTES:
-            self.save(trainer, learner)
-
-    def keep_best(self, learner: Learner) -> bool:
-        """Save the latest evaluated agent if its planner is the best so far.
-
-        Returns:
-            Whether an evaluation finished since the last call.
-        """
-        if len(self.state.evaluations) == self._num_seen_evaluations:
-            return False
-        self._num_seen_evaluations = len(self.state.evaluations)
-        if (latest := self.state.evaluations[-1])["planner"] > self.state.best_return:
-            self.state.best_return = latest["planner"]
-            evaluated = copy.deepcopy(learner.averaged)
-            weights = self.collect.evaluated_weights
-            evaluated.load_state_dict({name: torch.from_numpy(value) for name, value in weights.items()})
-            self.save_agent("best", evaluated, {name: latest[name] for name in ("env_frames", "updates", "minutes")})
-        return True
-
-    def save(self, trainer: lightning.Trainer, learner: Learner) -> None:
-        """Save the last agent and the state of the run."""
-        self.save_agent("last", learner.averaged, self.clocks(learner))
-        self.save_run(trainer, learner)
-        self._saved_minutes = self.state.minutes
-
-    def save_run(self, trainer: lightning.Trainer, learner: Learner) -> None:
-        """Save the state from which the run resumes."""
-        optimizers = [optimizer.state_dict() for optimizer in trainer.optimizers] or self._loaded_optimizers
-        saved = {"weights": learner.state_dict(), "updates": learner.updates}
-        save_state(self.folder / "resume", self.state, saved, optimizers, self.collect.replay)
-
-    def save_agent(self, name: str, model: WorldModel, info: dict[str, Any]) -> None:
-        """Save an agent in `checkpoints/<name>`, with the facts in `info` and the facts of the run."""
-        facts = self.facts | info | {"metrics": self.state.evaluations}
-        save_checkpoint(self.folder / "checkpoints" / name, model, self.config, facts)
-
-    def clocks(self, learner: Learner) -> dict[str, Any]:
-        """The frames, updates and minutes of the present agent."""
-        return {"env_frames": self.state.env_frames, "updates": learner.updates, "minutes": self.state.minutes}
-
-
-class Restore(lightning.Callback):
-    """Loads saved states into the optimizers of a resumed run.
-
-    Args:
-        optimizers: One saved state per optimizer; empty for a new run.
-    """
-
-    def __init__(self, optimizers: list[Any]) -> None:
-        self.optimizers = optimizers
-
-    def on_fit_start(self, trainer: lightning.Trainer, learner: lightning.LightningModule) -> None:
-        """Load the saved states, after Lightning has made the optimizers."""
-        for optimizer, saved in zip(trainer.optimizers, self.optimizers, strict=True) if self.optimizers else ():
-            load_optimizer_state(optimizer, saved)
-
-
-class Stop(lightning.Callback):
-    """Ends the run at its budget, or when the user interrupts; a second Ctrl-C ends the process at once.
-
-    Args:
-        config: Settings of the run, with its budget.
-        state: Clocks of the run, and whether the user interrupted it.
-    """
-
-    def __init__(self, config: Config, state: RunState) -> None:
-        self.run, self.state = config.run, state
-        self._previous: dict[int, Any] = {}
-
-    def on_train_start(self, trainer: lightning.Trainer, learner: lightning.LightningModule) -> None:
-        """Install the signal handlers."""
-        for number in (signal.SIGINT, signal.SIGTERM):
-            self._previous[number] = signal.signal(number, self._interrupt)
-
-    def on_train_batch_end(self, trainer: lightning.Trainer, *_: Any) -> None:  # type: ignore[override]
-        """Stop between two updates when the minutes are spent or the user interrupted."""
-        if self.state.interrupted or self._is_time_spent():
-            trainer.should_stop = True
-
-    def on_train_epoch_end(self, trainer: lightning.Trainer, learner: lightning.LightningModule) -> None:
-        """Stop after the epoch that learned from the last round."""
-        if self.is_spent():
-            trainer.should_stop = True
-
-    def on_train_end(self, trainer: lightning.Trainer, learner: lightning.LightningModule) -> None:
-        """Restore the previous signal handlers."""
-        for number, handler in self._previous.items():
-            signal.signal(number, handler)
-
-    def is_spent(self) -> bool:
-        """Whether the budget of frames or minutes is used up."""
-        frames = self.run.frames
-        return self._is_time_spent() or (frames is not None and self.state.env_frames >= frames)
-
-    def _is_time_spent(self) -> bool:
-        return self.run.minutes is not None and self.state.minutes >= self.run.minutes
-
-    def _interrupt(self, number: int, frame: Any) -> None:
-        if self.state.interrupted:
-            raise SystemExit(INTERRUPTED)  # Lightning would turn a KeyboardInterrupt into exit code 1
-        self.state.interrupted = True

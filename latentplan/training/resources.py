@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import os
-from pathlib import Path
 
 import torch
 
 from latentplan.config import Config, RunConfig, UserError
-from latentplan.replay.buffer import FRAME_BYTES
 
 UNKNOWN_LENGTH_CAPACITY = 200_000
 COLLECTOR_THREADS = 4  # an upper limit, because runs often share a machine
@@ -47,17 +45,17 @@ def set_up_torch(threads: int, device: torch.device) -> None:
         torch.set_float32_matmul_precision("high")  # TF32, which has three more bits than bfloat16
 
 
-def choose_replay_capacity(config: Config, saved: Path) -> int:
+def choose_replay_capacity(config: Config, saved: tuple[int, int]) -> int:
     """Rows of the replay: `replay.capacity`, or else enough for everything that the run collects.
 
     Args:
         config: Settings of the run.
-        saved: Folder of the saved replay, which may be missing. Without `replay.capacity` all saved rows fit.
+        saved: Environments of the saved replay, and the largest number of rows that one of them holds. Without
+            `replay.capacity` all saved rows fit.
     """
     if config.replay.capacity is not None:
         return config.replay.capacity
-    lanes = [path.stat().st_size // FRAME_BYTES for path in saved.glob("frames_*.u8")]
-    num_saved = len(lanes) * max(lanes, default=0)
+    num_saved = saved[0] * saved[1]
     if config.run.frames is None:
         return max(UNKNOWN_LENGTH_CAPACITY, num_saved)
     # Up to two rounds exceed the budget, and every episode ends with one frame without an action.

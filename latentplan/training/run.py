@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import errno
 import json
 import logging
 import warnings
@@ -14,26 +16,47 @@ import lightning
 import numpy as np
 import torch
 from lightning.pytorch.loggers import TensorBoardLogger
+from lightning.pytorch.utilities.exceptions import SIGTERMException
 
 from latentplan.agents.checkpoint import load_model
 from latentplan.config import USER_DOMAIN, Config, Device, UserError, derive_seed
+from latentplan.config.commit import Save
 from latentplan.config.files import dump_config, read_config
+from latentplan.config.run_folder import RUN_FILE, SAVES_FOLDER, read_run_config, run_saves
 from latentplan.envs import default_task
 from latentplan.models import WorldModel
 from latentplan.models.fast import accelerate
 from latentplan.replay.buffer import Replay
-from latentplan.training.callbacks import Collect, Record, Restore, Save, Stop, copy_weights
+from latentplan.replay.disk import ReplayFiles, count_saved
+from latentplan.training.callbacks import Collect, Record, copy_weights
 from latentplan.training.collection.collector import Description, EnvFactory
-from latentplan.training.collection.process import Worker, make_worker
+from latentplan.training.collection.episodes import Stopped, to_arrays
+from latentplan.training.collection.process import Worker, WorkerEnded, make_worker
 from latentplan.training.console import Progress
 from latentplan.training.learner.batches import ReplayBatches, ReplayData
 from latentplan.training.learner.curriculum import Curriculum
 from latentplan.training.learner.graphed import make_learner
+from latentplan.training.learner.skips import NotFiniteError
 from latentplan.training.resources import choose_device, choose_replay_capacity, choose_threads, set_up_torch
-from latentplan.training.state import INTERRUPTED, RunState, load_state, lock_folder, refuse_used, restore_learner
+from latentplan.training.saving import Guard, Restore, Stop
+from latentplan.training.saving import Save as SaveRun
+from latentplan.training.signals import Signals, exit_code
+from latentplan.training.state import (
+    METRICS_FILE,
+    RunState,
+    SavedRun,
+    lock_folder,
+    read_state,
+    refuse_used,
+    restore_learner,
+    restore_metrics,
+    warn_of_loss,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
+
+DISK_ERRORS = (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EIO)  # of which some do not name a file
 
 
 @dataclass(frozen=True)
@@ -42,7 +65,7 @@ class Result:
 
     Attributes:
         run_dir: Folder of the run.
-        exit_code: 0, or 130 when the user interrupted the run.
+        exit_code: 0; when a signal interrupted the run, 128 and its number: 130 for Ctrl-C, 143 for SIGTERM.
         summary: Mean return of the final evaluation per mode; empty when interrupted.
     """
 
@@ -84,7 +107,7 @@ def train(config: Config, make_env: EnvFactory | None = None) -> Result:
     if config.run.run_dir == "":
         raise UserError("--run-dir must name a folder, got an empty text")
     folder = Path(str(config.run.run_dir))
-    refuse_used(folder, "config.yaml", "--run-dir")
+    refuse_used(folder, "run", "--run-dir")
     return _start(config, folder, make_env, resume=False)
 
 
@@ -96,9 +119,10 @@ def resume(
     device: Device | None = None,
     make_env: EnvFactory | None = None,
 ) -> Result:
-    """Continues a run from its last save: weights, optimizers, replay, clocks and random streams.
+    """Continues a run from its last save: weights, optimizers, replay, clocks, random streams and running episodes.
 
-    A new budget or device is written to the run's settings, so later resumptions keep it.
+    If the last save is damaged, the run continues from the save before, and a warning names the damage and the loss. A
+    new budget or device is written to the run's settings, so later resumptions keep it.
 
     Args:
         run_dir: Folder of the run.
@@ -114,11 +138,11 @@ def resume(
         UserError: The folder holds no run that can be resumed.
     """
     folder = Path(run_dir)
-    if not (folder / "config.yaml").exists():
-        raise UserError(f"nothing to resume in {folder}: config.yaml is missing")
-    config = read_config(folder / "config.yaml")
+    config, warning = read_run_config(folder)
+    if warning:
+        warnings.warn(warning, RuntimeWarning, stacklevel=2)
     if config.env.task is None:  # `train` always writes the task
-        raise UserError(f"{folder / 'config.yaml'} is damaged: it does not say what the task is")
+        raise UserError(f"{folder / RUN_FILE} is damaged: it does not say what the task is")
     if config.env.domain == USER_DOMAIN and make_env is None:
         raise UserError("this run learns in your own environment: resume it from Python, with make_env")
     run = config.run
@@ -130,93 +154,140 @@ def resume(
 
 
 def _start(config: Config, folder: Path, make_env: EnvFactory | None, *, resume: bool) -> Result:
-    with lock_folder(folder):
-        run = _Run(config, folder, make_env, resume=resume)
-        dump_config(config, folder / "config.yaml")
-        return run.execute()
+    """Runs until the end, an interruption or an error; goes back to the last save after too many skipped steps."""
+    failed_at = -1
+    with lock_folder(folder), Signals() as signals:
+        while True:
+            try:
+                return _Run(config, folder, make_env, signals, resume=resume).execute()
+            except NotFiniteError as error:
+                if error.update <= failed_at:
+                    raise  # the same again: another try would end here too
+                failed_at, resume = error.update, True
+                warnings.warn(f"{error}: the run goes back to its last save", RuntimeWarning, stacklevel=2)
+            except Stopped:  # while the run was being set up, from which nothing is lost
+                return Result(folder, exit_code(signals.received), {})
+            except WorkerEnded as error:
+                raise UserError(f"{error}; the run has stopped, and --resume {folder} continues it") from error
+            except OSError as error:
+                is_own = str(error.filename or "").startswith(str(folder))
+                if not is_own and error.errno not in DISK_ERRORS:
+                    raise
+                raise UserError(
+                    f"the run in {folder} has stopped: {error.strerror} ({error.filename or 'while writing'}); "
+                    f"when this is mended, --resume {folder} continues from its last save"
+                ) from error
 
 
 class _Run:
     """A run with its worker, replay, learner, curriculum and display."""
 
-    def __init__(self, config: Config, folder: Path, make_env: EnvFactory | None, *, resume: bool) -> None:
-        self.config, self.folder = config, folder
+    def __init__(
+        self, config: Config, folder: Path, make_env: EnvFactory | None, signals: Signals, *, resume: bool
+    ) -> None:
+        self.config, self.folder, self.signals = config, folder, signals
+        self.saves = run_saves(folder)
+        self.saves.remove_leftovers()
+        save = self._find_save() if resume else None
         self.device = choose_device(config.run)
         self.console = Progress(config.run)
         set_up_torch(config.run.threads or choose_threads(config.collection.overlap), self.device)
-        self.worker: Worker = make_worker(config, make_env, self.device)
+        self.worker: Worker = make_worker(config, make_env, self.device, lambda: signals.received > 0)
         try:
             self.worker.submit("describe")
             self.description: Description = self.worker.result()
-            self._build(resume=resume)
+            self._build(save)
         except BaseException:
             self.worker.close()
             raise
 
-    def _build(self, *, resume: bool) -> None:
+    def _find_save(self) -> Save:
+        """The newest save that is whole; warns of newer ones that are not."""
+        save, problems = self.saves.newest()
+        warn_of_loss(save, problems)
+        return save
+
+    def _build(self, save: Save | None) -> None:
         config = self.config
+        saved: SavedRun | None = None if save is None else read_state(save)
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(derive_seed(config.run.seed, "weights"))
             model = WorldModel(config.model, self.description.action_dim, self.description.labels).to(self.device)
         accelerate(model)
         replay_device = self.device if config.replay.on_device else torch.device("cpu")
-        saved_replay = self.folder / "resume" / "replay"
         self.replay = Replay(
-            choose_replay_capacity(config, saved_replay),
+            choose_replay_capacity(config, (0, 0) if save is None else count_saved(save)),
             model.action_dim,
             config.model.deter_dim,
             config.env.num_envs,
             replay_device,
             len(model.labels),
         )
-        self.state, saved = RunState(), None
-        self._saved_optimizers: list[Any] = []
-        if resume:
-            self.state, saved, self._saved_optimizers = load_state(self.folder / "resume", self.device)
-            self.replay.load(saved_replay)
+        self.files = ReplayFiles(self.folder / SAVES_FOLDER, self.replay)
+        self.saved, self.state = saved, RunState() if saved is None else saved.state
+        self.signals.receive = self._interrupt
+        self.state.interrupted = self.signals.received
         self.curriculum = Curriculum(config, model.labels, self.state)
         self.learner = make_learner(model, config, self.description.discount, self.replay, self.curriculum)
-        if saved is not None:
-            restore_learner(self.learner, saved, self.folder)
+        if save is not None and saved is not None:
+            self.files.read(save)
+            restore_learner(self.learner, saved.learner, self.folder)
+            restore_metrics(save, self.folder)
+
+    def _interrupt(self, number: int) -> None:
+        self.state.interrupted = number
 
     def execute(self) -> Result:
-        """Learn until the budget is spent or the user interrupts, then evaluate."""
+        """Learn until the budget is spent or a signal arrives, then evaluate."""
         try:
             return self._execute()
         finally:
             self.worker.close()
 
     def _execute(self) -> Result:
-        config = self.config
+        config, saved, state = self.config, self.saved, self.state
         self._print_settings()
         videos = self.folder / "videos"
         videos.mkdir(exist_ok=True)
-        collect = Collect(config, self.replay, self.state, self.worker, videos)
-        save = Save(self.folder, config, collect, self.state, self._agent_facts(), self._saved_optimizers)
-        stop = Stop(config, self.state)
-        record = Record(self.folder / "metrics.csv", self.state, collect, self.console)
-        trainer = self._trainer([collect, self.curriculum, record, save, stop])
-        batches = ReplayBatches(self.replay, config, self.curriculum, self.learner)
-        if not self._saved_optimizers:
-            save.save_run(trainer, self.learner)  # makes a run that ends before its first save resumable
-        if not stop.is_spent():
-            self.console.start(self.learner.updates)
-            try:
-                trainer.fit(self.learner, datamodule=ReplayData(batches))
-            finally:
-                self.console.stop()
-            if not self.state.interrupted:
-                collect.store_results()
-                record.write_evaluations(trainer)
-                save.keep_best(self.learner)
+        resumed = () if saved is None else (to_arrays(saved.requests), to_arrays(saved.memory))
+        self.collect = collect = Collect(config, self.replay, state, self.worker, videos, *resumed)
+        optimizers = [] if saved is None else saved.optimizers
+        facts = self._agent_facts()
+        save = SaveRun(self.folder, config, collect, state, self.saves, self.files, facts, optimizers)
+        stop = Stop(config, state, self.signals)
+        record = Record(self.folder / METRICS_FILE, state, collect, self.console)
+        callbacks = [collect, self.curriculum, record, Guard(self.folder), save, stop]
+        trainer = self._trainer([Restore(optimizers), *callbacks])
+        copy = self.saves.find(RUN_FILE)
+        if copy is None or read_config(copy) != config:
+            save.save_run(trainer, self.learner)  # so that a run that ends before its next save can be resumed
+            dump_config(config, self.folder / RUN_FILE)
+        if is_unfinished := not stop.is_spent():
+            self._fit(trainer)
+        if is_unfinished or collect.has_requests():
+            with contextlib.suppress(Stopped):
+                if not state.interrupted:
+                    collect.complete()
+            record.write_evaluations(trainer)
+            save.keep_best(self.learner)
             save.save(trainer, self.learner)
-        if self.state.interrupted:
-            command = f"python scripts/train.py --resume {self.folder}"
-            if config.env.domain == USER_DOMAIN:
-                command = f'latentplan.training.resume("{self.folder}", make_env=...)'
-            self.console.console.print(f"stopped; to resume: {command}", soft_wrap=True)
-            return Result(self.folder, INTERRUPTED, {})
-        return Result(self.folder, 0, self._finish(trainer, save, videos / "final.webm"))
+        with contextlib.suppress(Stopped):
+            if not state.interrupted:
+                return Result(self.folder, 0, self._finish(trainer, save, videos / "final.webm"))
+        command = f"python scripts/train.py --resume {self.folder}"
+        if config.env.domain == USER_DOMAIN:
+            command = f'latentplan.training.resume("{self.folder}", make_env=...)'
+        self.console.console.print(f"stopped; to resume: {command}", soft_wrap=True)
+        return Result(self.folder, exit_code(state.interrupted), {})
+
+    def _fit(self, trainer: lightning.Trainer) -> None:
+        batches = ReplayBatches(self.replay, self.config, self.curriculum, self.learner)
+        self.console.start(self.learner.updates)
+        try:
+            with contextlib.suppress(SIGTERMException):  # of a signal before `Stop` has begun; `signals` has it too
+                trainer.fit(self.learner, datamodule=ReplayData(batches))
+        finally:
+            self.console.stop()
 
     def _trainer(self, callbacks: list[lightning.Callback]) -> lightning.Trainer:
         logging.getLogger("lightning.pytorch").setLevel(logging.ERROR)
@@ -225,7 +296,7 @@ class _Run:
             accelerator="gpu" if self.device.type == "cuda" else "cpu",
             devices=1,
             max_epochs=-1,
-            callbacks=[Restore(self._saved_optimizers), *callbacks],
+            callbacks=callbacks,
             logger=TensorBoardLogger(self.folder, name="tensorboard", version=""),
             enable_checkpointing=False,
             enable_progress_bar=False,
@@ -233,7 +304,7 @@ class _Run:
             log_every_n_steps=10**9,
         )
 
-    def _finish(self, trainer: lightning.Trainer, save: Save, film: Path) -> dict[str, float]:
+    def _finish(self, trainer: lightning.Trainer, save: SaveRun, film: Path) -> dict[str, float]:
         clocks = save.clocks(self.learner)
         episodes = self.config.evaluation.final_episodes
         self.console.console.print(f"final evaluation: {episodes} episodes each of planner and actor")
@@ -258,8 +329,16 @@ class _Run:
         return summary
 
     def _evaluate(self, model: WorldModel, film: Path | None = None, actor: bool = True) -> dict[str, list[float]]:
-        self.worker.submit("evaluate", self.config.evaluation.final_episodes, film, copy_weights(model), actor)
-        return self.worker.result()  # type: ignore[no-any-return]
+        returns: dict[str, list[float]] | None = None
+        while returns is None:
+            self.worker.submit("evaluate", self.config.evaluation.final_episodes, film, copy_weights(model), actor)
+            try:
+                returns = self.worker.result()
+            except WorkerEnded as error:
+                self.collect.replace_worker(error)
+        if self.state.interrupted:
+            raise Stopped
+        return returns
 
     def _evaluate_best(self) -> float:
         """Mean return of the saved best agent's planner on the final starts; -inf if no best agent can be read.

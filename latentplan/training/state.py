@@ -6,7 +6,8 @@ import contextlib
 import fcntl
 import os
 import time
-from collections.abc import Iterator
+import warnings
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -15,19 +16,18 @@ import torch
 
 from latentplan.agents.checkpoint import INFO
 from latentplan.config import UserError, make_folder
-from latentplan.replay.buffer import Replay, read_saved
+from latentplan.config.commit import DamageError, Extent, Save, Saves, write_synced
+from latentplan.config.run_folder import RUN_FILE, SAVES_FOLDER
+from latentplan.replay.buffer import read_saved
 
 if TYPE_CHECKING:
     from latentplan.training.learner.module import Learner
 
 
 LOCK_FILE = ".lock"
-RUN_FILE = "config.yaml"
-GOALS_FILE = "goals.pt"
-DISTILLATION_FILE = Path("resume") / "distill.pt"
-CONTENTS = {RUN_FILE: "a run", INFO: "an agent", GOALS_FILE: "an agent", str(DISTILLATION_FILE): "an agent"}
+CONTENTS = {RUN_FILE: "a run", INFO: "an agent", f"{SAVES_FOLDER}/save-*[0-9]": "an agent"}
 STATE_FILE = "state.pt"
-INTERRUPTED = 130  # exit code of a run that the user ended
+METRICS_FILE = "metrics.csv"
 
 
 @dataclass
@@ -39,12 +39,16 @@ class RunState:
         decisions: Decisions so far.
         rounds: Collection rounds so far.
         learned_rounds: Value of `rounds` when the last epoch ended; -1 before the first epoch.
+        in_epoch: Whether an epoch has begun and not ended.
+        epoch_updates: Updates so far in this epoch.
         earlier_minutes: Wall-clock minutes that the run had taken by `started`.
         next_evaluation: Value of `env_frames` at which the next evaluation is due.
         best_return: Best mean return of the planner in an evaluation so far.
         evaluations: One entry per evaluation: env_frames, decisions, updates, minutes, planner, actor.
+        episode_returns: Returns of collected episodes that no row of metrics has counted yet.
         curriculum_over: Whether the value head was reset after the curriculum's task.
-        interrupted: Whether the user asked to stop.
+        worker_restarts: Collection processes that ended and were replaced.
+        interrupted: Number of the signal that asked to stop; 0 without one.
         started: Time from which `minutes` counts on, in seconds of the monotonic clock of this process.
     """
 
@@ -52,12 +56,16 @@ class RunState:
     decisions: int = 0
     rounds: int = 0
     learned_rounds: int = -1
+    in_epoch: bool = False
+    epoch_updates: int = 0
     earlier_minutes: float = 0.0
     next_evaluation: int = 0
     best_return: float = float("-inf")
     evaluations: list[dict[str, Any]] = field(default_factory=list)
+    episode_returns: list[float] = field(default_factory=list)
     curriculum_over: bool = False
-    interrupted: bool = False
+    worker_restarts: int = 0
+    interrupted: int = 0
     started: float = field(default_factory=time.monotonic)
 
     @property
@@ -75,80 +83,135 @@ class RunState:
         return {name: value for name, value in values.items() if name not in ("interrupted", "started")}
 
 
-def save_state(folder: Path, state: RunState, learner: dict[str, Any], optimizers: list[Any], replay: Replay) -> None:
-    """Saves a run so that `load_state` can resume it; replaces the state file in one step, after the replay.
+@dataclass(frozen=True)
+class SavedRun:
+    """What a save holds beside the replay, the settings and the metrics.
 
-    Args:
-        folder: Folder of the saved state.
+    Attributes:
         state: Clocks and evaluations.
-        learner: The learner's `weights` and number of `updates`.
-        optimizers: One state per optimizer.
-        replay: The replay; its new rows are appended to the saved ones.
+        learner: The learner's `weights`, number of `updates`, latest `metrics` and counts of skipped steps, `skips`.
+        optimizers: One state per optimizer; empty before the first update.
+        requests: What the worker was asked for and has not answered; see `Collect`.
+        memory: State of the collector after the last round that was stored; None before the first.
     """
-    replay.save(folder / "replay")
-    save_atomically({"run": state.to_dict(), "learner": learner, "optimizers": optimizers}, folder / STATE_FILE)
+
+    state: RunState
+    learner: dict[str, Any]
+    optimizers: list[Any]
+    requests: dict[str, Any]
+    memory: dict[str, Any] | None
 
 
-def save_atomically(saved: dict[str, Any], path: Path) -> None:
-    """Writes a file with `torch.save`; an earlier file stays whole until the new one replaces it in one step."""
-    make_folder(path.parent)
-    part = path.with_name(f"{path.name}.part")
-    torch.save(saved, part)
-    part.replace(path)
+def write_state(saved: SavedRun, part: Path) -> None:
+    """Writes a run's state into the folder of a save."""
+    values = {name: getattr(saved, name) for name in ("learner", "optimizers", "requests", "memory")}
+    torch.save({"run": saved.state.to_dict(), **values}, part / STATE_FILE)
 
 
-def load_state(folder: Path, device: torch.device) -> tuple[RunState, dict[str, Any], list[Any]]:
-    """Loads the clocks, the learner's state and the optimizers' states that `save_state` wrote.
+def read_state(save: Save) -> SavedRun:
+    """The state that `write_state` wrote, with its tensors on the CPU.
 
     Raises:
-        UserError: The folder holds no saved run, or a damaged one.
+        DamageError: The state has other entries, or values outside of their ranges.
     """
-    if not (folder / STATE_FILE).exists():
-        raise UserError(f"nothing to resume in {folder.parent}: {folder / STATE_FILE} is missing")
-    saved = read_saved(folder / STATE_FILE, device, ("run", "learner", "optimizers"))
+    path = save.folder / STATE_FILE
+    saved = read_saved(path, keys=("run", "learner", "optimizers", "requests", "memory"))
     try:
-        return RunState(**saved["run"]), saved["learner"], saved["optimizers"]
-    except TypeError as error:
-        raise UserError(f"{folder / STATE_FILE} is damaged: {error}") from None
+        state = RunState(**saved.pop("run"))
+        counts = ("env_frames", "decisions", "rounds", "epoch_updates", "next_evaluation", "worker_restarts")
+        for name in counts:
+            value = getattr(state, name)
+            if not isinstance(value, int) or value < 0:
+                raise ValueError(f"{name} is {value!r}")
+        return SavedRun(state, **saved)
+    except (TypeError, ValueError) as error:
+        raise DamageError(f"{path} is damaged: {str(error)[:160]}") from None
+
+
+def save_values(saves: Saves, values: dict[str, Any], note: Mapping[str, Any]) -> None:
+    """Saves tensors and plain values as one commit; `load_values` restores them."""
+
+    def write(part: Path) -> dict[str, Extent]:
+        torch.save(values, part / STATE_FILE)
+        return {}
+
+    saves.commit(write, note)
+
+
+def load_values(saves: Saves, keys: Sequence[str]) -> dict[str, Any]:
+    """The values of the newest save that is whole; a warning names newer ones that are not.
+
+    Args:
+        saves: The saves.
+        keys: Names that the values must have.
+
+    Raises:
+        UserError: There is no save, or none is whole.
+    """
+    save, problems = saves.newest()
+    warn_of_loss(save, problems)
+    values: dict[str, Any] = read_saved(save.folder / STATE_FILE, keys=keys)
+    return values
+
+
+def warn_of_loss(save: Save, problems: Sequence[str]) -> None:
+    """Warn of saves that are damaged, and say what the save that takes their place holds."""
+    clocks = ", ".join(f"{name.replace('_', ' ')} {value}" for name, value in save.note.items())
+    for problem in problems:
+        warnings.warn(
+            f"{problem}: the save before takes its place ({clocks}); what was done after it is lost, and is done again",
+            RuntimeWarning,
+            stacklevel=3,
+        )
 
 
 def restore_learner(learner: Learner, saved: dict[str, Any], folder: Path) -> None:
     """Loads a saved state into a learner.
 
-    A run saved before averaged weights existed starts its average from the saved weights.
-
     Args:
         learner: The learner to load into.
-        saved: The saved `weights` and number of `updates`.
+        saved: `SavedRun.learner`.
         folder: Folder of the run, for the error message.
 
     Raises:
         UserError: The saved weights have other names or shapes than this model.
     """
-    weights = saved["weights"]
-    averaged = {f"averaged.{name[6:]}": value for name, value in weights.items() if name.startswith("model.")}
     try:
-        learner.load_state_dict({"averaged_updates": learner.averaged_updates, **averaged, **weights})
+        learner.load_state_dict(saved["weights"])
     except RuntimeError as error:
         reason = str(error).splitlines()[-1].strip()
         raise UserError(f"the saved weights in {folder} do not fit the settings in its config.yaml: {reason}") from None
     learner.updates = saved["updates"]
+    learner.metrics = {name: torch.tensor(value) for name, value in saved["metrics"].items()}
+    for half, counts in zip(learner.skips, saved["skips"], strict=True):
+        half.load(counts)
 
 
-def refuse_used(folder: Path, own_file: str, flag: str) -> None:
+def restore_metrics(save: Save, folder: Path) -> None:
+    """Puts the rows of metrics of a save in place of those that the run has written since."""
+    path = folder / METRICS_FILE
+    if not (save.folder / METRICS_FILE).exists():
+        path.unlink(missing_ok=True)
+        return
+    part = path.with_name(f"{path.name}.part")
+    write_synced(part, (save.folder / METRICS_FILE).read_bytes())
+    part.replace(path)
+
+
+def refuse_used(folder: Path, kind: str, flag: str) -> None:
     """Refuses a folder that already holds a run or an agent.
 
     Args:
         folder: Where a new run or agent is about to be written.
-        own_file: The file in `CONTENTS` from which the caller can resume; if it exists, the message names `--resume`.
+        kind: Kind of saves from which the caller can resume; if there are any, the message names `--resume`.
         flag: The flag that chooses another folder.
 
     Raises:
-        UserError: The folder holds one of the files in `CONTENTS`.
+        UserError: The folder holds something that `CONTENTS` describes.
     """
-    for name, content in CONTENTS.items():
-        if (folder / name).exists():
-            can_resume = (folder / own_file).exists()
+    for pattern, content in CONTENTS.items():
+        if any(folder.glob(pattern)):
+            can_resume = Saves(folder / SAVES_FOLDER, kind, 0).kinds() == {kind}
             advice = f"resume it with --resume {folder} (or from Python), or " if can_resume else ""
             raise UserError(f"{folder} already holds {content}: {advice}choose another {flag}")
 

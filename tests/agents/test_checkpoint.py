@@ -50,7 +50,13 @@ def assert_refused(call, *words):
     return message
 
 
+def unseal(folder):
+    """Deletes the manifest, as a user does after a deliberate change."""
+    (folder / "manifest.json").unlink()
+
+
 def change_info(folder, **changes):
+    unseal(folder)
     path = folder / "info.json"
     path.write_text(json.dumps(json.loads(path.read_text()) | changes))
 
@@ -83,7 +89,7 @@ def test_load_agent_gives_the_actions_of_the_saved_agent(model, folder):
 def test_save_checkpoint_replaces_an_earlier_one(model, folder):
     save_checkpoint(folder, model, CONFIG, INFO | {"env_frames": 2000})
     assert read_info(folder)["env_frames"] == 2000
-    assert sorted(path.name for path in folder.iterdir()) == ["info.json", "weights.safetensors"]
+    assert sorted(path.name for path in folder.iterdir()) == ["info.json", "manifest.json", "weights.safetensors"]
     load_model(folder)
 
 
@@ -122,6 +128,7 @@ def test_load_agent_refuses_weights_that_are_cut_off(folder):
 
 @pytest.mark.parametrize("content", ["{}", "[1, 2]", "nonsense", '{"config": {}}'])
 def test_read_info_refuses_descriptions_of_other_programs(folder, content):
+    unseal(folder)
     (folder / "info.json").write_text(content)
     assert_refused(lambda: read_info(folder), "info.json")
 
@@ -130,6 +137,7 @@ def test_read_info_refuses_descriptions_of_other_programs(folder, content):
 def test_read_info_names_a_missing_key(folder, key):
     facts = json.loads((folder / "info.json").read_text())
     del facts[key]
+    unseal(folder)
     (folder / "info.json").write_text(json.dumps(facts))
     assert_refused(lambda: read_info(folder), f"lacks {key}")
 
@@ -162,7 +170,7 @@ def test_load_agent_refuses_values_of_another_type(folder, key, value):
 @pytest.mark.parametrize("action_dim", [-1, 0])
 def test_load_agent_refuses_action_sizes_below_1(folder, action_dim):
     change_info(folder, action_dim=action_dim)
-    assert_refused(lambda: load_agent(folder), "does not fit")
+    assert_refused(lambda: load_agent(folder), "action_dim must be an integer in [1, 4096]")
 
 
 @pytest.mark.parametrize("number", ["nan", "inf"])

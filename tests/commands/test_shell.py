@@ -1,6 +1,8 @@
 """Exit codes, errors of one line, and the device of a command."""
 
 import errno
+import os
+import signal
 import subprocess
 import sys
 
@@ -40,6 +42,14 @@ def test_run_guarded_lets_bugs_through(error):
 
     with pytest.raises(type(error)):
         run_guarded(fail, [])
+
+
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGTERM, 143), (signal.SIGHUP, 129)])
+def test_run_guarded_ends_by_an_ordinary_exit_on_a_signal(number, code):
+    before = signal.signal(number, signal.SIG_DFL)
+    with pytest.raises(SystemExit) as ended:
+        run_guarded(lambda argv: os.kill(os.getpid(), number), [])
+    assert ended.value.code == code and signal.signal(number, before) == signal.SIG_DFL
 
 
 @pytest.mark.parametrize("words", [["train.py", "--help"], ["benchmark.py"]])

@@ -2,14 +2,13 @@
 
 from pathlib import Path
 
-import numpy as np
 import pytest
 import torch
 
 from latentplan.config import UserError
 from latentplan.replay import memory
-from latentplan.replay.buffer import Replay, count_replay_bytes
-from tests.replay.numbered_rows import CPU, NumberedRows, frame_values, make_filled_replay, make_replay, sample
+from latentplan.replay.buffer import count_replay_bytes
+from tests.replay.numbered_rows import NumberedRows, frame_values, make_filled_replay, make_replay, sample
 
 
 def assert_aligned(batch):
@@ -116,89 +115,6 @@ def test_refresh_ignores_beliefs_that_are_not_chosen(chosen):
     for row in range(len(before)):
         written = [deter[s, t] for s in range(2) for t in range(3) if chosen[s][t] and rows[s, t] == row]
         assert torch.equal(replay.deter[row].float(), written[-1] if written else before[row].float())
-
-
-def assert_same(left, right):
-    assert len(left) == len(right)
-    for seed in range(3):
-        pairs = zip(sample(left, seed=seed), sample(right, seed=seed), strict=True)
-        assert all(torch.equal(first, second) for first, second in pairs)
-
-
-@pytest.mark.parametrize("ring", RINGS)
-def test_load_restores_a_saved_replay(ring, tmp_path):
-    replay = make_filled_replay(**ring)
-    replay.save(tmp_path)
-    loaded = make_replay(ring.get("capacity", 60), ring.get("lanes", 1))
-    loaded.load(tmp_path)
-    assert_same(replay, loaded)
-
-
-@pytest.mark.parametrize("capacity", [60, 12])
-def test_save_gives_the_same_files_in_parts_as_at_once(capacity, tmp_path):
-    replay, numbered = make_replay(capacity), NumberedRows(0, (7, 4, 9))
-    for start in range(0, len(numbered.entries), 4):
-        replay.add(0, numbered.rows(start, start + 4))
-        replay.save(tmp_path)
-        if start == 8:  # go on from disk halfway
-            replay = make_replay(capacity)
-            replay.load(tmp_path)
-    loaded = make_replay(capacity)
-    loaded.load(tmp_path)
-    assert_same(replay, loaded)
-    assert_same(make_filled_replay(capacity=capacity), loaded)
-
-
-def test_save_writes_new_frames_only(tmp_path):
-    replay, numbered = make_replay(), NumberedRows(0, (7, 4, 9))
-    replay.add(0, numbered.rows(0, 8))
-    replay.save(tmp_path)
-    (tmp_path / "frames_0.u8").write_bytes(bytes(8 * 64 * 64 * 3))
-    replay.add(0, numbered.rows(8, 13))
-    replay.save(tmp_path)
-    stored = np.fromfile(tmp_path / "frames_0.u8", np.uint8).reshape(-1, 64, 64, 3)
-    assert len(stored) == 13
-    assert (stored[:8] == 0).all() and (stored[8:, 0, 0, 1] == 1).all()
-
-
-@pytest.mark.parametrize(("before", "after"), [(60, 100), (12, 60), (60, 14), (12, 8)])
-def test_load_keeps_the_newest_rows_in_another_capacity(before, after, tmp_path):
-    replay = make_filled_replay(capacity=before)
-    replay.save(tmp_path)
-    loaded = make_replay(after)
-    loaded.load(tmp_path)
-    assert len(loaded) == min(len(replay), after)
-    assert_aligned(sample(loaded))
-    newest = [entry[2::-1] for entry in NumberedRows(0, (7, 4, 9)).entries[-len(loaded) :]]
-    held = loaded.frames[torch.from_numpy(loaded.episode[0] >= 0)]
-    assert sorted(map(tuple, held[:, 0, 0].tolist())) == sorted(newest)
-    loaded.add(0, NumberedRows(0, (5,)).rows())
-    loaded.save(tmp_path)
-    again = make_replay(after)
-    again.load(tmp_path)
-    assert_same(loaded, again)
-
-
-def test_load_refuses_replays_of_other_sizes(tmp_path):
-    with pytest.raises(UserError, match="no replay found"):
-        make_replay().load(tmp_path)
-    make_filled_replay().save(tmp_path)
-    for other in (
-        make_replay(lanes=2),
-        Replay(60, 2, 2, 1, CPU, 2),
-        Replay(60, 1, 3, 1, CPU, 2),
-        Replay(60, 1, 2, 1, CPU),
-    ):
-        with pytest.raises(UserError, match="this run"):
-            other.load(tmp_path)
-
-
-def test_load_refuses_a_file_with_missing_frames(tmp_path):
-    make_filled_replay().save(tmp_path)
-    with (tmp_path / "frames_0.u8").open("r+b") as file:
-        file.truncate(10 * 64 * 64 * 3)
-    with pytest.raises(UserError, match="must hold 23 frames"):
-        make_replay().load(tmp_path)
 
 
 @pytest.mark.parametrize("lengths", [(), (2,), (4, 4, 4)])

@@ -4,7 +4,9 @@ import numpy as np
 import pytest
 import torch
 
+from latentplan.config.commit import Saves
 from latentplan.replay.buffer import Batch
+from latentplan.replay.disk import FORMAT, ReplayFiles, save_replay
 from tests.replay.numbered_rows import NumberedRows, make_filled_replay, make_replay, sample
 
 
@@ -44,7 +46,7 @@ def test_draw_reaches_beyond_terminal_states_but_not_beyond_time_limits(tmp_path
     ended.add(0, rows)
     starts = {int(row) for row in ended.draw(200, 5, np.random.default_rng(0))[:, 0]}
     assert starts == {0, 1, 2, 8, 9, 10, 11, 13, 14, 15, 16, 17}
-    ended.save(tmp_path)
+    save_replay(ended, tmp_path, {})
     again = make_replay()
-    again.load(tmp_path)
+    ReplayFiles(tmp_path, again).read(Saves(tmp_path, "replay", FORMAT).newest()[0])
     assert np.array_equal(again.is_end, ended.is_end)

@@ -8,8 +8,11 @@ import torch
 
 from latentplan.agents.checkpoint import read_info
 from latentplan.training import resume, train
-from latentplan.training.callbacks import Collect, Save, Stop
+from latentplan.training.callbacks import Collect
 from latentplan.training.collection.collector import Collector
+from latentplan.training.collection.episodes import Stopped
+from latentplan.training.collection.process import RemoteWorker, WorkerEnded
+from latentplan.training.saving import Save, Stop
 from latentplan.training.state import RunState
 from tests.training.run_folder import read_state
 
@@ -120,16 +123,43 @@ def test_evaluation_that_runs_when_the_time_is_up_can_be_the_best(tiny, dot, tmp
     assert read_frames(run.run_dir)["best"] == 45
 
 
-def test_store_results_drops_requests_of_a_worker_that_ended_with_an_interrupted_run(tiny, tmp_path):
+def test_store_results_keeps_requests_of_a_worker_that_ended_with_an_interrupted_run(tiny, tmp_path):
     class EndedWorker:
         def result(self):
-            raise RuntimeError("the collection process ended unexpectedly")
+            raise RuntimeError("collection failed")
 
-    state = RunState()
-    collect = Collect(tiny(tmp_path), None, state, EndedWorker(), tmp_path)
-    collect._is_round_pending = True
-    with pytest.raises(RuntimeError, match="ended unexpectedly"):
+    state, requests = RunState(), {"collect": {"counter": 3}, "evaluate": None, "weights": None}
+    collect = Collect(tiny(tmp_path), None, state, EndedWorker(), tmp_path, requests)
+    with pytest.raises(RuntimeError, match="collection failed"):
         collect.store_results()
-    state.interrupted = True
-    collect.store_results()
-    assert not collect._is_round_pending
+    state.interrupted = 15
+    with pytest.raises(Stopped):
+        collect.store_results()
+    assert collect.requests["collect"] == {"counter": 3}  # the resumed run asks again
+
+
+def test_replace_worker_starts_another_process_when_the_new_one_ends_too(tiny, tmp_path):
+    class Mortal(RemoteWorker):
+        """A worker whose first three processes end while they are prepared."""
+
+        def __init__(self):
+            self.starts, self.asked = 0, []
+
+        def restart(self):
+            self.starts += 1
+
+        def submit(self, *words):
+            self.asked.append(words[0])
+
+        def result(self):
+            if self.starts < 3:
+                raise WorkerEnded("the collection process ended unexpectedly (exit code -9)")
+
+    state, requests = RunState(), {"collect": {"counter": 3}, "evaluate": None, "weights": None}
+    collect = Collect(tiny(tmp_path), None, state, Mortal(), tmp_path, requests, memory={"agent": "random"})
+    with pytest.warns(RuntimeWarning, match="started again"):
+        collect.replace_worker(WorkerEnded("ended"))
+    assert state.worker_restarts == 3 and collect.worker.asked == ["restore"] * 3 + ["collect"]
+    state.worker_restarts = 20
+    with pytest.raises(WorkerEnded, match="too often"):
+        collect.replace_worker(WorkerEnded("too often"))

@@ -41,23 +41,14 @@ def test_metrics_file_keeps_figures_of_earlier_columns_when_losses_come_and_go(f
     assert [(row["removed"], row["added"]) for row in rows] == [("0.1234567890123", ""), ("", "7.0")]
 
 
-def test_metrics_file_drops_chosen_rows_and_a_row_written_in_part(file):
-    for updates in (1, 2, 3):
-        file.append({"updates": updates, "minutes": 0.0, "reward": 1.0})
-    with file.path.open("a", newline="") as text:
-        text.write("4,0.0")
-    file.drop_rows(lambda row: int(row["updates"]) == 2)
-    rows, header = read_table(file.path)
-    assert [row["updates"] for row in rows] == ["1", "3"] and header == ("updates", "minutes", "reward")
-
-
 def test_record_writes_each_metric_of_the_learner_to_csv_and_tensorboard(tmp_path):
     """The header orders losses as the learner does, and gradient norms after them."""
-    state = RunState(env_frames=30, decisions=15, earlier_minutes=2.0)
-    collect = SimpleNamespace(episode_returns=[4.0, 6.0])
+    state = RunState(env_frames=30, decisions=15, earlier_minutes=2.0, episode_returns=[4.0, 6.0])
+    collect = SimpleNamespace(is_epoch_over=True)
     record = Record(tmp_path / "metrics.csv", state, collect, SimpleNamespace(episode_return=None))
     names = ("reconstruction", "model_grad_norm", "surprise", "behaviour_grad_norm")
-    learner = SimpleNamespace(updates=7, metrics={name: torch.tensor(float(place)) for place, name in enumerate(names)})
+    metrics = {name: torch.tensor(float(place)) for place, name in enumerate(names)}
+    learner = SimpleNamespace(updates=7, metrics=metrics, skips=())
     logger = TensorBoardLogger(tmp_path, name="tensorboard", version="")
     record.on_train_epoch_end(SimpleNamespace(logger=logger), learner)
     logger.finalize("success")

@@ -28,6 +28,7 @@ from latentplan.models.heads import LARGEST_SCALAR
 from latentplan.models.symmetry import first_turn
 from latentplan.replay.buffer import Rows
 from latentplan.reporting.film import filming_if_possible
+from latentplan.training.collection.episodes import Episodes, Stopped, to_arrays, to_tensors
 
 TIMED_FRAMES = 5
 FILMED_FRAMES = 250
@@ -45,12 +46,14 @@ class Collected:
         env_frames: Simulator control steps taken in this round.
         decisions: Actions chosen in this round, over all environments.
         episode_returns: Returns of the episodes that ended in this round.
+        memory: State of the collector after this round, from which `Collector.restore` continues.
     """
 
     rows: list[Rows]
     env_frames: int
     decisions: int
     episode_returns: list[float]
+    memory: dict[str, Any]
 
 
 @dataclass(frozen=True)
@@ -110,12 +113,14 @@ class Collector:
             mode: make_agent(mode, self.model, config, discount) for mode in ("planner", "actor")
         }
         self._random = RandomAgent(action_dim)
+        self._episodes = Episodes(self.envs, config.run.seed)
         self._frames: np.ndarray | None = None
         self._labels = np.zeros((config.env.num_envs, len(self.labels)), np.float32)
         self._has_ended = np.ones(config.env.num_envs, dtype=bool)
         self._returns = np.zeros(config.env.num_envs)
         self._check_rewards = RewardCheck(config.env.num_envs, discount)
-        self._current_agent: object = None
+        self._current_agent: ModelAgent | RandomAgent | None = None
+        self.should_stop: Callable[[], bool] = lambda: False
 
     def describe(self) -> Description:
         """Facts of the environment that the learner needs; renders a few frames to time them."""
@@ -160,9 +165,48 @@ class Collector:
         steps = -(-decisions // len(self._has_ended))
         log = _Log(len(self._has_ended), self.model.action_dim, self.config.model.deter_dim)
         for _ in range(steps):
-            self._restart_ended(agent, counter)
+            if self.should_stop():
+                raise Stopped
+            self._restart_ended(agent)
             self._step(agent, log)
-        return Collected(log.rows(), log.env_frames, steps * len(self._has_ended), log.returns)
+        decisions = steps * len(self._has_ended)
+        return Collected(log.rows(), log.env_frames, decisions, log.returns, self._copy_memory())
+
+    def restore(self, memory: dict[str, Any]) -> None:
+        """Continues after a round of another collector: plays its running episodes again, action by action.
+
+        Where an environment does not repeat its episode, a new episode begins, and a warning says so.
+
+        Args:
+            memory: `Collected.memory` of that round.
+        """
+        memory = to_tensors(memory)
+        frames, labels, is_same = self._episodes.replay(memory["episodes"])
+        self._frames, self._returns = frames, memory["returns"].numpy().copy()
+        if self.labels:
+            self._labels = np.array(labels, np.float32)
+        self._has_ended = memory["has_ended"].numpy() | ~is_same
+        self._check_rewards.set_memory(memory["rewards"])
+        name = memory["agent"]
+        agent = self._random if name == "random" else self._agents[name]
+        if isinstance(agent, ModelAgent):
+            agent.set_memory(memory["belief"])
+        self._current_agent = agent
+
+    def _copy_memory(self) -> dict[str, Any]:
+        """What `restore` needs, as NumPy arrays and plain values, which pass between processes."""
+        assert self._frames is not None
+        agent = self._current_agent
+        names = {id(own): name for name, own in self._agents.items()}
+        memory = {
+            "agent": names.get(id(agent), "random"),
+            "belief": agent.memory() if isinstance(agent, ModelAgent) else None,
+            "episodes": self._episodes.memory(self._frames, self._has_ended),
+            "returns": self._returns.copy(),
+            "has_ended": self._has_ended.copy(),
+            "rewards": self._check_rewards.memory(),
+        }
+        return to_arrays(memory)  # type: ignore[no-any-return]
 
     def evaluate(
         self,
@@ -205,13 +249,12 @@ class Collector:
     def _load_weights(self, weights: dict[str, np.ndarray]) -> None:
         self.model.load_state_dict({name: torch.from_numpy(value) for name, value in weights.items()})
 
-    def _restart_ended(self, agent: ModelAgent | RandomAgent, counter: int) -> None:
+    def _restart_ended(self, agent: ModelAgent | RandomAgent) -> None:
         if not self._has_ended.any():
             return
-        if self._frames is None:
-            self._frames, info = self.envs.reset(seed=derive_seed(self.config.run.seed, "episodes", counter))
-        else:
-            self._frames, info = self.envs.reset(options={"reset_mask": self._has_ended})
+        is_new = self._frames is None
+        self._frames, info = self._episodes.restart(self._has_ended)
+        if not is_new:
             agent.reset(self._has_ended)
         if self.labels:
             self._labels[self._has_ended] = np.asarray(info["labels"])[self._has_ended]
@@ -223,7 +266,7 @@ class Collector:
         actions = agent.act(frames)
         state = agent.state if isinstance(agent, ModelAgent) else None
         deter = None if state is None else first_turn(state).deter.float().cpu().numpy()
-        self._frames, rewards, terminated, truncated, info = self.envs.step(actions)
+        self._frames, rewards, terminated, truncated, info = self._episodes.step(actions)
         self._check_rewards(rewards, first)
         self._has_ended = terminated | truncated
         self._returns += rewards
@@ -300,6 +343,14 @@ class RewardCheck:
         self.discount = discount
         self._sums = np.zeros(num_envs)
         self._has_warned = False
+
+    def memory(self) -> dict[str, Any]:
+        """What is known of the running episodes, for `set_memory`."""
+        return {"sums": self._sums.copy(), "has_warned": self._has_warned}
+
+    def set_memory(self, memory: dict[str, Any]) -> None:
+        """Continue with what another check knew of the running episodes; arrays are tensors now."""
+        self._sums, self._has_warned = memory["sums"].numpy().copy(), memory["has_warned"]
 
     def __call__(self, rewards: np.ndarray, is_first: np.ndarray) -> None:
         """Check one step's rewards.

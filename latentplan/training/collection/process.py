@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import multiprocessing
+import os
 import signal
 import sys
+import threading
 import traceback
 from collections import deque
+from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
-from multiprocessing.connection import Connection
+from concurrent.futures import wait as wait_for
+from multiprocessing.connection import Connection, wait
 from typing import Any
 
 import torch
@@ -17,7 +21,14 @@ from gymnasium.vector.utils import CloudpickleWrapper
 from latentplan.config import Config, UserError
 from latentplan.envs import single_threaded_children
 from latentplan.training.collection.collector import CLOSING_SECONDS, Collector, EnvFactory
+from latentplan.training.collection.episodes import Stopped
 from latentplan.training.resources import choose_collector_threads
+
+POLL_SECONDS = 0.1  # between two looks at whether the run stops
+
+
+class WorkerEnded(RuntimeError):
+    """The collection process ended, and its answers are lost."""
 
 
 class LocalWorker:
@@ -27,14 +38,26 @@ class LocalWorker:
         config: Settings of the run.
         make_user_env: Makes the user's own environment; None makes the suite's task.
         device: Device of the acting model.
+        should_stop: Whether the run stops, so that a round is given up.
     """
 
-    def __init__(self, config: Config, make_user_env: EnvFactory | None, device: str) -> None:
+    def __init__(
+        self,
+        config: Config,
+        make_user_env: EnvFactory | None,
+        device: str,
+        should_stop: Callable[[], bool] = lambda: False,
+    ) -> None:
         self._collector = Collector(config, make_user_env, device)
+        self._collector.should_stop = should_stop
         self._results: list[Any] = []
 
     def submit(self, method: str, *arguments: Any) -> None:
-        """Run a method of the collector, and keep its result for `result`."""
+        """Run a method of the collector, and keep its result for `result`.
+
+        Raises:
+            Stopped: The run stops.
+        """
         self._results.append(getattr(self._collector, method)(*arguments))
 
     def result(self) -> Any:
@@ -53,13 +76,29 @@ class RemoteWorker:
         config: Settings of the run.
         make_user_env: Makes the user's own environment; None makes the suite's task.
         threads: CPU threads of the process.
+        should_stop: Whether the run stops, so that nobody waits for results.
     """
 
-    def __init__(self, config: Config, make_user_env: EnvFactory | None, threads: int = 1) -> None:
+    def __init__(
+        self,
+        config: Config,
+        make_user_env: EnvFactory | None,
+        threads: int = 1,
+        should_stop: Callable[[], bool] = lambda: False,
+    ) -> None:
+        self._arguments = (make_user_env and CloudpickleWrapper(make_user_env), config, threads)
+        self._should_stop, self._is_daemon = should_stop, config.env.num_envs == 1
+        self._start()
+
+    def restart(self) -> None:
+        """Replace a process that ended by a new one; requests that are not answered yet are dropped."""
+        self.close()
+        self._start()
+
+    def _start(self) -> None:
         context = multiprocessing.get_context("spawn")
         self._connection, child_end = context.Pipe()
-        arguments = (child_end, make_user_env and CloudpickleWrapper(make_user_env), config, threads)
-        self._process = context.Process(target=_serve, args=arguments, daemon=config.env.num_envs == 1)
+        self._process = context.Process(target=_serve, args=(child_end, *self._arguments), daemon=self._is_daemon)
         with single_threaded_children():
             self._process.start()
         child_end.close()
@@ -76,14 +115,23 @@ class RemoteWorker:
 
         Raises:
             UserError: The method raised this error.
-            RuntimeError: The method failed with another error, or the process ended.
+            Stopped: The run stops.
+            WorkerEnded: The process ended.
+            RuntimeError: The method failed with another error.
         """
+        future = self._futures.popleft()
         try:
-            kind, value = self._futures.popleft().result()
+            while not future.done() and not self._should_stop():
+                wait_for([future], timeout=POLL_SECONDS)
+            if not future.done():
+                raise Stopped
+            kind, value = future.result()
         except (EOFError, OSError):
             self._process.join(timeout=5.0)
+            if self._should_stop():
+                raise Stopped from None
             code = self._process.exitcode
-            raise RuntimeError(f"the collection process ended unexpectedly (exit code {code})") from None
+            raise WorkerEnded(f"the collection process ended unexpectedly (exit code {code})") from None
         if kind == "user_error":
             raise UserError(value)
         if kind == "error":
@@ -110,29 +158,48 @@ class RemoteWorker:
 Worker = LocalWorker | RemoteWorker
 
 
-def make_worker(config: Config, make_user_env: EnvFactory | None, device: torch.device) -> Worker:
+def make_worker(
+    config: Config, make_user_env: EnvFactory | None, device: torch.device, should_stop: Callable[[], bool]
+) -> Worker:
     """The worker that `collection.overlap` selects; a local worker acts on the learner's device."""
     if config.collection.overlap:
-        return RemoteWorker(config, make_user_env, choose_collector_threads(device))
-    return LocalWorker(config, make_user_env, str(device))
+        return RemoteWorker(config, make_user_env, choose_collector_threads(device), should_stop)
+    return LocalWorker(config, make_user_env, str(device), should_stop)
 
 
 def _serve(connection: Connection, make_user_env: EnvFactory | None, config: Config, threads: int) -> None:
     """Runs methods of a `Collector` in this process as the learner requests them, until the connection closes."""
     signal.signal(signal.SIGTERM, lambda *_: sys.exit())  # an ordinary exit also ends the environments' processes
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches the whole process group, but only the learner reacts
+    # Ctrl-C and a closed terminal reach the whole process group, but only the learner reacts.
+    for number in (signal.SIGINT, signal.SIGHUP):
+        signal.signal(number, signal.SIG_IGN)
+    threading.Thread(target=_end_with_parent, daemon=True).start()
     torch.set_num_threads(threads)
     collector: Collector | None = None
     while True:
         try:
             method, arguments = connection.recv()
-        except EOFError:
+        except (EOFError, OSError):
             return
         try:
             if collector is None:
                 collector = Collector(config, make_user_env, "cpu")
-            connection.send(("ok", getattr(collector, method)(*arguments)))
+            answer = "ok", getattr(collector, method)(*arguments)
         except UserError as error:
-            connection.send(("user_error", str(error)))
+            answer = "user_error", str(error)
         except Exception:
-            connection.send(("error", traceback.format_exc()))
+            answer = "error", traceback.format_exc()
+        try:
+            connection.send(answer)
+        except OSError:  # the learner has ended
+            return
+
+
+def _end_with_parent() -> None:
+    """Ends this process and its children at once when the process that started it has ended."""
+    parent = multiprocessing.parent_process()
+    if parent is not None:
+        wait([parent.sentinel])
+        for child in multiprocessing.active_children():
+            child.kill()
+        os._exit(0)

@@ -28,19 +28,22 @@ from latentplan.agents.base import ModelAgent
 from latentplan.agents.checkpoint import load_model, read_info, resolve_checkpoint, save_checkpoint
 from latentplan.agents.planning import PlanningAgent
 from latentplan.config import USER_DOMAIN, DistillConfig, PlannerConfig, UserError, derive_seed, to_dict
+from latentplan.config.commit import Saves
 from latentplan.config.removed import drop_removed
+from latentplan.config.run_folder import SAVES_FOLDER
 from latentplan.envs import make_env, make_from
 from latentplan.evaluation.episodes import OnStep, Step, episode_seed, iterate_episodes
 from latentplan.evaluation.statistics import confidence_interval
 from latentplan.models import Gaussian, State
-from latentplan.replay.buffer import read_saved
 from latentplan.training.collection.collector import EnvFactory
 from latentplan.training.console import StatusLine
 from latentplan.training.distillation.labels import Demonstrations, plan_actions, read_first_actions
 from latentplan.training.distillation.student import Student
 from latentplan.training.run import Result
-from latentplan.training.state import DISTILLATION_FILE, INTERRUPTED, lock_folder, refuse_used, save_atomically
+from latentplan.training.signals import Signals, exit_code, raise_interrupt
+from latentplan.training.state import load_values, lock_folder, refuse_used, save_values
 
+KIND, FORMAT = "distillation", 2
 NUM_STAGES = 3  # per round: collect, train, select
 NO_ROUND = -1  # value of `best_round` while the actor before distillation is the best
 # Names of random streams, from which the starts of episodes derive; other names would change the results.
@@ -73,7 +76,7 @@ def distill(
         UserError: The checkpoint, the folder or a setting cannot be used.
     """
     folder = Path(folder)
-    refuse_used(folder, str(DISTILLATION_FILE), "--out")
+    refuse_used(folder, KIND, "--out")
     source = resolve_checkpoint(checkpoint)
     return _Distillation(source, folder, settings or DistillConfig(), planner, device, make_env).run()
 
@@ -222,14 +225,17 @@ class _Distillation:
         self.student = Student(self.model.actor, settings)
         self.initial = self.best = copy.deepcopy(self.model.actor.state_dict())
         self.line = StatusLine()
+        self.saves = _saves(folder)
         self._started = time.monotonic()
         self._earlier_minutes = 0.0
 
     def run(self) -> Result:
         """Run the remaining rounds and save the better agent; after an interruption, print how to resume."""
         state = self.state
+        signals = Signals(raise_interrupt)
         try:
-            with lock_folder(self.folder), self.line:
+            with lock_folder(self.folder), self.line, signals:
+                self.saves.remove_leftovers()
                 if not state.planner:
                     self._evaluate_initial()
                 while not self._is_spent():
@@ -243,13 +249,14 @@ class _Distillation:
             if self.config.env.domain == USER_DOMAIN:
                 command = f'latentplan.training.resume_distillation("{self.folder}", make_env=...)'
             self.line.print(f"stopped; to resume: {command}")
-            return Result(self.folder, INTERRUPTED, {})
+            return Result(self.folder, exit_code(signals.received), {})
         finally:
             self.env.close()
 
     def load(self, saved: dict[str, Any]) -> None:
         """Load what `_save` saved."""
-        self.state = DistillationState(**saved["state" if "state" in saved else "standing"])  # "standing" before 0.2.0
+        self.saves.newest()  # which the next save keeps
+        self.state = DistillationState(**saved["state"])
         self._earlier_minutes = self.state.minutes
         self.demonstrations.load_state_dict(saved["demonstrations"])
         self.student.load_state_dict(saved["student"])
@@ -395,7 +402,8 @@ class _Distillation:
             "student": self.student.state_dict(),
             "best": self.best,
         }
-        save_atomically(saved, self.folder / DISTILLATION_FILE)
+        round_index, stage = divmod(self.state.stage, NUM_STAGES)
+        save_values(self.saves, saved, {"round": round_index, "stage": stage})
 
     def _is_spent(self) -> bool:
         """Whether the budget allows no further round; a round that has begun is finished."""
@@ -411,17 +419,23 @@ class _Distillation:
         self.line.update(f"round {round_index} of {self.settings.rounds} | {activity} | {self._minutes():.1f} min")
 
 
+def _saves(folder: Path) -> Saves:
+    return Saves(folder / SAVES_FOLDER, KIND, FORMAT)
+
+
 def _load_distillation(folder: Path) -> dict[str, Any]:
     """The distillation saved in a folder.
 
     Raises:
-        UserError: The folder holds no distillation, or a damaged one.
+        UserError: The folder holds no distillation, or a damaged one, or one of an earlier version.
     """
-    path = folder / DISTILLATION_FILE
-    if not path.is_file():
-        raise UserError(f"nothing to resume in {folder}: {path} is missing")
-    saved: dict[str, Any] = read_saved(path)
-    return saved
+    if (folder / SAVES_FOLDER / "distill.pt").exists():
+        raise UserError(
+            f"{folder} was saved by latentplan 0.2.0 or earlier: finish it with that version, or start anew"
+        )
+    return load_values(
+        _saves(folder), ("source", "sha256", "settings", "planner", "state", "demonstrations", "student")
+    )
 
 
 def format_mean(returns: Sequence[float], *, signed: bool = False) -> str:

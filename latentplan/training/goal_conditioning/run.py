@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import contextlib
-import json
 import math
-import signal
+import shutil
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -17,17 +15,23 @@ import torch
 
 from latentplan.agents.checkpoint import load_model, read_info, resolve_checkpoint, save_checkpoint
 from latentplan.config import USER_DOMAIN, Config, GoalsConfig, UserError, derive_seed, to_dict
+from latentplan.config.commit import Save, Saves
+from latentplan.config.run_folder import RUN_FILE, SAVES_FOLDER, run_saves
 from latentplan.models import WorldModel
-from latentplan.replay.buffer import Replay, read_saved
+from latentplan.replay.buffer import Replay
+from latentplan.replay.disk import FORMAT as REPLAY_FORMAT
+from latentplan.replay.disk import ReplayFiles, count_saved, save_replay
 from latentplan.training.collection.collector import Collector
 from latentplan.training.console import StatusLine
 from latentplan.training.goal_conditioning.learner import BoxSource, GoalLearner
 from latentplan.training.run import Result
-from latentplan.training.state import GOALS_FILE, INTERRUPTED, lock_folder, refuse_used, save_atomically
+from latentplan.training.signals import Signals, exit_code, raise_interrupt
+from latentplan.training.state import load_values, lock_folder, refuse_used, save_values, warn_of_loss
 
 ROUND_DECISIONS = 125
 SAVE_SECONDS = 300.0
-PLAYED_FILE = "played.json"  # names the agent that played the replay in the same folder, and its settings
+KIND, FORMAT = "goals", 2
+PLAYED_FOLDER = "replay"
 
 
 def learn_goals(
@@ -49,7 +53,7 @@ def learn_goals(
         UserError: The agent, its replay or the folder cannot be used.
     """
     folder = Path(folder)
-    refuse_used(folder, GOALS_FILE, "--out")
+    refuse_used(folder, KIND, "--out")
     with lock_folder(folder):
         return _learn(Path(checkpoint), folder, settings or GoalsConfig(), device, None)
 
@@ -68,11 +72,14 @@ def resume_goals(
     Raises:
         UserError: The folder holds nothing to resume, or the agent that the learning started from has changed.
     """
-    path = Path(folder) / GOALS_FILE
-    if not path.exists():
-        raise UserError(f"nothing to resume in {folder}: {path} is missing")
+    saves = _saves(Path(folder))
+    if not saves.exist():
+        raise UserError(
+            f"nothing to resume in {folder}: {saves.folder} holds no save; what latentplan 0.2.0 or earlier saved is "
+            "continued by that version"
+        )
     with lock_folder(Path(folder)):
-        saved = read_saved(path, keys=("run", "source", "sha256", "settings", "minutes", "learner"))
+        saved = load_values(saves, ("run", "source", "sha256", "settings", "minutes", "learner"))
         if read_info(saved["source"])["sha256"] != saved["sha256"]:
             raise UserError(f"{saved['source']} is not the agent from which {folder} started")
         settings = GoalsConfig(**saved["settings"])
@@ -80,43 +87,48 @@ def resume_goals(
         return _learn(Path(saved["run"]), Path(folder), settings, device, saved)
 
 
-def load_replay(path: Path, model: WorldModel) -> Replay:
-    """Loads the whole replay in a folder into main memory.
+def load_replay(save: Save, model: WorldModel) -> Replay:
+    """Loads the whole replay of a save into main memory.
 
     Raises:
-        UserError: The replay is damaged, or does not fit the model.
+        UserError: The replay does not fit the model.
     """
-    num_lanes, lane_size = read_saved(path / "rows.pt", keys=("episode",))["episode"].shape
+    num_lanes, num_rows = count_saved(save)
     sizes = (model.action_dim, model.config.deter_dim, num_lanes, torch.device("cpu"), len(model.labels))
-    replay = Replay(num_lanes * lane_size, *sizes)
-    replay.load(path)
+    replay = Replay(num_lanes * num_rows, *sizes)
+    ReplayFiles(save.folder.parent, replay).read(save)
     return replay
+
+
+def _saves(folder: Path) -> Saves:
+    return Saves(folder / SAVES_FOLDER, KIND, FORMAT)
 
 
 def _load_or_play(
     agent: Path, sha256: str, folder: Path, model: WorldModel, config: Config, settings: GoalsConfig, line: StatusLine
 ) -> Replay:
     """Loads the replay of the agent's run if there is one, else a replay that the agent plays and the folder keeps."""
-    collected, played, note = agent / "resume" / "replay", folder / "replay", folder / "replay" / PLAYED_FILE
-    if (collected / "rows.pt").exists():
-        return load_replay(collected, model)
+    if (agent / RUN_FILE).exists() and (agent / SAVES_FOLDER).exists():
+        save, problems = run_saves(agent).newest()
+        warn_of_loss(save, problems)
+        return load_replay(save, model)
     origin = {"sha256": sha256, "seed": settings.seed, "play_decisions": settings.play_decisions}
-    if (folder / GOALS_FILE).exists() or (note.exists() and note.read_text() == json.dumps(origin)):
-        line.print(f"using the replay that was played before, in {played}")
-        return load_replay(played, model)
+    played = Saves(folder / PLAYED_FOLDER, "replay", REPLAY_FORMAT)
+    if played.exist():
+        save, _ = played.newest()
+        if save.note == origin or _saves(folder).exist():
+            line.print(f"using the replay that was played before, in {played.folder}")
+            return load_replay(save, model)
+        shutil.rmtree(played.folder)  # of another agent, and nothing was learned from it
     if config.env.domain == USER_DOMAIN:
         raise UserError(f"{agent} has no replay, and its environment is your own: give the folder of its run")
-    if (played / "rows.pt").exists() and not note.exists():
-        raise UserError(f"{played} holds a replay of another agent: choose another --out")
     line.print(f"no replay in {agent}: playing {settings.play_decisions:,} decisions first")
 
     def report(done: int) -> None:
         line.update(f"played {done:,} of {settings.play_decisions:,} decisions")
 
     replay = play(config, model, settings.play_decisions, settings.seed, report)
-    note.unlink(missing_ok=True)
-    replay.save(played)
-    note.write_text(json.dumps(origin))
+    save_replay(replay, played.folder, origin)
     return replay
 
 
@@ -135,23 +147,21 @@ def _learn(run: Path, folder: Path, settings: GoalsConfig, device: str, saved: d
     if not model.goal_names:
         raise UserError(f"the agent of {run} was trained without named quantities, so there are no goals to learn")
     model.requires_grad_(False)
-    line = StatusLine()
+    line, signals = StatusLine(), Signals(raise_interrupt)
     try:
-        replay = _load_or_play(run, info["sha256"], folder, model, config, settings, line)
+        with signals:
+            replay = _load_or_play(run, info["sha256"], folder, model, config, settings, line)
     except KeyboardInterrupt:
         line.print("stopped while playing, before the first update: nothing is saved")
-        return Result(folder, INTERRUPTED, {})
-    with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(derive_seed(settings.seed, "heads"))
-        model.add_goal_heads(settings.hidden_dim)
-    frames_per_step = config.env.action_repeat
-    learner = GoalLearner(model, settings, config.learning, info["discount"], frames_per_step, replay)
-    earlier = 0.0
+        return Result(folder, exit_code(signals.received), {})
+    learner = _make_learner(model, config, info["discount"], replay, settings)
+    saves, earlier = _saves(folder), 0.0
     if saved is not None:
+        saves.newest()  # which the next save keeps
         learner.load_state_dict(saved["learner"])
         earlier = saved["minutes"]
     started = last_save = time.monotonic()
-    worth = math.nan
+    worth, signals = math.nan, Signals()
 
     def minutes() -> float:
         return earlier + (time.monotonic() - started) / 60.0
@@ -161,10 +171,12 @@ def _learn(run: Path, folder: Path, settings: GoalsConfig, device: str, saved: d
         save_checkpoint(folder, model, config, info | {"goals": facts | {"from_sha256": info["sha256"]}})
         about = {"run": str(run.resolve()), "source": str(source.resolve()), "sha256": info["sha256"]}
         state = {"settings": to_dict(settings), "minutes": minutes(), "learner": learner.state_dict()}
-        save_atomically(about | state, folder / GOALS_FILE)
+        save_values(saves, about | state, {"updates": learner.updates, "minutes": round(minutes(), 1)})
 
-    with line, _stop_on_signals() as should_stop:
-        while learner.updates < settings.updates and not (should_stop() or minutes() >= (settings.minutes or math.inf)):
+    with line, signals:
+        saves.remove_leftovers()
+        budget = settings.minutes or math.inf
+        while learner.updates < settings.updates and not (signals.received or minutes() >= budget):
             parts = learner.update()
             worth = parts["worth"] if math.isnan(worth) else 0.99 * worth + 0.01 * parts["worth"]
             line.update(
@@ -175,33 +187,21 @@ def _learn(run: Path, folder: Path, settings: GoalsConfig, device: str, saved: d
                 save()
                 last_save = time.monotonic()
         save()
-        if should_stop():
+        if signals.received:
             line.print(f"stopped; to resume: python scripts/goals.py --resume {folder}")
-            return Result(folder, INTERRUPTED, {})
+            return Result(folder, exit_code(signals.received), {})
         line.print(f"agent: {folder}")
     return Result(folder, 0, {"worth": worth})
 
 
-@contextlib.contextmanager
-def _stop_on_signals() -> Iterator[Callable[[], bool]]:
-    """Turns the first SIGINT or SIGTERM into a flag, so that the running update is finished; a second one interrupts.
-
-    Yields:
-        A function that tells whether a signal has arrived.
-    """
-    received: list[int] = []
-
-    def receive(number: int, frame: Any) -> None:
-        if received:
-            raise KeyboardInterrupt
-        received.append(number)
-
-    previous = {number: signal.signal(number, receive) for number in (signal.SIGINT, signal.SIGTERM)}
-    try:
-        yield lambda: bool(received)
-    finally:
-        for number, handler in previous.items():
-            signal.signal(number, handler)
+def _make_learner(
+    model: WorldModel, config: Config, discount: float, replay: Replay, settings: GoalsConfig
+) -> GoalLearner:
+    """Adds goal heads with new weights to a model, and makes their learner."""
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(derive_seed(settings.seed, "heads"))
+        model.add_goal_heads(settings.hidden_dim)
+    return GoalLearner(model, settings, config.learning, discount, config.env.action_repeat, replay)
 
 
 def play(config: Config, model: WorldModel, decisions: int, seed: int, report: Callable[[int], None]) -> Replay:

@@ -9,7 +9,7 @@ import numpy as np
 from torch import Tensor
 from torch.utils.data import DataLoader, IterableDataset
 
-from latentplan.config import Config, derive_seed
+from latentplan.config import CollectionConfig, Config, derive_seed
 from latentplan.replay.buffer import Batch, Replay
 from latentplan.training.learner.curriculum import Curriculum
 from latentplan.training.learner.graphed import GraphedLearner
@@ -25,12 +25,13 @@ class ReplayBatches(IterableDataset[Batch | Tensor]):
         replay: Source of the sequences.
         config: Settings of the run.
         curriculum: Replaces the rewards of the sequences.
-        learner: Receives the batches; its number of updates seeds the draws, so that a resumed run draws new batches.
+        learner: Receives the batches; its number of updates seeds the draws of an epoch. A run that resumes within an
+            epoch draws the batches again that it has learned from, and drops them.
     """
 
     def __init__(self, replay: Replay, config: Config, curriculum: Curriculum, learner: Learner) -> None:
         self.replay, self.config, self.curriculum, self.learner = replay, config, curriculum, learner
-        self.length = max(1, round(config.collection.round_decisions * config.collection.updates_per_decision))
+        self.length = updates_per_epoch(config.collection)
 
     def __len__(self) -> int:
         """Updates per epoch."""
@@ -38,14 +39,22 @@ class ReplayBatches(IterableDataset[Batch | Tensor]):
 
     def __iter__(self) -> Iterator[Batch | Tensor]:
         """Draws the batches of this epoch one by one."""
-        if self.curriculum.state.interrupted and not self.replay.written.any():
-            return  # the run was interrupted before it collected anything
-        learning = self.config.learning
-        rng = np.random.default_rng(derive_seed(self.config.run.seed, "batches", self.learner.updates))
+        state, learning = self.curriculum.state, self.config.learning
+        if not state.in_epoch:
+            return  # the run was interrupted before the epoch began
+        done = self.learner.updates
+        first = done - state.epoch_updates
+        rng = np.random.default_rng(derive_seed(self.config.run.seed, "batches", first))
         takes_rows = isinstance(self.learner, GraphedLearner)
-        for _ in range(self.length):
+        for update in range(first, first + self.length):
             rows = self.replay.draw(learning.batch_size, learning.sequence_length, rng)
-            yield rows if takes_rows else self.curriculum(self.replay.gather(rows))
+            if update >= done:
+                yield rows if takes_rows else self.curriculum(self.replay.gather(rows))
+
+
+def updates_per_epoch(collection: CollectionConfig) -> int:
+    """Updates that follow a round of collection, at least 1."""
+    return max(1, round(collection.round_decisions * collection.updates_per_decision))
 
 
 class ReplayData(lightning.LightningDataModule):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Callable
 from typing import TYPE_CHECKING
 
@@ -13,7 +12,6 @@ from latentplan.config import LearningConfig, derive_seed
 from latentplan.models import WorldModel
 from latentplan.replay.buffer import Batch, Replay
 from latentplan.training.learner.module import Learner, is_refreshed
-from latentplan.training.learner.optimization import descend_if_finite
 
 if TYPE_CHECKING:
     from latentplan.config import Config
@@ -27,8 +25,8 @@ class GraphedLearner(Learner):
 
     `training_step` takes rows of replay, (batch, time + 1), instead of a batch. The graph gathers and augments the
     sequences, computes both losses, steps both optimizers, updates the slow target and the averages, and stores the new
-    beliefs. The graph reads nothing back to the host, so an update cannot raise: a gradient that is not finite changes
-    no weights, and `catch_up` reports the skipped update. On a CPU the same update runs without a graph.
+    beliefs. The graph reads nothing back to the host, so an update cannot raise: `skips` counts in the graph. On a CPU
+    the same update runs without a graph.
 
     Args:
         model: The world model with actor and value head.
@@ -39,8 +37,6 @@ class GraphedLearner(Learner):
         prepare: Applied to gathered sequences. The graph records this function, so its effect may change only together
             with `reset_value_head`, which starts a new recording.
     """
-
-    skipped: Tensor
 
     def __init__(
         self,
@@ -53,13 +49,12 @@ class GraphedLearner(Learner):
     ) -> None:
         super().__init__(model, config, discount, replay, seed)
         self.prepare = prepare
-        self.register_buffer("skipped", torch.zeros((), dtype=torch.long), persistent=False)
         self._rows = torch.zeros(config.batch_size, config.sequence_length + 1, dtype=torch.long, device=replay.device)
         self._generator: torch.Generator | None = None
         self._graph: torch.cuda.CUDAGraph | None = None
         self._outputs: dict[str, Tensor] = {}
         self._recorded_parameters = [*self.model.parameters(), *self.averaged.parameters()]
-        self._num_warm_up_updates, self._updates_since_report = 0, 0
+        self._num_warm_up_updates = 0
 
     def training_step(self, rows: Tensor, batch_index: int) -> None:  # type: ignore[override]
         """Update world model and behaviour from the sequences at rows of replay, (batch, time + 1)."""
@@ -79,7 +74,6 @@ class GraphedLearner(Learner):
         else:
             self._outputs = self.update(self._generator)
         self.updates += 1
-        self._updates_since_report += 1
         self.metrics |= self._outputs
 
     def update(self, generator: torch.Generator) -> dict[str, Tensor]:
@@ -89,33 +83,15 @@ class GraphedLearner(Learner):
         is_finite = torch.isfinite(learned.parts["model_grad_norm"])
         self.replay.refresh(batch.rows, learned.states.deter, is_refreshed(batch, is_unturned & is_finite))
         self.snapshot.refresh()
-        parts = learned.parts | self._learn_behaviour(learned, batch, generator)
-        self.skipped += ~(is_finite & torch.isfinite(parts["behaviour_grad_norm"]))
-        return parts
+        return learned.parts | self._learn_behaviour(learned, batch, generator)
 
     def catch_up(self) -> None:
-        """Warn of updates skipped since the last call; no behaviour update is outstanding.
-
-        Raises:
-            FloatingPointError: Every update since the last call was skipped.
-        """
-        updates, skipped = self._updates_since_report, int(self.skipped)
-        self._updates_since_report = 0
-        self.skipped.zero_()
-        if skipped == 0:
-            return
-        report = f"gradients were not finite in {skipped} of the last {updates} updates, up to update {self.updates}"
-        if skipped == updates:
-            raise FloatingPointError(report)
-        warnings.warn(f"{report}: these updates were skipped", RuntimeWarning, stacklevel=2)
+        """Does nothing: no behaviour update is outstanding."""
 
     def reset_value_head(self) -> None:
         """Reset as `Learner` does, and drop the graph, because it uses the old optimizer state."""
         super().reset_value_head()
         self._graph, self._num_warm_up_updates = None, 0
-
-    def _descend(self, optimizer: torch.optim.Optimizer, loss: Tensor) -> Tensor:
-        return descend_if_finite(optimizer, loss, self.config.max_grad_norm)
 
     def _warm_up(self, generator: torch.Generator) -> None:
         """Run one update in a side stream, which CUDA requires of the updates before a recording."""

@@ -24,7 +24,13 @@ from latentplan.training.learner.losses import (
     weighted_sum,
     world_model_loss,
 )
-from latentplan.training.learner.optimization import descend, keep_freed_memory, return_scale, update_average
+from latentplan.training.learner.optimization import (
+    descend_if_finite,
+    keep_freed_memory,
+    return_scale,
+    update_average,
+)
+from latentplan.training.learner.skips import Skips
 
 MODEL, BEHAVIOUR = 0, 1  # indices of the two halves of an update: their parameters, optimizers and average counts
 
@@ -50,6 +56,8 @@ class Learner(lightning.LightningModule):
         averaged: A copy of the model with averaged weights.
         updates: Updates so far.
         metrics: Losses and gradient norms of the latest update, by name.
+        skips: Skipped steps of the world model and of behaviour. A step whose loss or gradient is not finite changes
+            neither weights nor replay.
     """
 
     return_range: Tensor
@@ -66,6 +74,8 @@ class Learner(lightning.LightningModule):
         self.register_buffer("averaged_updates", torch.zeros(2))  # of the model, of behaviour
         self.updates = 0
         self.metrics: dict[str, Tensor] = {}
+        shape = config.batch_size, config.sequence_length + 1
+        self.skips = tuple(Skips(shape, model.device) for _ in (MODEL, BEHAVIOUR))
         self._thread = ThreadPoolExecutor(1, thread_name_prefix="behaviour")
         self._waiting: tuple[Learned, Batch, torch.Generator] | None = None
 
@@ -86,7 +96,8 @@ class Learner(lightning.LightningModule):
             learned, batch, is_unturned = self._learn_model(batch, generator)
         finally:
             self._finish_behaviour(behaviour)
-        self.replay.refresh(batch.rows, learned.states.deter, is_refreshed(batch, is_unturned))
+        is_finite = torch.isfinite(learned.parts["model_grad_norm"])
+        self.replay.refresh(batch.rows, learned.states.deter, is_refreshed(batch, is_unturned & is_finite))
         self.snapshot.refresh()
         self._waiting = (learned, batch, generator)
         self.updates += 1
@@ -135,13 +146,13 @@ class Learner(lightning.LightningModule):
         """
         batch, is_unturned = quarter_turns(self.model.backend, batch, self.config.turned_share, generator)
         learned = world_model_loss(self.model, batch, self.config, generator)
-        learned.parts["model_grad_norm"] = self._descend(self._optimizers()[MODEL], learned.loss)
+        learned.parts["model_grad_norm"] = self._descend(MODEL, learned.loss, batch.rows)
         self._update_average(MODEL)
         return learned._replace(loss=learned.loss.detach()), batch, is_unturned
 
     def _learn_behaviour(self, learned: Learned, batch: Batch, generator: torch.Generator) -> dict[str, Tensor]:
         loss, parts = self._behaviour_loss(learned, batch, generator)
-        parts["behaviour_grad_norm"] = self._descend(self._optimizers()[BEHAVIOUR], loss)
+        parts["behaviour_grad_norm"] = self._descend(BEHAVIOUR, loss, batch.rows)
         self._update_average(BEHAVIOUR)
         target, values = self.target_value.parameters(), self.model.value_head.parameters()
         self.model.backend.move_towards([*target], [*values], self.config.target_rate)
@@ -210,8 +221,10 @@ class Learner(lightning.LightningModule):
         weights = torch.cat([within, reached])
         return Replayed(seen, targets, weights / weights.mean())
 
-    def _descend(self, optimizer: torch.optim.Optimizer, loss: Tensor) -> Tensor:
-        return descend(optimizer, loss, self.config.max_grad_norm, self.updates)
+    def _descend(self, half: int, loss: Tensor, rows: Tensor) -> Tensor:
+        norm = descend_if_finite(self._optimizers()[half], loss, self.config.max_grad_norm)
+        self.skips[half].record(norm, rows)
+        return norm
 
 
 def is_refreshed(batch: Batch, chosen: Tensor) -> Tensor:

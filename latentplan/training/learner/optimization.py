@@ -27,7 +27,7 @@ def descend(optimizer: torch.optim.Optimizer, loss: Tensor, max_norm: float, upd
     Raises:
         FloatingPointError: The gradient is not finite; the message names `update`.
     """
-    norm = _clipped_gradient(optimizer, loss, max_norm)
+    norm = clipped_gradient(optimizer, loss, max_norm)
     if not torch.isfinite(norm):
         raise FloatingPointError(
             f"the gradient is not finite at update {update} (loss {loss.item()}): "
@@ -38,18 +38,23 @@ def descend(optimizer: torch.optim.Optimizer, loss: Tensor, max_norm: float, upd
 
 
 def descend_if_finite(optimizer: torch.optim.Optimizer, loss: Tensor, max_norm: float) -> Tensor:
-    """Makes one step of a fused optimizer without reading values back; a gradient that is not finite changes nothing.
+    """Makes one step of a fused optimizer without reading values back.
+
+    A loss or a gradient that is not finite changes nothing.
 
     Returns:
-        The norm of the gradient before clipping; the step was made if and only if the norm is finite.
+        The norm of the gradient before clipping, NaN for a loss that is not finite; the step was made if and only if
+        the norm is finite.
     """
-    norm = _clipped_gradient(optimizer, loss, max_norm)
+    norm = clipped_gradient(optimizer, loss, max_norm)
+    norm = torch.where(torch.isfinite(loss.detach()), norm, torch.nan)
     optimizer.found_inf = (~torch.isfinite(norm)).float()  # type: ignore[attr-defined]  # 1 skips the step
     optimizer.step()
     return norm
 
 
-def _clipped_gradient(optimizer: torch.optim.Optimizer, loss: Tensor, max_norm: float) -> Tensor:
+def clipped_gradient(optimizer: torch.optim.Optimizer, loss: Tensor, max_norm: float) -> Tensor:
+    """Gives the parameters of an optimizer the gradient of a loss, clipped; returns its norm before clipping."""
     optimizer.zero_grad(set_to_none=True)
     loss.backward()
     parameters = [parameter for group in optimizer.param_groups for parameter in group["params"]]

@@ -15,7 +15,8 @@ from latentplan.training import distill, resume_distillation
 from latentplan.training.distillation.labels import Demonstrations, plan_actions
 from latentplan.training.distillation.run import Comparison
 from latentplan.training.distillation.student import Student
-from latentplan.training.state import DISTILLATION_FILE, INTERRUPTED, lock_folder
+from latentplan.training.state import lock_folder
+from tests.training.run_folder import list_saves, read_state
 
 INFO = {"domain": "user", "task": "push", "env_frames": 7, "discount": 0.9, "metrics": [{"planner": 1.0}]}
 PLANNER = PlannerConfig(
@@ -132,13 +133,13 @@ def test_resume_distillation_ends_with_the_agent_of_an_uninterrupted_one(
 ):
     out = tmp_path / "out"
     stopped = distill(checkpoint, out, SETTINGS, make_env=interrupting(push, at_step).make)
-    assert (stopped.exit_code, dict(stopped.summary)) == (INTERRUPTED, {})
+    assert (stopped.exit_code, dict(stopped.summary)) == (130, {})
     assert f"--resume {out}" in " ".join(capsys.readouterr().out.split())
     gone_on = resume_distillation(out, make_env=push)
     assert gone_on.exit_code == 0 and gone_on.summary == finished.summary
     expected, after = read_weights(finished.run_dir), read_weights(out)
     assert all(torch.equal(expected[name], after[name]) for name in expected)
-    saved, reference = (torch.load(folder / DISTILLATION_FILE, weights_only=True) for folder in (out, finished.run_dir))
+    saved, reference = (read_state(folder) for folder in (out, finished.run_dir))
     assert saved["state"]["stage"] == reference["state"]["stage"] == 9
     assert all(torch.equal(saved["demonstrations"][name], part) for name, part in reference["demonstrations"].items())
 
@@ -166,13 +167,19 @@ def test_distill_lifts_the_deadline_of_the_search(spent):
     assert read_info(spent.run_dir)["distilled"]["planner"]["deadline_ms"] is None
 
 
-def test_resume_distillation_adds_rounds_also_to_a_state_saved_by_version_0_1(spent, push, tmp_path):
+def test_resume_distillation_adds_rounds(spent, push, tmp_path):
     folder = shutil.copytree(spent.run_dir, tmp_path / "out")
-    saved = torch.load(folder / DISTILLATION_FILE, weights_only=True)
-    saved["standing"] = saved.pop("state")  # the key of version 0.1
-    torch.save(saved, folder / DISTILLATION_FILE)
     resume_distillation(folder, rounds=2, minutes=60.0, make_env=push)
     assert read_info(folder)["distilled"]["rounds"] == 2
+
+
+def test_resume_distillation_goes_back_to_the_save_before_a_damaged_one(finished, push, tmp_path):
+    folder = shutil.copytree(finished.run_dir, tmp_path / "out")
+    path = list_saves(folder)[-1] / "state.pt"
+    path.write_bytes(path.read_bytes()[:-100])
+    with pytest.warns(RuntimeWarning, match=r"state\.pt is damaged.*the save before takes its place"):
+        again = resume_distillation(folder, make_env=push)
+    assert again.summary == finished.summary
 
 
 def test_distill_refuses_folders_in_use_or_damaged(finished, checkpoint, push, tmp_path):
@@ -189,8 +196,8 @@ def test_distill_refuses_folders_in_use_or_damaged(finished, checkpoint, push, t
     with lock_folder(tmp_path / "held"), pytest.raises(UserError, match="another process learns"):
         distill(checkpoint, tmp_path / "held", SETTINGS, make_env=push)
     (tmp_path / "resume").mkdir()
-    (tmp_path / "resume" / "distill.pt").write_bytes((finished.run_dir / "resume" / "distill.pt").read_bytes()[:-100])
-    with pytest.raises(UserError, match=r"distill\.pt is damaged"):
+    (tmp_path / "resume" / "distill.pt").touch()
+    with pytest.raises(UserError, match="0.2.0 or earlier"):
         resume_distillation(tmp_path)
 
 
@@ -202,7 +209,7 @@ def test_distill_refuses_an_agent_with_learned_goals(model, tiny, push, tmp_path
 
 
 def test_distill_plans_the_oldest_labels_again_in_each_round(finished):
-    rounds = torch.load(finished.run_dir / DISTILLATION_FILE, weights_only=True)["demonstrations"]["round"]
+    rounds = read_state(finished.run_dir)["demonstrations"]["round"]
     # 40 beliefs a round; a tenth of the 40 and of the 80 there were before is labelled anew in rounds 1 and 2.
     assert len(rounds) == 120
     assert rounds[:40].unique(return_counts=True)[1].tolist() == [40 - 12, 4, 8]

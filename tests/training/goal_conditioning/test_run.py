@@ -2,6 +2,7 @@
 
 import math
 import os
+import shutil
 import signal
 
 import numpy as np
@@ -12,18 +13,21 @@ from latentplan.agents.checkpoint import load_agent, load_model, read_info, save
 from latentplan.agents.gated import GatedAgent
 from latentplan.agents.planning import PlanningAgent
 from latentplan.config import GoalsConfig, UserError
+from latentplan.config.commit import Saves
+from latentplan.config.files import dump_config
 from latentplan.config.quantities import QUANTITIES
 from latentplan.models import State, WorldModel
 from latentplan.objectives.box import box_degree, box_of
 from latentplan.objectives.parser import parse_objective
 from latentplan.replay.buffer import Replay, Rows
+from latentplan.replay.disk import ReplayFiles
 from latentplan.training import learn_goals, resume_goals
 from latentplan.training.goal_conditioning import learner as goal_learner
 from latentplan.training.goal_conditioning import run as goal_run
 from latentplan.training.goal_conditioning.learner import Boxes, BoxSource, GoalLearner
 from latentplan.training.goal_conditioning.run import describe_box, load_replay
 from latentplan.training.learner.optimization import descend
-from latentplan.training.state import GOALS_FILE, INTERRUPTED, lock_folder
+from latentplan.training.state import lock_folder
 
 LABELS = {"height": 0.5, "speed": 1.0, "task.walk": 0.5}
 INFO = {"domain": "walker", "task": "walk", "env_frames": 7, "discount": 0.9, "metrics": []}
@@ -55,8 +59,13 @@ def make_run(folder, config, labels):
             labels=rng.normal(size=(ROWS, len(labels))).astype(np.float32),
         ),
     )
-    replay.save(folder / "resume" / "replay")
+    Saves(folder / "resume", "run", 2).commit(ReplayFiles(folder / "resume", replay).write, {"env_frames": ROWS})
+    dump_config(config, folder / "config.yaml")
     return folder
+
+
+def read_replay(run, model):
+    return load_replay(Saves(run / "resume", "run", 2).newest()[0], model)
 
 
 @pytest.fixture(scope="module")
@@ -111,7 +120,7 @@ def test_resume_goals_ends_with_the_agent_of_an_uninterrupted_learning(run, fini
     assert all(torch.equal(value, weights[1][name]) for name, value in weights[0].items())
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 def test_learn_goals_finishes_the_running_update_when_a_signal_arrives(run, finished, tmp_path, monkeypatch, number):
     def interrupted(optimizer, loss, max_norm, update):
         if update == 2:
@@ -121,7 +130,7 @@ def test_learn_goals_finishes_the_running_update_when_a_signal_arrives(run, fini
     monkeypatch.setattr(goal_learner, "descend", interrupted)
     before = signal.getsignal(number)
     result = learn_goals(run, tmp_path / "part", SETTINGS)
-    assert result.exit_code == INTERRUPTED and read_info(tmp_path / "part")["goals"]["updates"] == 3
+    assert result.exit_code == 128 + number and read_info(tmp_path / "part")["goals"]["updates"] == 3
     assert signal.getsignal(number) is before
     monkeypatch.undo()
     resumed = resume_goals(tmp_path / "part")
@@ -138,7 +147,9 @@ def test_goal_learner_raises_the_imagined_worth(run):
         model.probe_head.output.weight.normal_(std=2.0)
         model.dynamics.input.linear.weight[:, -1] *= 4.0
     settings = GoalsConfig(starts=64, horizon=4, learning_rate=1e-2, entropy_scale=0.0)
-    learner = GoalLearner(model, settings, config.learning, 0.9, 2, load_replay(run / "resume" / "replay", model))
+    learner = GoalLearner(
+        model, settings, config.learning, 0.9, 2, load_replay(Saves(run / "resume", "run", 2).newest()[0], model)
+    )
     ends = torch.full((64, 2), -math.inf)
     low, high = torch.where(torch.tensor([False, True]), 2.0, ends), -ends  # a high speed at any height
     learner.source.draw = lambda num, generator: Boxes(low, high, torch.arange(num) % ROWS)
@@ -161,7 +172,9 @@ def test_goal_learner_raises_when_the_gradient_is_not_finite(run):
     model.add_goal_heads(8)
     with torch.no_grad():
         model.goal_heads.actor.mlp.output.bias[0] = math.nan
-    learner = GoalLearner(model, SETTINGS, config.learning, 0.9, 2, load_replay(run / "resume" / "replay", model))
+    learner = GoalLearner(
+        model, SETTINGS, config.learning, 0.9, 2, load_replay(Saves(run / "resume", "run", 2).newest()[0], model)
+    )
     with pytest.raises(FloatingPointError, match="not finite at update 0"):
         learner.update()
 
@@ -202,7 +215,7 @@ def test_learn_goals_refuses_folders_and_agents_it_cannot_use(run, finished, tin
     refused(lambda: learn_goals(tmp_path / "mine", tmp_path / "a"), "no replay", "the folder of its run")
     with lock_folder(finished.run_dir):
         refused(lambda: resume_goals(finished.run_dir), "another process learns")
-    refused(lambda: resume_goals(run), "nothing to resume", GOALS_FILE)
+    refused(lambda: resume_goals(run), "a run, not a goals")
     unnamed = make_run(tmp_path / "unnamed", tiny(""), {})
     refused(lambda: learn_goals(unnamed, tmp_path / "b"), "without named quantities")
     other = make_run(tmp_path / "other", tiny("", env={"domain": "walker"}), LABELS)
@@ -229,7 +242,7 @@ def test_learn_goals_plays_first_when_the_agent_has_no_replay(cartpole, tmp_path
     save_checkpoint(tmp_path / "agent", model, config, INFO | {"domain": "cartpole", "task": "swingup"})
     settings = GoalsConfig(**vars(SETTINGS) | {"updates": 1, "play_decisions": 50})
     learn_goals(tmp_path / "agent", tmp_path / "out", settings)
-    replay = load_replay(tmp_path / "out" / "replay", model)
+    replay = load_replay(Saves(tmp_path / "out" / "replay", "replay", 1).newest()[0], model)
     assert 50 <= len(replay) <= 55 and float(replay.labels.abs().sum()) > 0.0
     resumed = resume_goals(tmp_path / "out", updates=2)
     assert read_info(resumed.run_dir)["goals"]["updates"] == 2
@@ -244,16 +257,14 @@ def test_learn_goals_reuses_a_played_replay_only_of_the_same_agent(cartpole, tmp
         folder = tmp_path / f"agent{agent}"
         save_checkpoint(folder, WorldModel(config.model, 1, labels), config, INFO | {"domain": "cartpole"})
         learn_goals(folder, tmp_path / "out", settings)
-        for name in ("info.json", GOALS_FILE):  # as if the process had ended before its first save
-            (tmp_path / "out" / name).unlink()
-        return "playing 25 decisions" in capsys.readouterr().out, (tmp_path / "out" / "replay/rows.pt").read_bytes()
+        (tmp_path / "out" / "info.json").unlink()  # as if the process had ended before its first save
+        shutil.rmtree(tmp_path / "out" / "resume")
+        save = Saves(tmp_path / "out" / "replay", "replay", 1).newest()[0]
+        return "playing 25 decisions" in capsys.readouterr().out, (save.folder / "rows.pt").read_bytes()
 
     first, again, other = learn(0), learn(0), learn(1)
     assert first[0] and not again[0] and other[0]
     assert first[1] == again[1] != other[1]
-    (tmp_path / "out" / "replay" / "played.json").unlink()  # the origin of the replay is now unknown
-    with pytest.raises(UserError, match="holds a replay of another agent"):
-        learn(1)
 
 
 def test_describe_box_returns_an_expression_that_parses_to_the_box():

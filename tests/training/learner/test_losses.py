@@ -6,7 +6,7 @@ import torch
 from latentplan.models import Gaussian, State, WorldModel, kl_divergence
 from latentplan.models.backend import lambda_return
 from latentplan.training.learner.losses import draw_noise, imagine, imitation_loss, world_model_loss
-from latentplan.training.learner.optimization import return_scale
+from latentplan.training.learner.optimization import descend, return_scale
 
 
 def make_generator():
@@ -117,7 +117,7 @@ def test_world_model_loss_has_no_gradient_for_actor_and_value_head(model, batch,
 def test_behaviour_loss_has_no_gradient_for_the_world_model(learner, batch):
     learned = world_model_loss(learner.model, batch, learner.config, make_generator())
     loss, _ = learner._behaviour_loss(learned, batch, make_generator())
-    learner._descend(learner.configure_optimizers()[1], loss)
+    descend(learner.configure_optimizers()[1], loss, 100.0, 0)
     assert all(parameter.grad is None for parameter in learner.snapshot.model.dynamics.parameters())
     assert find_parts_with_gradient(learner.model) == {"actor", "value_head"}
     assert all(parameter.grad is None for parameter in learner.target_value.parameters())

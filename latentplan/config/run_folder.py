@@ -1,0 +1,64 @@
+"""The settings and the saves in the folder of a run."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from latentplan.config.checks import UserError
+from latentplan.config.commit import Saves
+from latentplan.config.files import SECTIONS, build_config, field_names, read_config, read_layer
+from latentplan.config.settings import Config
+
+RUN_FILE = "config.yaml"
+SAVES_FOLDER = "resume"
+RUN_FORMAT = 2  # 1 was `resume/state.pt`, from which a run could not continue exactly
+
+
+def run_saves(folder: Path) -> Saves:
+    """The saves of a run.
+
+    Raises:
+        UserError: The run was saved in the format of an earlier version.
+    """
+    saves = Saves(folder / SAVES_FOLDER, "run", RUN_FORMAT)
+    if (folder / SAVES_FOLDER / "state.pt").exists() and not saves.exist():
+        raise UserError(
+            f"{folder} was saved by latentplan 0.2.0 or earlier, from whose saves a run does not continue exactly: "
+            "finish it with that version, or start a new run; its agents in checkpoints/ load as before"
+        )
+    return saves
+
+
+def read_run_config(folder: Path) -> tuple[Config, str | None]:
+    """The settings with which a run resumes, and a warning, or None.
+
+    These are the settings in `config.yaml` of the run's folder, which a user may have edited. If the file is missing,
+    damaged or cut off, the settings in the last save take its place.
+
+    Raises:
+        UserError: The folder holds no run that can be resumed.
+    """
+    path, copy = folder / RUN_FILE, run_saves(folder).find(RUN_FILE)
+    if copy is None:
+        raise UserError(f"nothing to resume in {folder}: it holds no save of a run that is whole")
+    saved = read_config(copy)
+    try:
+        if path.read_bytes() == copy.read_bytes():
+            return saved, None
+        layer = read_layer(path)
+        missing = [f"{section}.{name}" for section in SECTIONS for name in field_names(section)]
+        missing = [key for key in missing if key.partition(".")[2] not in layer.get(key.partition(".")[0], {})]
+        if missing:
+            raise UserError(f"{path} lacks {', '.join(missing[:3])}")
+        own = build_config(layer)
+    except (OSError, ValueError) as error:
+        reason = error if isinstance(error, UserError) else f"{path} cannot be read"
+        return saved, f"{reason}: the settings of the last save take its place"
+    changes = [
+        f"{section}.{name} from {before!r} to {after!r}"
+        for section in SECTIONS
+        for name, before in vars(getattr(saved, section)).items()
+        if (after := getattr(getattr(own, section), name)) != before
+    ]
+    what = ", ".join(changes) or "nothing that counts"
+    return own, f"{path} was edited after the last save, or is damaged: the run goes on with a change of {what}"

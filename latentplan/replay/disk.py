@@ -1,0 +1,116 @@
+"""The replay on disk: frames in append-only logs, and everything else of the rows in one file per save."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from latentplan.config import UserError
+from latentplan.config.commit import Extent, Log, Save, Saves
+from latentplan.replay.buffer import COLUMNS, FRAME_BYTES, FRAME_SHAPE, Replay, read_saved
+
+ROWS_FILE = "rows.pt"
+FORMAT = 1
+ROWS_PER_BLOCK = 256
+
+
+class ReplayFiles:
+    """Writes the rows of a replay for a save, and reads them back.
+
+    Frames never change once they were collected, so a save appends those that are new. The other columns are written
+    whole, because updates refresh the beliefs of any rows; they take a small part of the room that frames take.
+
+    Args:
+        folder: Folder of all saves.
+        replay: The replay.
+    """
+
+    def __init__(self, folder: Path, replay: Replay) -> None:
+        self.folder, self.replay = folder, replay
+        self._logs = [Log(folder, f"frames{lane}", FRAME_BYTES) for lane in range(replay.num_lanes)]
+
+    def write(self, part: Path) -> dict[str, Extent]:
+        """Appends new frames, and writes the other columns into the folder of a save.
+
+        Returns:
+            The committed part of each log.
+        """
+        replay = self.replay
+        extents: dict[str, Extent] = {}
+        for lane, log in enumerate(self._logs):
+            first, end = int(replay.first[lane]), int(replay.written[lane])
+            if (start := max(first, log.end)) < end:
+                log.append(start, self._blocks(lane, start, end))
+            log.drop_before(first)
+            extents |= log.extents()
+        index = torch.cat([replay.held_rows(lane) for lane in range(replay.num_lanes)])
+        columns = {name: getattr(replay, name)[index].cpu() for name in COLUMNS}
+        episode = torch.from_numpy(replay.episode).flatten()[index.cpu()]
+        bounds = {name: torch.from_numpy(getattr(replay, name).copy()) for name in ("first", "written")}
+        torch.save(columns | bounds | {"episode": episode}, part / ROWS_FILE)
+        return extents
+
+    def read(self, save: Save) -> None:
+        """Fills the replay with the rows of a save, or with the newest that fit.
+
+        Raises:
+            UserError: The lanes, actions, beliefs or labels of the save have other sizes.
+        """
+        replay = self.replay
+        saved = read_saved(save.folder / ROWS_FILE, keys=(*COLUMNS, "episode", "first", "written"))
+        columns = ("actions", "deter", "labels")
+        sizes = (len(saved["written"]), *(saved[name].shape[1] for name in columns))
+        own = (replay.num_lanes, *(getattr(replay, name).shape[1] for name in columns))
+        if sizes != own:
+            raise UserError(
+                f"the replay in {save.folder} has (environments, action, deter, labels) {sizes}, this run {own}"
+            )
+        offset = 0
+        for lane, (first, end) in enumerate(zip(saved["first"].tolist(), saved["written"].tolist(), strict=True)):
+            held = min(end - first, replay.lane_size)
+            rows = slice(offset + end - first - held, offset + end - first)
+            offset += end - first
+            replay.first[lane], replay.written[lane] = end - held, end
+            index = replay.held_rows(lane)
+            positions = index.cpu().numpy() - lane * replay.lane_size
+            replay.episode[lane, positions] = saved["episode"][rows].numpy()
+            replay.is_end[lane, positions] = saved["continues"][rows].numpy() == 0.0
+            for name in COLUMNS:
+                getattr(replay, name)[index] = saved[name][rows].to(replay.device)
+            self._logs[lane].restore(save.logs)
+            self._read_frames(lane, end - held, end)
+
+    def _blocks(self, lane: int, start: int, end: int) -> Iterator[bytes]:
+        replay = self.replay
+        for first in range(start, end, ROWS_PER_BLOCK):
+            rows = torch.arange(first, min(first + ROWS_PER_BLOCK, end)) % replay.lane_size + lane * replay.lane_size
+            yield replay.frames[rows.to(replay.device)].cpu().numpy().tobytes()
+
+    def _read_frames(self, lane: int, start: int, end: int) -> None:
+        replay, log, found = self.replay, self._logs[lane], 0
+        for first, count, path in log.rows():
+            low, high = max(first, start), min(first + count, end)
+            if low >= high:
+                continue
+            stored = np.memmap(path, np.uint8, "r", shape=(count, *FRAME_SHAPE))
+            rows = torch.arange(low, high) % replay.lane_size + lane * replay.lane_size
+            frames = torch.from_numpy(np.array(stored[low - first : high - first]))
+            replay.frames[rows.to(replay.device)] = frames.to(replay.device)
+            found += high - low
+        if found != end - start:
+            raise UserError(f"the logs in {self.folder} are damaged: they must hold {end - start:,} frames")
+
+
+def save_replay(replay: Replay, folder: Path, note: Mapping[str, Any]) -> None:
+    """Saves a replay alone; `load_replay` restores it."""
+    Saves(folder, "replay", FORMAT).commit(ReplayFiles(folder, replay).write, note)
+
+
+def count_saved(save: Save) -> tuple[int, int]:
+    """Environments of a saved replay, and the largest number of rows that one of them holds."""
+    saved = read_saved(save.folder / ROWS_FILE, keys=("first", "written"))
+    return len(saved["written"]), int((saved["written"] - saved["first"]).max())

@@ -1,0 +1,142 @@
+"""The running episodes of collection: each has its own seed and a record of its actions, so that it can be repeated."""
+
+from __future__ import annotations
+
+import warnings
+import zlib
+from typing import Any
+
+import numpy as np
+import torch
+from gymnasium.vector import VectorEnv
+
+from latentplan.config import derive_seed
+
+
+class Stopped(Exception):
+    """A round was given up, because the run stops; a resumed run repeats the round."""
+
+
+class Episodes:
+    """Starts and steps several environments, and keeps a record of every running episode.
+
+    An episode's start depends only on the seed of the run, its environment and its number. Its seed and its actions
+    therefore bring another environment into the same state, if the environment depends on nothing else.
+
+    Args:
+        envs: The environments.
+        seed: Seed of the run.
+    """
+
+    def __init__(self, envs: VectorEnv[np.ndarray, np.ndarray, Any], seed: int) -> None:
+        self.envs, self.seed = envs, seed
+        self._begun = [0] * envs.num_envs  # episodes so far, of each environment
+        self._actions: list[list[np.ndarray]] = [[] for _ in range(envs.num_envs)]
+        self._is_started = False
+        self._over = np.zeros(envs.num_envs, dtype=bool)  # while episodes are repeated
+
+    def restart(self, where: np.ndarray) -> tuple[np.ndarray, dict[str, Any]]:
+        """Begins the next episode in some environments.
+
+        Args:
+            where: The environments, bool (env,); all of them at the first call.
+
+        Returns:
+            Frames of all environments, uint8 (env, 64, 64, 3), and the infos of those that began.
+        """
+        for lane in np.flatnonzero(where):
+            self._begun[lane] += 1
+            self._actions[lane].clear()
+        return self._reset(where)
+
+    def step(self, actions: np.ndarray) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
+        """The result of one step of all environments with actions (env, action)."""
+        for record, action in zip(self._actions, actions, strict=True):
+            record.append(np.array(action))
+        return self.envs.step(actions)
+
+    def memory(self, frames: np.ndarray, has_ended: np.ndarray) -> list[dict[str, Any]]:
+        """The record of each environment's running episode, for `replay`.
+
+        Args:
+            frames: The present frames, uint8 (env, 64, 64, 3).
+            has_ended: Environments whose episode is over, bool (env,).
+        """
+        size = self.envs.single_action_space.shape or ()
+        return [
+            {
+                "begun": begun,
+                "actions": np.stack(record) if record and not over else np.zeros((0, *size), np.float32),
+                "frame": zlib.crc32(frame.tobytes()),
+            }
+            for begun, record, frame, over in zip(self._begun, self._actions, frames, has_ended, strict=True)
+        ]
+
+    def replay(self, records: list[dict[str, Any]]) -> tuple[np.ndarray, Any, np.ndarray]:
+        """Plays recorded episodes again; the shorter ones begin later, so that all arrive at the same time.
+
+        Args:
+            records: What `memory` returned; records without actions stand for episodes that are over.
+
+        Returns:
+            The present frames, uint8 (env, 64, 64, 3), the present labels, and whether each environment has repeated
+            its episode, bool (env,).
+        """
+        self._begun = [record["begun"] for record in records]
+        actions = [record["actions"].numpy() for record in records]
+        lengths = np.array([len(taken) for taken in actions])
+        is_same = np.ones(len(records), dtype=bool)
+        frames, info = self._reset(np.ones(len(records), dtype=bool))
+        for time in range(longest := int(lengths.max(initial=0))):
+            place = time - (longest - lengths)  # of each episode; before 0 the environment waits and plays anything
+            begins = (place == 0) | (self._over)
+            if time and begins.any():
+                frames, _ = self._reset(begins)
+            taken = [
+                own[at] if at >= 0 else np.zeros(own.shape[1:], np.float32)
+                for own, at in zip(actions, place, strict=True)
+            ]
+            frames, _, terminated, truncated, info = self.envs.step(np.stack(taken))
+            self._over = np.asarray(terminated) | np.asarray(truncated)
+            is_same &= ~(self._over & (place >= 0))
+        self._actions = [list(taken) for taken in actions]
+        sums = np.array([zlib.crc32(frame.tobytes()) for frame in frames])
+        is_same &= (sums == np.array([record["frame"] for record in records])) | (lengths == 0)
+        if not is_same.all():
+            warnings.warn(
+                f"{(~is_same).sum()} of {len(is_same)} environments did not repeat their episode from its seed and its "
+                "actions: new episodes begin there, and the run is no longer equal to an uninterrupted one",
+                RuntimeWarning,
+                stacklevel=2,
+            )
+        return frames, info.get("labels"), is_same
+
+    def _reset(self, where: np.ndarray) -> tuple[np.ndarray, dict[str, Any]]:
+        seeds: Any = [derive_seed(self.seed, f"episodes {lane}", begun) for lane, begun in enumerate(self._begun)]
+        self._over = np.zeros(len(seeds), dtype=bool)
+        if not self._is_started:
+            self._is_started = True
+            return self.envs.reset(seed=seeds)
+        return self.envs.reset(seed=seeds, options={"reset_mask": where})
+
+
+def to_arrays(value: Any) -> Any:
+    """Nested dictionaries and lists with their tensors as NumPy arrays; bfloat16 becomes float32."""
+    if isinstance(value, dict):
+        return {name: to_arrays(inner) for name, inner in value.items()}
+    if isinstance(value, list | tuple):
+        return [to_arrays(inner) for inner in value]
+    if isinstance(value, torch.Tensor):
+        return (value.float() if value.dtype == torch.bfloat16 else value).numpy()
+    return value
+
+
+def to_tensors(value: Any) -> Any:
+    """Nested dictionaries and lists with their NumPy arrays as tensors, which `torch.save` writes as plain data."""
+    if isinstance(value, dict):
+        return {name: to_tensors(inner) for name, inner in value.items()}
+    if isinstance(value, list | tuple):
+        return [to_tensors(inner) for inner in value]
+    if isinstance(value, np.ndarray):
+        return torch.from_numpy(np.ascontiguousarray(value).copy())
+    return value

@@ -1,0 +1,257 @@
+"""The callbacks of a training run that save, restore, guard and stop it."""
+
+from __future__ import annotations
+
+import copy
+import shutil
+import time
+import warnings
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import lightning
+import torch
+
+from latentplan.agents.checkpoint import save_checkpoint
+from latentplan.config import Config
+from latentplan.config.commit import Extent, Saves
+from latentplan.config.files import dump_config
+from latentplan.config.run_folder import RUN_FILE
+from latentplan.models import WorldModel
+from latentplan.replay.disk import ReplayFiles
+from latentplan.training.callbacks import Collect
+from latentplan.training.collection.episodes import to_tensors
+from latentplan.training.learner.optimization import load_optimizer_state
+from latentplan.training.learner.skips import LONGEST_STREAK, NotFiniteError
+from latentplan.training.signals import Signals
+from latentplan.training.state import METRICS_FILE, RunState, SavedRun, write_state
+
+if TYPE_CHECKING:
+    from latentplan.training.learner.module import Learner
+
+SAVE_MINUTES = 5.0
+SAVE_SHARE = 0.01  # timed saves take at most this share of the time
+SKIPPED_FOLDER = "skipped"
+KEPT_BATCHES = 10
+
+
+class Save(lightning.Callback):
+    """Saves the last agent, the best agent, and the state from which a run resumes.
+
+    Args:
+        folder: Folder of the run.
+        config: Settings of the run.
+        collect: Source of the evaluated weights, of the worker's requests and of the collector's state.
+        state: Clocks and evaluations of the run.
+        saves: The saves of the run.
+        files: Writes the replay.
+        facts: Facts of the run that are saved with every agent.
+        optimizers: States that the optimizers were loaded with; saved again if the run ends before its first update.
+    """
+
+    def __init__(
+        self,
+        folder: Path,
+        config: Config,
+        collect: Collect,
+        state: RunState,
+        saves: Saves,
+        files: ReplayFiles,
+        facts: dict[str, Any],
+        optimizers: list[Any],
+    ) -> None:
+        self.folder, self.config, self.collect, self.state, self.facts = folder, config, collect, state, facts
+        self.saves, self.files = saves, files
+        self._loaded_optimizers = optimizers
+        self._num_seen_evaluations = len(state.evaluations)
+        self._has_evaluated = False
+        self._next_minutes = state.minutes + SAVE_MINUTES
+
+    def on_train_epoch_start(self, trainer: lightning.Trainer, learner: Learner) -> None:  # type: ignore[override]
+        """Save the agent of an evaluation that has just finished, if it is the best."""
+        self._has_evaluated |= self.keep_best(learner)
+
+    def on_train_epoch_end(self, trainer: lightning.Trainer, learner: Learner) -> None:  # type: ignore[override]
+        """Save after every evaluation, and some minutes after the last save."""
+        if self.collect.is_epoch_over and (self._has_evaluated or self.state.minutes >= self._next_minutes):
+            self.save(trainer, learner)
+
+    def keep_best(self, learner: Learner) -> bool:
+        """Save the latest evaluated agent if its planner is the best so far.
+
+        Returns:
+            Whether an evaluation finished since the last call.
+        """
+        if len(self.state.evaluations) == self._num_seen_evaluations:
+            return False
+        self._num_seen_evaluations = len(self.state.evaluations)
+        if (latest := self.state.evaluations[-1])["planner"] > self.state.best_return:
+            self.state.best_return = latest["planner"]
+            evaluated = copy.deepcopy(learner.averaged)
+            weights = self.collect.evaluated_weights
+            evaluated.load_state_dict({name: torch.from_numpy(value) for name, value in weights.items()})
+            self.save_agent("best", evaluated, {name: latest[name] for name in ("env_frames", "updates", "minutes")})
+        return True
+
+    def save(self, trainer: lightning.Trainer, learner: Learner) -> None:
+        """Save the last agent and the state of the run."""
+        started = time.monotonic()
+        self.save_agent("last", learner.averaged, self.clocks(learner))
+        self.save_run(trainer, learner)
+        self._has_evaluated = False
+        pause = max(SAVE_MINUTES, (time.monotonic() - started) / 60.0 / SAVE_SHARE)
+        self._next_minutes = self.state.minutes + (pause if SAVE_MINUTES > 0.0 else 0.0)
+
+    def save_run(self, trainer: lightning.Trainer, learner: Learner) -> None:
+        """Save the state from which the run resumes."""
+        learner.catch_up()
+        saved = SavedRun(
+            self.state,
+            {
+                "weights": learner.state_dict(),
+                "updates": learner.updates,
+                "metrics": {name: float(value) for name, value in learner.metrics.items()},
+                "skips": [half.to_list() for half in learner.skips],
+            },
+            [optimizer.state_dict() for optimizer in trainer.optimizers] or self._loaded_optimizers,
+            to_tensors(self.collect.requests),
+            to_tensors(self.collect.memory),
+        )
+
+        def write(part: Path) -> dict[str, Extent]:
+            extents = self.files.write(part)
+            write_state(saved, part)
+            dump_config(self.config, part / RUN_FILE)
+            if (self.folder / METRICS_FILE).exists():
+                shutil.copyfile(self.folder / METRICS_FILE, part / METRICS_FILE)
+            return extents
+
+        self.saves.commit(write, self.clocks(learner))
+
+    def save_agent(self, name: str, model: WorldModel, info: dict[str, Any]) -> None:
+        """Save an agent in `checkpoints/<name>`, with the facts in `info` and the facts of the run."""
+        facts = self.facts | info | {"metrics": self.state.evaluations}
+        save_checkpoint(self.folder / "checkpoints" / name, model, self.config, facts)
+
+    def clocks(self, learner: Learner) -> dict[str, Any]:
+        """The frames, updates and minutes of the present agent."""
+        return {"env_frames": self.state.env_frames, "updates": learner.updates, "minutes": self.state.minutes}
+
+
+class Restore(lightning.Callback):
+    """Loads saved states into the optimizers of a resumed run.
+
+    Args:
+        optimizers: One saved state per optimizer; empty for a new run.
+    """
+
+    def __init__(self, optimizers: list[Any]) -> None:
+        self.optimizers = optimizers
+
+    def on_fit_start(self, trainer: lightning.Trainer, learner: lightning.LightningModule) -> None:
+        """Load the saved states, after Lightning has made the optimizers."""
+        for optimizer, saved in zip(trainer.optimizers, self.optimizers, strict=True) if self.optimizers else ():
+            load_optimizer_state(optimizer, saved)
+
+
+class Guard(lightning.Callback):
+    """Keeps batches whose steps were skipped, and ends a run in which too many steps in a row were skipped.
+
+    A GPU is asked at the end of an epoch only, because it would have to wait. Then the last batch of the epoch that was
+    skipped is kept.
+
+    Args:
+        folder: Folder of the run; batches are kept in `skipped/` there, at most 10.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder / SKIPPED_FOLDER
+        self._seen = [0, 0]
+
+    def on_train_start(self, trainer: lightning.Trainer, learner: Learner) -> None:  # type: ignore[override]
+        """Count from the steps that were skipped before."""
+        self._seen = [int(half.total) for half in learner.skips]
+
+    def on_train_batch_end(self, trainer: lightning.Trainer, learner: Learner, *_: Any) -> None:  # type: ignore[override]
+        """Check the latest update, on a CPU."""
+        if learner.device.type == "cpu":
+            self.check(learner)
+
+    def on_train_epoch_end(self, trainer: lightning.Trainer, learner: Learner) -> None:  # type: ignore[override]
+        """Check all updates since the last check."""
+        self.check(learner)
+
+    def check(self, learner: Learner) -> None:
+        """Keep the batch of a skipped step.
+
+        Raises:
+            NotFiniteError: Ten steps in a row were skipped.
+        """
+        for half, name in enumerate(("model", "behaviour")):
+            skips = learner.skips[half]
+            if (total := int(skips.total)) == self._seen[half]:
+                continue
+            self._seen[half] = total
+            self._keep(learner, name, skips.rows)
+            if int(skips.longest) >= LONGEST_STREAK:
+                raise NotFiniteError(
+                    f"the loss or gradient of the {name} was not finite in {LONGEST_STREAK} steps in a row, up to "
+                    f"update {learner.updates}; batches are kept in {self.folder}; a lower learning rate may help",
+                    learner.updates,
+                )
+
+    def _keep(self, learner: Learner, name: str, rows: torch.Tensor) -> None:
+        """Keep a batch and warn; after some batches a run only counts, because one reason would fill its log."""
+        path = self.folder / f"{name}-{learner.updates:09d}.pt"
+        if path.exists() or len(list(self.folder.glob("*.pt"))) >= KEPT_BATCHES:
+            return
+        self.folder.mkdir(exist_ok=True)
+        torch.save(
+            {
+                part: value.cpu()
+                for part, value in learner.replay.gather(rows.to(learner.replay.device))._asdict().items()
+            },
+            path,
+        )
+        warnings.warn(
+            f"the loss or gradient of the {name} was not finite at update {learner.updates}: the step was skipped, and "
+            f"its batch is kept in {path}",
+            RuntimeWarning,
+            stacklevel=2,
+        )
+
+
+class Stop(lightning.Callback):
+    """Ends the run at its budget, or when a signal asks for it.
+
+    Args:
+        config: Settings of the run, with its budget.
+        state: Clocks of the run, and whether a signal interrupted it.
+        signals: Handles signals, also while Lightning runs.
+    """
+
+    def __init__(self, config: Config, state: RunState, signals: Signals) -> None:
+        self.run, self.state, self.signals = config.run, state, signals
+
+    def on_train_start(self, trainer: lightning.Trainer, learner: lightning.LightningModule) -> None:
+        """Handle signals in place of Lightning, whose handler would lose the run."""
+        self.signals.install()
+
+    def on_train_batch_end(self, trainer: lightning.Trainer, *_: Any) -> None:  # type: ignore[override]
+        """Stop between two updates when the minutes are spent or a signal has arrived."""
+        if self.state.interrupted or self._is_time_spent():
+            trainer.should_stop = True
+
+    def on_train_epoch_end(self, trainer: lightning.Trainer, learner: lightning.LightningModule) -> None:
+        """Stop after the epoch that learned from the last round."""
+        if self.state.interrupted or self.is_spent():
+            trainer.should_stop = True
+
+    def is_spent(self) -> bool:
+        """Whether the minutes are used up, or the frames are and the learner has learned from all of them."""
+        frames, state = self.run.frames, self.state
+        has_learned = not state.in_epoch and state.learned_rounds == state.rounds
+        return self._is_time_spent() or (frames is not None and state.env_frames >= frames and has_learned)
+
+    def _is_time_spent(self) -> bool:
+        return self.run.minutes is not None and self.state.minutes >= self.run.minutes
