@@ -28,6 +28,7 @@ from latentplan.planning.realtime.worker import settle
 from latentplan.planning.search.cem import CEMPlanner, icem_planner, mppi_planner
 from latentplan.planning.search.elites import refit
 from latentplan.planning.search.registry import PLANNERS, Planner, SupportsPlan, make_planner
+from latentplan.planning.simulators import JaxModel, MuJoCoModel, Physics
 
 __all__ = [
     "PLANNERS",
@@ -36,9 +37,12 @@ __all__ = [
     "CEMTrajectoryOptimizer",
     "Decision",
     "FunctionModel",
+    "JaxModel",
     "Model",
     "ModelPredictiveController",
+    "MuJoCoModel",
     "Objective",
+    "Physics",
     "Plan",
     "PlanBuffer",
     "PlanExecutor",
