@@ -1,0 +1,34 @@
+"""This library's planners, with their own defaults: only the problem and the budget are named."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import torch
+
+from bench.controllers.serve import Entry, serve
+from bench.controllers.task import Act, Task
+from latentplan.planning import PLANNERS, ModelPredictiveController, make_planner
+
+
+def controller(name: str) -> Callable[[Task, Sequence[int]], Act]:
+    """A function that makes the controller of a registered planner."""
+
+    def make(task: Task, seeds: Sequence[int]) -> Act:
+        problem = task.problem
+        bounds = {"action_low": problem.action_low, "action_high": problem.action_high}
+        size = {"action_dim": problem.action_dim, "horizon": problem.horizon}
+        if make_planner(name, **size).num_iterations == 1:  # the planner spends its budget in one iteration
+            budget = {"num_samples": task.samples * task.iterations}
+        else:
+            iterations = {"num_iterations": task.iterations, "warm_start_iterations": task.iterations}
+            budget = {"num_samples": task.samples, **iterations}
+        planner = make_planner(name, **size, **bounds, **budget, **task.settings)
+        streams = [torch.Generator().manual_seed(seed) for seed in seeds]
+        return ModelPredictiveController(planner, task.model(), generator=streams).act
+
+    return make
+
+
+if __name__ == "__main__":
+    serve({name: Entry(controller(name), is_batched=True) for name in PLANNERS})
