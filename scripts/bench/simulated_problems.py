@@ -168,14 +168,14 @@ def _from_mujoco(
     mjmodel: mujoco.MjModel,
     cost: Callable[[Physics, Tensor], Tensor],
     draw_start: Callable[[torch.Generator], Tensor],
-    **sizes: int,
+    **sizes: Any,
 ) -> SimulatedProblem:
     simulator = MuJoCoModel(mjmodel, cost, substeps=sizes.pop("substeps"))
     return _problem(name, simulator, simulator.action_dim, draw_start, **sizes)
 
 
 def _problem(
-    name: str, simulator: RolloutModel, action_dim: int, draw_start: Callable[[torch.Generator], Tensor], **sizes: int
+    name: str, simulator: RolloutModel, action_dim: int, draw_start: Callable[[torch.Generator], Tensor], **sizes: Any
 ) -> SimulatedProblem:
     """Returns the problem of a model, for actions in [-1, 1]."""
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from typing import Any
 
 import torch
 
@@ -16,9 +17,9 @@ def controller(name: str) -> Callable[[Task, Sequence[int]], Act]:
 
     def make(task: Task, seeds: Sequence[int]) -> Act:
         problem = task.problem
-        bounds = {"action_low": problem.action_low, "action_high": problem.action_high}
-        size = {"action_dim": problem.action_dim, "horizon": problem.horizon}
-        if make_planner(name, **size).num_iterations == 1:  # the planner spends its budget in one iteration
+        bounds: dict[str, Any] = {"action_low": problem.action_low, "action_high": problem.action_high}
+        size: dict[str, Any] = {"action_dim": problem.action_dim, "horizon": problem.horizon}
+        if getattr(make_planner(name, **size), "num_iterations", None) == 1:  # it spends its budget in one iteration
             budget = {"num_samples": task.samples * task.iterations}
         else:
             iterations = {"num_iterations": task.iterations, "warm_start_iterations": task.iterations}

@@ -7,6 +7,7 @@ import json
 import os
 import random
 import sys
+import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import cache
 from typing import Any, NamedTuple
@@ -14,7 +15,6 @@ from typing import Any, NamedTuple
 import torch
 
 from bench.controllers.task import Act, Task, find_problem
-from bench.machine import read_clock
 
 MakeController = Callable[[Task, Sequence[int]], Act]
 
@@ -82,6 +82,8 @@ def play(entry: Entry, task: Task, seeds: Sequence[int]) -> dict[str, Any]:
 
 def _decisions(entry: Entry, request: dict[str, Any]) -> Iterator[float]:
     """Yields the milliseconds of each decision of runs that follow each other."""
+    # The processor time of one thread does not count the work of other programs on a busy machine.
+    clock = time.thread_time if torch.get_num_threads() == 1 else time.perf_counter
     seed, task = 0, _task(request)
     problem = task.problem
     while True:
@@ -89,9 +91,9 @@ def _decisions(entry: Entry, request: dict[str, Any]) -> Iterator[float]:
             act, state = entry.make(task, [seed]), problem.start([seed])
         for _ in range(problem.num_steps):
             with torch.no_grad():
-                started = read_clock(state.device)
+                started = clock()
                 action = act(state)
-                elapsed = read_clock(state.device) - started
+                elapsed = clock() - started
                 state = problem.dynamics(state, action)
             yield 1000.0 * elapsed
         seed += 1

@@ -40,12 +40,14 @@ class TaskEnv(ModelBasedEnvBase):  # type: ignore[misc]
 
 
 class Return(nn.Module):
-    """Writes the summed reward of each candidate as its advantage."""
+    """Writes the summed reward of each candidate, below that of the best, as its advantage."""
 
     def forward(self, tensordict: TensorDict) -> TensorDict:
         """The same tensordict with `advantage`."""
-        reward = tensordict["next", "reward"]
-        return tensordict.set("advantage", reward.sum(dim=-2, keepdim=True).expand_as(reward).contiguous())
+        reward = tensordict["next", "reward"]  # (1, candidate, step, 1)
+        total = reward.sum(dim=-2, keepdim=True)
+        # The planner takes the exponential of the advantage, which is 0 for all candidates if all are very negative.
+        return tensordict.set("advantage", (total - total.max()).expand_as(reward).contiguous())
 
 
 def make_with(kind: Any) -> Callable[[Task, Sequence[int]], Act]:
