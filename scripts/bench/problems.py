@@ -93,7 +93,8 @@ def pendulum() -> ControlProblem:
     State: angle from upright in radians and speed in radians per second. A rod of mass 1 and length 1 turns under
     gravity 10, in steps of 0.05 s, at speeds of at most 8. The action is a torque in [-2, 2]. The cost of a step is
     angle² + 0.1 speed² + 0.001 torque², the angle taken in (-pi, pi]. A run starts at the bottom with speed 1, each up
-    to 0.05 off.
+    to 0.01 off. A plan of 20 steps ends before the pendulum is up. From starts that are further off some runs find by
+    chance another swing that costs 220, which says nothing of the planner.
     """
 
     def dynamics(state: Tensor, action: Tensor) -> Tensor:
@@ -107,7 +108,7 @@ def pendulum() -> ControlProblem:
         return angle.square() + 0.1 * speed.square() + 0.001 * action[:, 0].square()
 
     def draw_start(generator: torch.Generator) -> Tensor:
-        return torch.tensor([math.pi, 1.0]) + _spread(2, 0.05, generator)
+        return torch.tensor([math.pi, 1.0]) + _spread(2, 0.01, generator)
 
     return ControlProblem("pendulum", 1, -2.0, 2.0, 20, 100, dynamics, cost, draw_start)
 
