@@ -8,6 +8,7 @@ from torch.utils._pytree import tree_map
 
 from latentplan.planning.model import State
 from latentplan.planning.search.scorer import Scorer
+from latentplan.planning.search.space import Space
 
 
 def ascend(
@@ -17,7 +18,7 @@ def ascend(
     *,
     num_steps: int,
     step_size: float,
-    bounds: tuple[Tensor, Tensor],
+    space: Space,
 ) -> tuple[Tensor, Tensor, Tensor | None]:
     """Returns sequences improved by gradient ascent on their return.
 
@@ -29,7 +30,7 @@ def ascend(
         actions: Sequences, (batch, horizon, action).
         num_steps: Number of gradient steps.
         step_size: Largest change of an action in the first step, in action units.
-        bounds: Lowest and highest action, each (action,).
+        space: Keeps bounds and limits of the actions.
 
     Returns:
         Sequences (batch, horizon, action) with a return no lower and a violation no higher than before, their returns
@@ -38,7 +39,6 @@ def ascend(
     Raises:
         ValueError: The return is not differentiable in the actions.
     """
-    low, high = bounds
     with torch.enable_grad():
         # A tensor made in inference mode cannot take part in a gradient; its clone can.
         rows = scorer.start_rows(tree_map(lambda leaf: leaf.clone(), state), 1)
@@ -46,7 +46,7 @@ def ascend(
         size = torch.full_like(current[:, :1, :1], step_size)
         value, violation, slope = _measure(scorer, rows, current)
         for _ in range(num_steps):
-            trial = torch.clamp(current + size * slope, low, high)
+            trial = space.decode(space.encode(space.bounds.clamp(current + size * slope)))
             trial_value, trial_violation, trial_slope = _measure(scorer, rows, trial)
             accept = (trial_value > value) & (trial_violation <= violation)
             accept = accept | (torch.isfinite(trial_value) & ~torch.isfinite(value))

@@ -95,7 +95,8 @@ PLANNERS: dict[str, Callable[..., Planner]] = {
 def make_planner(name: str, options: SearchOptions | None = None, **settings: Any) -> Planner:
     """Returns the planner that is registered under a name.
 
-    An option of `options` that has its default value is not passed on, so that `icem` and `mppi` take their own value.
+    `cem` takes every option of `options`. For another planner, an option that has its default value is not passed on,
+    so that `icem` and `mppi` take their own value.
 
     Args:
         name: A name in `PLANNERS`.
@@ -111,6 +112,10 @@ def make_planner(name: str, options: SearchOptions | None = None, **settings: An
         raise_unknown("planner", name, PLANNERS)
     changed: dict[str, Any] = {}
     if options is not None:
-        fields = dataclasses.fields(SearchOptions)
-        changed = {f.name: getattr(options, f.name) for f in fields if getattr(options, f.name) != f.default}
+        names = {field.name for field in dataclasses.fields(SearchOptions)}
+        takes_all = PLANNERS[name] is CEMPlanner
+        for field in dataclasses.fields(options):  # an agent's settings have defaults of their own
+            value = getattr(options, field.name)
+            if field.name in names and (takes_all or value != field.default):
+                changed[field.name] = value
     return PLANNERS[name](**changed | settings)

@@ -8,6 +8,8 @@ from functools import lru_cache
 import torch
 from torch import Tensor
 
+MODEL_STREAM = 0x5DEECE66D  # makes the seed of a model's stream another than the seeds it is made of
+
 Generators = torch.Generator | Sequence[torch.Generator] | None
 
 
@@ -49,6 +51,11 @@ class Streams:
     def policy_generators(self) -> list[torch.Generator]:
         """Returns a stream for each environment's policy samples."""
         return [torch.Generator(self._device).manual_seed(seed) for seed in self._policy_seeds]
+
+    def model_generator(self) -> torch.Generator:
+        """Returns the stream of a model that samples, which all environments of the call share."""
+        seed = sum(self._policy_seeds) % 2**62 ^ MODEL_STREAM
+        return torch.Generator(self._device).manual_seed(seed)
 
 
 def _draw_seeds(generator: torch.Generator | None) -> tuple[int, int]:
