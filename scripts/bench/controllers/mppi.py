@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from itertools import product
 from typing import Any
 
 import torch
@@ -15,21 +14,17 @@ from bench.controllers.serve import Entry, serve
 from bench.controllers.task import Act, Task
 
 CHOICES = tuple(
-    {"lambda_": temperature, "std": std, "commands": commands}
-    for temperature, std, commands in product((0.03, 0.3, 3.0), (0.5, 1.0), ("one", "all"))
+    {"lambda_": temperature, "std": std}
+    for temperature, std in ((0.3, 0.5), (0.3, 1.0), (0.03, 0.5), (3.0, 0.5), (30.0, 0.5))
 )
 
 
 def make_with(kind: Any, **own: Any) -> Callable[[Task, Sequence[int]], Act]:
-    """A function that makes a controller of a class of the library.
-
-    The setting `commands` says whether a decision is one command with all candidates, or one command per iteration.
-    """
+    """A function that makes a controller of a class of the library; each iteration is one command."""
 
     def make(task: Task, seeds: Sequence[int]) -> Act:
         step, ones = task.stepper(), torch.ones(task.problem.action_dim)
         size = len(task.problem.start(seeds)[0])
-        is_one = task.settings["commands"] == "one"
 
         def dynamics(rows: Tensor, unit: Tensor) -> Tensor:
             following, cost = step(rows[:, :size], unit)
@@ -41,7 +36,7 @@ def make_with(kind: Any, **own: Any) -> Callable[[Task, Sequence[int]], Act]:
             nx=size + 1,
             noise_sigma=task.settings["std"] ** 2 * torch.eye(len(ones)),
             lambda_=task.settings["lambda_"],
-            num_samples=task.samples * task.iterations if is_one else task.samples,
+            num_samples=task.samples,
             horizon=task.problem.horizon,
             u_min=-ones,
             u_max=ones,
@@ -51,7 +46,7 @@ def make_with(kind: Any, **own: Any) -> Callable[[Task, Sequence[int]], Act]:
 
         def act(state: Tensor) -> Tensor:
             start = torch.cat([state[0], torch.zeros(1)])
-            for command in range(1 if is_one else task.iterations):
+            for command in range(task.iterations):
                 unit: Tensor = controller.command(start, shift_nominal_trajectory=command == 0)
             return unit[None]
 

@@ -20,7 +20,7 @@ def controller(name: str) -> Callable[[Task, Sequence[int]], Act]:
         bounds: dict[str, Any] = {"action_low": problem.action_low, "action_high": problem.action_high}
         size: dict[str, Any] = {"action_dim": problem.action_dim, "horizon": problem.horizon}
         if getattr(make_planner(name, **size), "num_iterations", None) == 1:  # it spends its budget in one iteration
-            budget = {"num_samples": task.samples * task.iterations}
+            budget: dict[str, Any] = {"num_samples": task.samples * task.iterations}
         else:
             iterations = {"num_iterations": task.iterations, "warm_start_iterations": task.iterations}
             budget = {"num_samples": task.samples, **iterations}
