@@ -19,8 +19,7 @@ ARM = """
     <joint name="shoulder" axis="0 1 0" damping="0.5"/><geom type="capsule" fromto="0 0 0 0 0 -.5" size=".04"/>
     <body pos="0 0 -.5">
       <joint name="elbow" axis="0 1 0" damping="0.5"/><geom type="capsule" fromto="0 0 0 0 0 -.4" size=".03"/>
-      <site name="hand" pos="0 0 -.4"/>
-    </body>
+      <site name="hand" pos="0 0 -.4"/></body>
   </body></worldbody>
   <actuator><motor joint="shoulder" ctrlrange="-25 25"/><motor joint="elbow" ctrlrange="-10 10"/></actuator>
   <sensor><framepos name="hand" objtype="site" objname="hand"/></sensor></mujoco>"""
