@@ -177,10 +177,10 @@ def icem_planner(**settings: Any) -> CEMPlanner:
     """Returns the improved CEM of Pinneri et al. 2020: coloured noise, kept and shifted elites, best candidate.
 
     Args:
-        **settings: Arguments of `CEMPlanner`; they replace `noise_beta` 2, `keep_elite_fraction` 0.3 and `final`
-            "best".
+        **settings: Arguments of `CEMPlanner`; they replace `noise_beta` 2, `white_noise_share` 0, `keep_elite_fraction`
+            0.3 and `final` "best".
     """
-    own: dict[str, Any] = {"noise_beta": 2.0, "keep_elite_fraction": 0.3, "final": "best"}
+    own: dict[str, Any] = {"noise_beta": 2.0, "white_noise_share": 0.0, "keep_elite_fraction": 0.3, "final": "best"}
     return CEMPlanner(**own | settings)
 
 
@@ -199,6 +199,14 @@ def mppi_planner(**settings: Any) -> CEMPlanner:
     if (merged.get("warm_start_iterations") or 1) > merged["num_iterations"]:
         merged["warm_start_iterations"] = merged["num_iterations"]
     return CEMPlanner(**merged)
+
+
+# By planner, the options for which it has a value of its own.
+OWN_OPTIONS: dict[Callable[..., CEMPlanner], set[str]] = {
+    CEMPlanner: set(),
+    icem_planner: {"noise_beta", "white_noise_share", "keep_elite_fraction", "final"},
+    mppi_planner: {"num_elites", "num_iterations", "smoothing", "temperature", "adapt_std", "warm_start_iterations"},
+}
 
 
 def _check_problem(planner: CEMPlanner) -> None:
