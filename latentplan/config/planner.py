@@ -51,7 +51,8 @@ class SearchOptions:
         white_noise_share: Share of the samples whose noise is white although `noise_beta` is above 0, in [0, 1]. Above 0
             the smooth samples explore further than `init_std`, and the white ones stay closer to the mean.
         keep_elite_fraction: Share of the elites that stay candidates in the next iteration and plan, in [0, 1].
-        temperature: Elites are weighted by exp(return / temperature) as in MPPI; null weights all elites alike.
+        temperature: Elites are weighted by exp(return / (temperature * spread)) as in MPPI, where the spread is the
+            standard deviation of their returns; null weights all elites alike.
         adapt_std: Whether the variance is refitted too.
         action_spline: A search over the knots of a spline instead of every action: `zero` (each knot is held), `linear`
             or `cubic`; null searches over the actions.
