@@ -48,8 +48,11 @@ class SearchOptions:
             the mean and another sequence, by predicted return: the policy's own sequence, or the best candidate where
             the policy makes no proposals or constraints or an objective that it was not trained for are set.
         noise_beta: Exponent of coloured sampling noise, in [0, 100]; 0 is white, larger is smoother over the horizon.
+        white_noise_share: Share of the samples whose noise is white although `noise_beta` is above 0, in [0, 1]. Above 0
+            the smooth samples explore further than `init_std`, and the white ones stay closer to the mean.
         keep_elite_fraction: Share of the elites that stay candidates in the next iteration and plan, in [0, 1].
-        temperature: Elites are weighted by exp(return / temperature) as in MPPI; null weights all elites alike.
+        temperature: Elites are weighted by exp(return / (temperature * spread)) as in MPPI, where the spread is the
+            standard deviation of their returns; null weights all elites alike.
         adapt_std: Whether the variance is refitted too.
         action_spline: A search over the knots of a spline instead of every action: `zero` (each knot is held), `linear`
             or `cubic`; null searches over the actions.
@@ -77,9 +80,10 @@ class SearchOptions:
     terminal_value: bool | None = None
     use_continues: bool = False
     tail: str = "zero"
-    final: str = "mean"
-    noise_beta: float = 0.0
-    keep_elite_fraction: float = 0.0
+    final: str = "better"
+    noise_beta: float = 2.0
+    white_noise_share: float = 0.5
+    keep_elite_fraction: float = 0.5
     temperature: float | None = None
     adapt_std: bool = True
     action_spline: str | None = None
@@ -94,7 +98,7 @@ class SearchOptions:
         check_whole(self, 1, "warm_start_iterations", "num_knots")
         check_whole(self, 0, "num_policy_samples", "gradient_steps")
         above_zero(self, "smoothing", "temperature", "gradient_step_size", "deadline_ms")
-        within(self, smoothing=(0.0, 1.0), keep_elite_fraction=(0.0, 1.0))
+        within(self, smoothing=(0.0, 1.0), keep_elite_fraction=(0.0, 1.0), white_noise_share=(0.0, 1.0))
         within(self, noise_beta=(0.0, STEEPEST_NOISE), min_std=(0.0, WIDEST_STD))
         if isinstance(self.init_std, Real):  # a planner checks a std per action dimension, which it alone accepts
             within(self, init_std=(0.0, WIDEST_STD))

@@ -143,13 +143,13 @@ def navigation() -> ControlProblem:
     return ControlProblem("navigation", 2, -1.0, 1.0, 20, 40, dynamics, cost, draw_start)
 
 
-def linear_quadratic(num_states: int = 60, action_dim: int = 30) -> ControlProblem:
+def linear_quadratic(num_states: int = 60, action_dim: int = 30, num_steps: int = 20) -> ControlProblem:
     """Returns a random linear system with a quadratic cost, and many actions.
 
     The system s' = A s + B a is drawn once: A is Gaussian, scaled to the spectral radius 1, and B is Gaussian with a
     standard deviation of 0.7 / sqrt(action_dim). Actions lie in [-1, 1]. The cost of a step is |s|² + 0.1 |a|². A run
-    starts at a random direction with |s|² = 20. The lower bound is the optimum without bounds on the actions, by
-    Riccati's recursion.
+    starts in a random direction, so far away that the optimum without bounds on the actions is 36. This optimum, by
+    Riccati's recursion, is the lower bound.
     """
     draw = torch.Generator().manual_seed(0)
     matrix = torch.randn(num_states, num_states, generator=draw)
@@ -162,10 +162,6 @@ def linear_quadratic(num_states: int = 60, action_dim: int = 30) -> ControlProbl
     def cost(state: Tensor, action: Tensor) -> Tensor:
         return state.square().sum(dim=1) + 0.1 * action.square().sum(dim=1)
 
-    def draw_start(generator: torch.Generator) -> Tensor:
-        direction = torch.randn(num_states, generator=generator)
-        return math.sqrt(20.0) * direction / direction.norm()
-
     def bound(start: Tensor, num_steps: int) -> Tensor:
         a, b, eye = transition.double(), control.double(), torch.eye(num_states).double()
         matrix = torch.zeros_like(a)
@@ -174,7 +170,11 @@ def linear_quadratic(num_states: int = 60, action_dim: int = 30) -> ControlProbl
             matrix = eye + a.T @ matrix @ (a - b @ gain)
         return torch.einsum("ri,ij,rj->r", start.double(), matrix, start.double()).float()
 
-    return ControlProblem("lq", action_dim, -1.0, 1.0, 10, 20, dynamics, cost, draw_start, bound)
+    def draw_start(generator: torch.Generator) -> Tensor:
+        direction = torch.randn(num_states, generator=generator)
+        return direction * (36.0 / bound(direction[None], num_steps)).sqrt()
+
+    return ControlProblem("lq", action_dim, -1.0, 1.0, 10, num_steps, dynamics, cost, draw_start, bound)
 
 
 def _spread(size: int, width: float, generator: torch.Generator) -> Tensor:

@@ -177,28 +177,39 @@ def icem_planner(**settings: Any) -> CEMPlanner:
     """Returns the improved CEM of Pinneri et al. 2020: coloured noise, kept and shifted elites, best candidate.
 
     Args:
-        **settings: Arguments of `CEMPlanner`; they replace `noise_beta` 2, `keep_elite_fraction` 0.3 and `final`
-            "best".
+        **settings: Arguments of `CEMPlanner`; they replace `noise_beta` 2, `white_noise_share` 0, `keep_elite_fraction`
+            0.3 and `final` "best".
     """
-    own: dict[str, Any] = {"noise_beta": 2.0, "keep_elite_fraction": 0.3, "final": "best"}
+    own: dict[str, Any] = {"noise_beta": 2.0, "white_noise_share": 0.0, "keep_elite_fraction": 0.3, "final": "best"}
     return CEMPlanner(**own | settings)
 
 
 def mppi_planner(**settings: Any) -> CEMPlanner:
-    """Returns MPPI (Williams et al. 2017): one refit to all candidates, weighted by exp(return / temperature).
+    """Returns MPPI (Williams et al. 2017): refits to all candidates, weighted by exp(return / (temperature * spread)).
+
+    The spread is the standard deviation of the candidates' returns, so one temperature serves returns of any scale.
 
     Args:
-        **settings: Arguments of `CEMPlanner`; they replace `temperature` 1, `smoothing` 1, `num_iterations` 1,
-            `adapt_std` False, and `num_elites`, which is all of `num_samples`. A warm start has at most
-            `num_iterations` refits.
+        **settings: Arguments of `CEMPlanner`; they replace `temperature` 0.1, `smoothing` 1, `num_iterations` 1,
+            `adapt_std` False, `keep_elite_fraction` 0, `noise_beta` 2, `white_noise_share` 0.5, `final` "better",
+            `num_elites`, which is all of `num_samples`, and `warm_start_iterations`, which is `num_iterations`.
     """
-    num_samples = settings.get("num_samples", SearchOptions.num_samples)
-    own: dict[str, Any] = {"num_elites": num_samples, "num_iterations": 1}
-    own |= {"smoothing": 1.0, "temperature": 1.0, "adapt_std": False}
+    own: dict[str, Any] = {"num_elites": settings.get("num_samples", SearchOptions.num_samples), "num_iterations": 1}
+    own |= {"smoothing": 1.0, "temperature": 0.1, "adapt_std": False, "keep_elite_fraction": 0.0}
+    own |= {"noise_beta": 2.0, "white_noise_share": 0.5, "final": "better"}
     merged = own | settings
-    if (merged.get("warm_start_iterations") or 1) > merged["num_iterations"]:
+    if merged.get("warm_start_iterations") is None:
         merged["warm_start_iterations"] = merged["num_iterations"]
     return CEMPlanner(**merged)
+
+
+# By planner, the options for which it has a value of its own.
+OWN_OPTIONS: dict[Callable[..., CEMPlanner], set[str]] = {
+    CEMPlanner: set(),
+    icem_planner: {"noise_beta", "white_noise_share", "keep_elite_fraction", "final"},
+    mppi_planner: {"num_elites", "num_iterations", "warm_start_iterations", "smoothing", "temperature", "adapt_std"}
+    | {"keep_elite_fraction", "noise_beta", "white_noise_share", "final"},
+}
 
 
 def _check_problem(planner: CEMPlanner) -> None:

@@ -371,7 +371,8 @@ class Search:
     def _sample(self, progress: Progress, num: int) -> Tensor:
         """Returns `num` clean points per environment, (batch, num, length, action)."""
         mean, std = progress.mean[:, None], self._sampling_std(progress.var)[:, None]
-        noise = self.streams.noise(num, self.space.length, self.bounds.action_dim, self.options.noise_beta, self.dtype)
+        beta, white_share = self.options.noise_beta, self.options.white_noise_share
+        noise = self.streams.noise(num, self.space.length, self.bounds.action_dim, beta, white_share, self.dtype)
         samples = torch.addcmul(mean, std, noise)
         if progress.probabilities is not None:
             assert self.space.choices is not None

@@ -14,7 +14,7 @@ from latentplan.config.planner import SearchOptions
 from latentplan.planning.model import Bound, State
 from latentplan.planning.objectives import Constraint, Term
 from latentplan.planning.plan import Plan
-from latentplan.planning.search.cem import CEMPlanner, icem_planner, mppi_planner
+from latentplan.planning.search.cem import OWN_OPTIONS, CEMPlanner, icem_planner, mppi_planner
 from latentplan.planning.search.sampling import Generators
 
 
@@ -95,8 +95,8 @@ PLANNERS: dict[str, Callable[..., Planner]] = {
 def make_planner(name: str, options: SearchOptions | None = None, **settings: Any) -> Planner:
     """Returns the planner that is registered under a name.
 
-    `cem` takes every option of `options`. For another planner, an option that has its default value is not passed on,
-    so that `icem` and `mppi` take their own value.
+    An option of `options` that has its default value is not passed on if the planner has its own value for it, as
+    `icem` and `mppi` have for some options; a planner that is registered later chooses all defaults itself.
 
     Args:
         name: A name in `PLANNERS`.
@@ -113,9 +113,9 @@ def make_planner(name: str, options: SearchOptions | None = None, **settings: An
     changed: dict[str, Any] = {}
     if options is not None:
         names = {field.name for field in dataclasses.fields(SearchOptions)}
-        takes_all = PLANNERS[name] is CEMPlanner
+        own = OWN_OPTIONS.get(PLANNERS[name], names)
         for field in dataclasses.fields(options):  # an agent's settings have defaults of their own
             value = getattr(options, field.name)
-            if field.name in names and (takes_all or value != field.default):
+            if field.name in names and (field.name not in own or value != field.default):
                 changed[field.name] = value
     return PLANNERS[name](**changed | settings)
