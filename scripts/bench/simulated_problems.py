@@ -127,7 +127,7 @@ def humanoid() -> SimulatedProblem:
         return torch.cat([torch.zeros(1), pose, torch.zeros(40)])  # time, angles, velocities
 
     body = _build_humanoid(points)
-    return _from_mujoco("humanoid", body, cost, draw_start, substeps=1, horizon=8, num_steps=20)
+    return _from_mujoco("humanoid", body, cost, draw_start, substeps=1, horizon=8, num_steps=15)
 
 
 def latent() -> SimulatedProblem:
