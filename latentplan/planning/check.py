@@ -202,7 +202,11 @@ def _check_result(name: str, result: Any, inputs: Inputs) -> Iterator[str]:
         shape, order = ((rows,), "(next_state, reward)") if name != "rollout" else ((rows, horizon), "(rewards, state)")
         if not isinstance(result, tuple) or len(result) != 2:
             is_step = name == "step"
-            yield describe_step_result(result) if is_step else f"{name}() must return {order}, got {type(result).__name__}"
+            yield (
+                describe_step_result(result)
+                if is_step
+                else f"{name}() must return {order}, got {type(result).__name__}"
+            )
             return
         rewards, last = result if name == "rollout" else result[::-1]
         yield from _check_tensor(f"{name}()'s reward" + "s" * (name == "rollout"), rewards, shape)

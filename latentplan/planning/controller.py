@@ -204,9 +204,7 @@ class ModelPredictiveController:
         assert self.plan is not None
         return torch.zeros_like(self.plan.is_warm) if self._is_stale is None else self._is_stale
 
-    def _search(
-        self, state: State, previous: Plan | None, generator: Generators, last_action: Tensor | None
-    ) -> Plan:
+    def _search(self, state: State, previous: Plan | None, generator: Generators, last_action: Tensor | None) -> Plan:
         """Returns a new plan, of which no action has been executed."""
         given = {"keep": self.keep, "callback": self.callback, "last_action": last_action}
         plan = self.planner.plan(

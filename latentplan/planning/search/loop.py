@@ -30,9 +30,16 @@ from latentplan.planning.plan import Iteration, Plan, WarmStart, shift_plan
 from latentplan.planning.search.choice import Choice, Finalists, choose
 from latentplan.planning.search.choices import Choices
 from latentplan.planning.search.deadline import Budget, Pace
-from latentplan.planning.search.elites import Elites, Scores, mean_return, move_towards, select_elites, spread_of_returns
+from latentplan.planning.search.elites import (
+    Elites,
+    Scores,
+    mean_return,
+    move_towards,
+    select_elites,
+    spread_of_returns,
+)
 from latentplan.planning.search.gradient import Pause, Refined, ascend
-from latentplan.planning.search.purity import Watch
+from latentplan.planning.search.purity import Watch, describe_writing
 from latentplan.planning.search.sampling import Generators, Streams
 from latentplan.planning.search.scorer import Scorer
 from latentplan.planning.search.space import Bounds, Space
@@ -341,6 +348,8 @@ class Search:
             rollout = self.scorer.imagine(rows, actions, with_states=with_states)
             scores = self.scorer.score_rollout(rollout)
         except Exception as error:
+            if is_new and "single memory location" in str(error):  # rows of one environment share their memory
+                raise ValueError(describe_writing(self.model, "state")) from error
             if is_new:
                 error.add_note("check_model(model, state, planner=planner) lists everything that a planner needs")
             raise

@@ -7,6 +7,7 @@ import torch
 
 from latentplan.config import PlannerConfig
 from latentplan.planning import (
+    PLANNERS,
     CEMPlanner,
     FunctionModel,
     SearchOptions,
@@ -212,7 +213,9 @@ def test_mixed_noise_has_smooth_samples_that_explore_and_white_ones_that_stay_cl
 
 def test_lower_temperature_raises_the_expected_return(point, states, seeded):
     values = [
-        mppi_planner(action_dim=2, horizon=4, final="mean", temperature=temperature).plan(point, states, generator=seeded())
+        mppi_planner(action_dim=2, horizon=4, final="mean", temperature=temperature).plan(
+            point, states, generator=seeded()
+        )
         for temperature in (0.1, 1.0, 10.0)
     ]
     returns = torch.stack([plan.expected_return for plan in values])
@@ -320,3 +323,63 @@ def test_planner_refuses_sizes_that_are_not_whole(name):
 def test_plan_refuses_a_state_without_rows(point, make_planner):
     with pytest.raises(ValueError, match="at least one row"):
         make_planner().plan(point, torch.zeros(0, 4))
+
+
+def counted(point, curvature=1.0):
+    """A model that counts its steps with a gradient; only 0.3 is good, as sharply as `curvature` says."""
+    calls = []
+
+    def reward(state, action):
+        if torch.is_grad_enabled():
+            calls.append(len(action))
+        return -curvature * (action - 0.3).square().sum(dim=1)
+
+    return FunctionModel(lambda state, action: state, reward), calls
+
+
+def test_gradient_pauses_where_it_does_not_help_and_tries_again(point, make_planner, seeded):
+    """A plateau has no gradient: the refinement pauses for 1, 3, 7 and 15 searches, then for 15 again."""
+    model, calls = counted(point, curvature=0.0)
+    planner = make_planner(gradient_steps=2, horizon=1, num_iterations=1)
+    plan, refined = None, []
+    for search in range(48):
+        calls.clear()
+        plan = planner.plan(model, torch.zeros(2, 1), plan, generator=seeded(search))
+        refined += [search] if calls else []
+    assert refined == [0, 2, 6, 14, 30, 46]
+
+
+def test_gradient_goes_on_where_it_helps_and_after_a_cold_start(point, make_planner, seeded):
+    model, calls = counted(point)
+    planner = make_planner(gradient_steps=2, num_iterations=1)
+    plan = None
+    for search in range(6):
+        calls.clear()
+        plan = planner.plan(model, torch.zeros(2, 1), plan, generator=seeded(search))
+        assert calls and plan.info["gradient_wait"].tolist() == [0, 0]
+    flat, calls = counted(point, curvature=0.0)
+    plan = planner.plan(flat, torch.zeros(2, 1), plan, generator=seeded())
+    assert plan.info["gradient_wait"].tolist() == [1, 1]
+    calls.clear()
+    planner.plan(flat, torch.zeros(2, 1), plan.forget(torch.tensor([True, False])), generator=seeded())
+    assert calls  # an environment that starts cold has no pause
+
+
+def test_gradient_step_is_a_twentieth_of_the_range_by_default(make_planner, seeded):
+    model = FunctionModel(lambda state, action: state, lambda state, action: action.sum(dim=1))
+    planner = make_planner(
+        gradient_steps=1, action_low=(-1.0, -20.0), action_high=(1.0, 20.0), init_std=0.0, num_iterations=1, horizon=1
+    )
+    plan = planner.plan(model, torch.zeros(1, 1), generator=seeded())
+    torch.testing.assert_close(plan.action, torch.tensor([[0.1 / 20, 2.0]]))
+
+
+def test_cem_gradient_is_a_registered_planner_that_halves_the_gap_on_a_smooth_problem(point, states, seeded):
+    cem, refined = (
+        PLANNERS[name](action_dim=2, horizon=6, num_samples=32, num_iterations=2).plan(
+            FunctionModel(point.dynamics, point.reward), states, generator=seeded()
+        )
+        for name in ("cem", "cem_gradient")
+    )
+    assert (refined.expected_return >= cem.expected_return - 1e-5).all()
+    assert (refined.expected_return > cem.expected_return + 0.005).any()

@@ -98,7 +98,9 @@ def test_select_elites_ranks_and_weighs_feasible_candidates_first():
     order = select_elites(CANDIDATES[None], scores, num_elites=4, temperature=None)
     assert order.scores.returns.tolist() == [[3.2, 1.0, -0.5, 4.0]]
     weighted = select_elites(CANDIDATES[None], scores, num_elites=4, temperature=1.0)
-    torch.testing.assert_close(weighted.weights[0, :2], torch.softmax(RETURNS[:2] / RETURNS[:2].std(correction=0), dim=0))
+    torch.testing.assert_close(
+        weighted.weights[0, :2], torch.softmax(RETURNS[:2] / RETURNS[:2].std(correction=0), dim=0)
+    )
     assert (weighted.weights[0, 2:] == 0).all()
     none = select_elites(CANDIDATES[None], Scores(RETURNS[None], violations + 1), num_elites=4, temperature=1.0)
     least = -torch.tensor([1.0, 1.0, 2.0, 3.0]).double()

@@ -124,7 +124,9 @@ def test_presets_plan_longer_for_other_objectives_too(point, states, seeded):
         assert plan.actions.shape == (5, 4, 2)
 
 
-@pytest.mark.parametrize(("name", "hint"), [("icme", "did you mean 'icem'"), ("ilqr_", "available: cem, cem_gradient, icem, mppi")])
+@pytest.mark.parametrize(
+    ("name", "hint"), [("icme", "did you mean 'icem'"), ("ilqr_", "available: cem, cem_gradient, icem, mppi")]
+)
 def test_make_planner_names_the_nearest_planner_when_the_name_is_unknown(name, hint):
     with pytest.raises(ValueError, match=hint):
         make_planner(name, action_dim=1)

@@ -86,7 +86,9 @@ def test_bounds_per_step_hold_in_model_and_plan(recorder, make_planner, seeded):
 def test_bounds_per_environment_give_each_the_plan_it_has_alone(point, states, make_planner, seeded):
     low = torch.linspace(-1.0, 0.2, 5)[:, None, None].expand(5, 1, 2)
     high = torch.full((5, 1, 2), 0.6)
-    together = make_planner(action_low=low, action_high=high).plan(point, states, generator=[seeded(i) for i in range(5)])
+    together = make_planner(action_low=low, action_high=high).plan(
+        point, states, generator=[seeded(i) for i in range(5)]
+    )
     for row in range(5):
         planner = make_planner(action_low=low[row, 0], action_high=0.6)
         alone = planner.plan(point, states[row : row + 1], generator=seeded(row))
@@ -287,7 +289,9 @@ def test_scheduler_without_plan_and_policy_acts_in_the_middle_of_the_bounds(poin
 
 
 def test_penalties_see_actions_and_not_knots(recorder, make_planner, seeded):
-    planner = make_planner(action_spline="zero", num_knots=2, init_mean=0.5, init_std=0.0, num_iterations=1, final="better")
+    planner = make_planner(
+        action_spline="zero", num_knots=2, init_mean=0.5, init_std=0.0, num_iterations=1, final="better"
+    )
     model = constant(lambda state, action: torch.zeros(len(state)))
     plan = planner.plan(model, torch.zeros(1, 1), objective=action_penalty(), generator=seeded())
     assert plan.expected_return.item() == pytest.approx(-6 * 2 * 0.25)
