@@ -58,7 +58,8 @@ class SearchOptions:
             or `cubic`; null searches over the actions.
         num_knots: Knots of the spline, at most `horizon`; null takes a third of `horizon`, rounded up, at least 2.
         gradient_steps: Steps of gradient ascent on the chosen sequence; the model must be differentiable.
-        gradient_step_size: Largest change of an action in the first gradient step, in action units.
+        gradient_step_size: Largest change of an action in the first gradient step, in action units; null takes a
+            twentieth of the action range, which is 0.1 for actions in [-1, 1].
         constraint_penalty: Return that is subtracted per unit of violation; null ranks feasible candidates first.
         deadline_ms: Milliseconds that a search may take; null sets no limit.
 
@@ -89,7 +90,7 @@ class SearchOptions:
     action_spline: str | None = None
     num_knots: int | None = None
     gradient_steps: int = 0
-    gradient_step_size: float = 0.1
+    gradient_step_size: float | None = None
     constraint_penalty: float | None = None
     deadline_ms: float | None = None
 

@@ -237,7 +237,7 @@ def shift_plan(
     *,
     rest: Tensor,
     tail: str,
-    clamp: Callable[[Tensor], Tensor],
+    fit: Callable[[Tensor], Tensor],
     policy_tail: Callable[[Tensor, Tensor], Tensor],
 ) -> WarmStart:
     """Shifts a plan by the actions executed since it was made, and fills its tail.
@@ -246,7 +246,7 @@ def shift_plan(
         previous: The previous plan, of any length.
         rest: The start of a cold search, (batch, horizon, action), in the precision of the next plan.
         tail: How the tail is filled: `zero` (with `rest`), `hold` (the last action repeated) or `policy`.
-        clamp: `clamp(sequence) -> sequence` keeps the bounds, for (batch, horizon, action) and (batch, kept, ...).
+        fit: `fit(sequence) -> sequence` makes the actions allowed ones, for (batch, horizon, action) and (batch, kept, ...).
         policy_tail: `policy_tail(sequence, is_tail) -> sequence` fills the tail with the model's policy.
     """
     length, horizon = previous.mean.shape[1], rest.shape[1]
@@ -265,10 +265,10 @@ def shift_plan(
         mean = torch.where(is_tail, rest, mean)
     elif tail == "policy":
         mean = policy_tail(mean, is_tail)
-    mean = clamp(torch.where(is_warm, mean, rest))
+    mean = fit(torch.where(is_warm, mean, rest))
 
     elites = previous.elites
     if elites is not None:
         elites = torch.take_along_dim(elites, index[:, None], dim=2).to(rest.dtype)
-        elites = clamp(torch.where(is_tail[:, None], mean[:, None], elites))
+        elites = fit(torch.where(is_tail[:, None], mean[:, None], elites))
     return WarmStart(mean, elites, previous.is_warm)

@@ -172,6 +172,12 @@ def mean_return(elites: Elites) -> Tensor:
     return total.masked_fill(elites.weights.sum(dim=1) == 0, float("nan"))
 
 
+def spread_of_returns(elites: Elites) -> Tensor:
+    """Returns the standard deviation of the elites' returns, above 0, (batch,)."""
+    returns = elites.scores.returns.masked_fill(elites.weights == 0, float("-inf"))
+    return _spread(returns)[:, 0]
+
+
 def _same_precision(*tensors: Tensor) -> list[Tensor]:
     """Returns the tensors in one floating-point precision that holds them all."""
     dtype = reduce(torch.promote_types, (tensor.dtype for tensor in tensors))

@@ -30,9 +30,16 @@ from latentplan.planning.plan import Iteration, Plan, WarmStart, shift_plan
 from latentplan.planning.search.choice import Choice, Finalists, choose
 from latentplan.planning.search.choices import Choices
 from latentplan.planning.search.deadline import Budget, Pace
-from latentplan.planning.search.elites import Elites, Scores, mean_return, move_towards, select_elites
-from latentplan.planning.search.gradient import ascend
-from latentplan.planning.search.purity import Watch
+from latentplan.planning.search.elites import (
+    Elites,
+    Scores,
+    mean_return,
+    move_towards,
+    select_elites,
+    spread_of_returns,
+)
+from latentplan.planning.search.gradient import Pause, Refined, ascend
+from latentplan.planning.search.purity import Watch, describe_writing
 from latentplan.planning.search.sampling import Generators, Streams
 from latentplan.planning.search.scorer import Scorer
 from latentplan.planning.search.space import Bounds, Space
@@ -176,13 +183,14 @@ class Search:
         self.problem, self.previous = problem, previous
         self.horizon = options.horizon if objective is None else options.goal_horizon or options.horizon
         low, high = (self._per_step(value, name) for name, value in (("low", problem.low), ("high", problem.high)))
-        self.bounds = Bounds(low, high)
+        choices = Choices(problem.choices, self.dtype, self.device) if problem.choices else None
+        self.bounds = Bounds(low, high, choices)
         self._check_previous()
         limits, constraints = _split_limits(problem.constraints)
         self.space = self._make_space(limits)
         self.init_std, self.min_std = self._spreads()
         rest = (low + high) / 2 if problem.init_mean is None else self._per_step(problem.init_mean, "init_mean")
-        self.rest = self.bounds.clamp(rest).expand(self.batch, self.horizon, -1)
+        self.rest = self.bounds.fit(rest).expand(self.batch, self.horizon, -1)
         self.num_proposals = options.num_proposals(has_policy(model))
         # The policy was trained on the task's reward, so it may not replace a plan for another objective.
         self.may_use_policy = self.num_proposals > 0 and objective is None and not constraints
@@ -225,15 +233,22 @@ class Search:
         mean = space.decode(space.clean(torch.where(has_elites, progress.mean, space.encode(shifted.mean))))
         actions, expected, violation = self._choose(progress, mean, proposals)
         budget.lap("choose")
-        if options.gradient_steps and not budget.allows("gradient"):
+        pause = self._pause() if options.gradient_steps else None
+        if pause is not None and bool((pause.left > 0).all()):
+            pause = pause.waited()
+        elif pause is not None and not budget.allows("gradient"):
             stopped = "deadline"
-        elif options.gradient_steps:
-            actions, refined, violation = self._refine(actions)
-            expected = torch.where(torch.isfinite(refined), refined, expected)
+        elif pause is not None:
+            refined = self._refine(actions)
+            actions, violation = refined.actions, refined.violations
+            expected = torch.where(torch.isfinite(refined.returns), refined.returns, expected)
+            pause = pause.renewed(refined.gain, spread_of_returns(progress.elites))
             budget.lap("gradient")
         info = {**progress.describe(history, stopped), "is_policy": torch.zeros_like(progress.has_elites)}
         if violation is not None:
             info["violation"] = violation
+        if pause is not None:
+            info |= {"gradient_pause": pause.length, "gradient_wait": pause.left}
         if progress.probabilities is not None:
             info["probabilities"] = progress.probabilities
         kept = None
@@ -269,7 +284,7 @@ class Search:
             if budget.allows("propose"):
                 mode = self._propose(budget)[:, 0]
             else:
-                mode = self.bounds.clamp(self.scorer.act(self.state, self.bounds)[:, None].expand_as(actions))
+                mode = self.bounds.fit(self.scorer.act(self.state, self.bounds)[:, None].expand_as(actions))
             is_policy = torch.isfinite(mode).flatten(1).all(1)
             actions = torch.where(is_policy[:, None, None], mode, actions)
         progress = self._begin(self._encode(shifted))
@@ -329,8 +344,15 @@ class Search:
         actions = self.space.decode(points)
         watch = Watch(rows, actions) if is_new else None
         with_states = self.view.keep == "states"
-        rollout = self.scorer.imagine(rows, actions, with_states=with_states)
-        scores = self.scorer.score_rollout(rollout)
+        try:
+            rollout = self.scorer.imagine(rows, actions, with_states=with_states)
+            scores = self.scorer.score_rollout(rollout)
+        except Exception as error:
+            if is_new and "single memory location" in str(error):  # rows of one environment share their memory
+                raise ValueError(describe_writing(self.model, "state")) from error
+            if is_new:
+                error.add_note("check_model(model, state, planner=planner) lists everything that a planner needs")
+            raise
         if watch is not None:
             watch.check(self.model)
         return scores, self.scorer.arrange_states(rollout) if with_states else None
@@ -428,7 +450,17 @@ class Search:
             progress.has_elites | has_elites,
         )
 
-    def _refine(self, actions: Tensor) -> Choice:
+    def _pause(self) -> Pause:
+        """Returns the pause of gradient refinement, which the previous plan hands on; none where a plan starts cold."""
+        none = torch.zeros(self.batch, dtype=torch.long, device=self.device)
+        info = {} if self.previous is None else self.previous.info
+        if self.previous is None or "gradient_pause" not in info:
+            return Pause(none, none)
+        is_warm = self.previous.is_warm.to(self.device)
+        pause = (info[name].to(self.device) for name in ("gradient_pause", "gradient_wait"))
+        return Pause(*(torch.where(is_warm, part, none) for part in pause))
+
+    def _refine(self, actions: Tensor) -> Refined:
         return ascend(
             self.scorer,
             self.state,
@@ -446,7 +478,7 @@ class Search:
             previous,
             rest=self.rest,
             tail=self.options.tail,
-            clamp=self.bounds.clamp,
+            fit=self.bounds.fit,
             policy_tail=lambda actions, is_tail: self.scorer.continue_by_policy(
                 self.state, actions, is_tail, self.bounds
             ),
@@ -471,9 +503,7 @@ class Search:
             raise ValueError(f"the last plan is for {batch} environments and actions of {dim}, this search for {sizes}")
 
     def _make_space(self, limits: Sequence[Tensor]) -> Space:
-        options, choices = self.options, None
-        if self.problem.choices:
-            choices = Choices(self.problem.choices, self.dtype, self.device)
+        options, choices = self.options, self.bounds.choices
         max_change = None
         if limits:
             max_change = torch.stack([limit.expand(self.bounds.action_dim) for limit in limits]).amin(dim=0)
@@ -486,7 +516,6 @@ class Search:
             self.horizon,
             spline=options.action_spline,
             num_knots=options.knots(self.horizon),
-            choices=choices,
             max_change=max_change,
             last_action=None if find_last is None else find_last(),
         )

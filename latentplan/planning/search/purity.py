@@ -54,7 +54,12 @@ class Watch:
         for name, given, copy in zip(("state", "action"), self._given, self._copies, strict=True):
             pairs = zip(tree_leaves(given), tree_leaves(copy), strict=True)
             if not all(bool(((left == right) | ((left != left) & (right != right))).all()) for left, right in pairs):
-                raise ValueError(
-                    f"{type(model).__name__} writes into the {name} it is given; step(), rollout() and what they call "
-                    f"must return new tensors ({name} + change instead of {name} += change, or {name}.clone() first)"
-                )
+                raise ValueError(describe_writing(model, name))
+
+
+def describe_writing(model: object, name: str) -> str:
+    """Returns the message for a model that writes into its state or action."""
+    return (
+        f"{type(model).__name__} writes into the {name} it is given; step(), rollout() and what they call must return "
+        f"new tensors ({name} + change instead of {name} += change, or {name}.clone() first)"
+    )

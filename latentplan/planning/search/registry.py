@@ -14,7 +14,13 @@ from latentplan.config.planner import SearchOptions
 from latentplan.planning.model import Bound, State
 from latentplan.planning.objectives import Constraint, Term
 from latentplan.planning.plan import Plan
-from latentplan.planning.search.cem import OWN_OPTIONS, CEMPlanner, icem_planner, mppi_planner
+from latentplan.planning.search.cem import (
+    OWN_OPTIONS,
+    CEMPlanner,
+    cem_gradient_planner,
+    icem_planner,
+    mppi_planner,
+)
 from latentplan.planning.search.sampling import Generators
 
 
@@ -85,6 +91,7 @@ class Planner(SupportsPlan, Protocol):
 
 PLANNERS: dict[str, Callable[..., Planner]] = {
     "cem": CEMPlanner,
+    "cem_gradient": cem_gradient_planner,
     "icem": icem_planner,
     "mppi": mppi_planner,
 }

@@ -150,10 +150,9 @@ class Scorer:
         chosen: list[Tensor] = []
 
         def choose(step: int, rows: State) -> Tensor:
-            low, high = bounds.at(step, num)
             action = _policy_actions(self.model, split_rows(rows, batch), num, generators)
             check_shape("policy()", action, (batch * num, bounds.action_dim))
-            chosen.append(torch.clamp(action.to(low.dtype), low, high))
+            chosen.append(bounds.fit_step(action, step, num))
             return chosen[-1]
 
         self._step_through(repeat_rows(state, num), horizon, choose)
@@ -167,7 +166,7 @@ class Scorer:
         rows = self.model.propose(state, num, horizon, generators)  # type: ignore[attr-defined]
         check_shape("propose()", rows, (batch * num, horizon, bounds.action_dim))
         rows = rows.to(bounds.low.dtype)
-        return bounds.clamp(rearrange(rows, "(batch num) horizon action -> batch num horizon action", batch=batch))
+        return bounds.fit(rearrange(rows, "(batch num) horizon action -> batch num horizon action", batch=batch))
 
     def act(self, state: State, bounds: Bounds, step: int = 0) -> Tensor:
         """Returns the policy's mode at a step, within the bounds, (batch, action); NaN where the policy is NaN."""
@@ -178,9 +177,8 @@ class Scorer:
         else:
             require(self.model, "policy", "num_policy_samples above 0")
             action = self.model.policy(state, None)  # type: ignore[attr-defined]
-        low, high = bounds.at(step)
         check_shape("policy()", action, (rows, bounds.action_dim))
-        return torch.clamp(action.to(low.dtype), low, high)
+        return bounds.fit_step(action, step)
 
     def continue_by_policy(self, state: State, actions: Tensor, is_tail: Tensor, bounds: Bounds) -> Tensor:
         """Returns the sequences (batch, horizon, action) with the policy's mode where is_tail (batch, horizon, 1)."""
@@ -220,7 +218,7 @@ class Scorer:
         for step in range(horizon):
             action = choose(step, state)
             state, reward = take_step(self.model, state, action, self.generator)
-            check_shape("step()'s reward", reward, action.shape[:1])
+            _check_reward(reward, len(action))
             states.append(state)
             rewards.append(reward)
             if self.use_continues:
@@ -246,6 +244,16 @@ class Scorer:
         if self.penalty is None:
             return Scores(returns, violations)
         return Scores(returns - self.penalty * violations, violations, is_ranked=False)
+
+
+def _check_reward(reward: Tensor, rows: int) -> None:
+    if not isinstance(reward, Tensor):
+        raise TypeError(f"step()'s reward must be a tensor of shape ({rows},), got {type(reward).__name__}")
+    if reward.shape != (rows,):
+        raise ValueError(
+            f"step()'s reward must have shape ({rows},), got {tuple(reward.shape)}: one number per row, and dim 0 of a "
+            "state is its rows (state[None] for one environment, state.flatten(0, 1) for two dimensions of environments)"
+        )
 
 
 def _per_candidate(values: Tensor, rollout: Rollout, over_particles: str, name: str) -> Tensor:

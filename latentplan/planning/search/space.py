@@ -7,8 +7,8 @@ constraints and controllers only see actions that can be executed.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from functools import lru_cache
-from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -16,44 +16,58 @@ from torch import Tensor
 from latentplan.planning.search.choices import Choices
 
 
-class Bounds(NamedTuple):
-    """The lowest and the highest action of each environment and step.
+@dataclass(frozen=True)
+class Bounds:
+    """The lowest and the highest action of each environment and step, and the values of discrete dimensions.
 
     Attributes:
         low: Lowest action, (1 or batch, 1 or horizon, action).
         high: Highest action, shaped like `low`.
+        choices: The discrete dimensions; None without any.
     """
 
     low: Tensor
     high: Tensor
+    choices: Choices | None = None
 
     @property
     def action_dim(self) -> int:
         """Numbers in an action."""
         return self.low.shape[-1]
 
-    def clamp(self, sequences: Tensor, *, in_place: bool = False) -> Tensor:
-        """Returns sequences (batch, horizon, action) or (batch, sample, horizon, action) within the bounds.
+    def fit(self, sequences: Tensor, *, in_place: bool = False) -> Tensor:
+        """Returns sequences (batch, horizon, action) or (batch, sample, horizon, action) of actions that are allowed.
 
         Args:
             sequences: The sequences.
-            in_place: Whether the given tensor is changed and returned.
+            in_place: Whether the given tensor may be changed.
         """
-        low, high = (bound[:, None] for bound in self) if sequences.ndim == 4 else self
-        if not in_place:
-            return torch.clamp(sequences, low, high)
-        return torch.minimum(torch.maximum(sequences, low, out=sequences), high, out=sequences)
+        low, high = self.low, self.high
+        if sequences.ndim == 4:
+            low, high = low[:, None], high[:, None]
+        if in_place:
+            fitted = torch.minimum(torch.maximum(sequences, low, out=sequences), high, out=sequences)
+        else:
+            fitted = torch.clamp(sequences, low, high)
+        return fitted if self.choices is None else self.choices.snap(fitted)
 
-    def at(self, step: int, num: int = 1) -> Bounds:
-        """Returns the bounds of one step, (1 or rows, action), for `num` rows of each environment, batch-major."""
-        low, high = (bound[:, step if bound.shape[1] > 1 else 0] for bound in self)
-        if num == 1 or len(low) == 1:
-            return Bounds(low, high)
-        return Bounds(low.repeat_interleave(num, dim=0), high.repeat_interleave(num, dim=0))
+    def fit_step(self, actions: Tensor, step: int, num: int = 1) -> Tensor:
+        """Returns actions (rows, action) of one step that are allowed, for `num` rows per environment, batch-major."""
+        low, high = self.at(step)
+        if num > 1 and len(low) > 1:
+            low, high = (bound.repeat_interleave(num, dim=0) for bound in (low, high))
+        fitted = torch.clamp(actions.to(low.dtype), low, high)
+        return fitted if self.choices is None else self.choices.snap(fitted)
+
+    def at(self, step: int) -> tuple[Tensor, Tensor]:
+        """Returns the lowest and the highest action of one step, each (1 or batch, action)."""
+        low, high = (bound[:, step if bound.shape[1] > 1 else 0] for bound in (self.low, self.high))
+        return low, high
 
     def select(self, steps: Tensor) -> Bounds:
         """Returns the bounds of the steps (chosen,) int."""
-        return self if self.low.shape[1] == 1 else Bounds(self.low[:, steps], self.high[:, steps])
+        low, high = (bound if bound.shape[1] == 1 else bound[:, steps] for bound in (self.low, self.high))
+        return Bounds(low, high, self.choices)
 
 
 class Space:
@@ -64,7 +78,6 @@ class Space:
         horizon: Number of actions of a plan.
         spline: `zero`, `linear` or `cubic`; None searches over the actions themselves.
         num_knots: Number of knots of a spline.
-        choices: The discrete dimensions; None without any.
         max_change: Largest change of an action from one step to the next, (action,); None without a rate limit.
         last_action: The action executed last, NaN where unknown, (batch, action); used with `max_change` only.
 
@@ -80,11 +93,10 @@ class Space:
         *,
         spline: str | None = None,
         num_knots: int = 0,
-        choices: Choices | None = None,
         max_change: Tensor | None = None,
         last_action: Tensor | None = None,
     ) -> None:
-        self.bounds, self.horizon, self.choices = bounds, horizon, choices
+        self.bounds, self.horizon, self.choices = bounds, horizon, bounds.choices
         self.max_change, self.last_action = max_change, last_action
         self.length, self.point_bounds, self._steps = horizon, bounds, None
         self._matrix: Tensor | None = None
@@ -111,11 +123,7 @@ class Space:
             points: (batch, length, action) or (batch, sample, length, action).
             in_place: Whether the given tensor may be changed.
         """
-        points = self.point_bounds.clamp(points, in_place=in_place)
-        if self.is_plain:
-            return points
-        if self.choices is not None:
-            points = self.choices.snap(points)
+        points = self.point_bounds.fit(points, in_place=in_place)
         return self._limit_changes(points) if self._matrix is None else points
 
     def decode(self, points: Tensor) -> Tensor:
@@ -126,7 +134,7 @@ class Space:
         if self.choices is not None:
             held = torch.einsum("hk,...ka->...ha", self._hold, points)
             actions = self.choices.join(actions, self.choices.snap(held))
-        return self._limit_changes(self.bounds.clamp(actions))
+        return self._limit_changes(self.bounds.fit(actions))
 
     def decode_var(self, var: Tensor) -> Tensor:
         """Returns the variance of the actions, (batch, horizon, action), from that of a point."""
