@@ -9,6 +9,7 @@ settings with the lowest cost on starts that are not reported are taken for each
 from __future__ import annotations
 
 import json
+import math
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -31,6 +32,7 @@ if TYPE_CHECKING:
 
 OURS = "latentplan"
 PROBLEM_NAMES = ("pendulum", "navigation", "lq", "push", "humanoid", "latent")
+BUDGETS = ("evaluations", "milliseconds")
 FIRST_TUNING_SEED = 100  # reported are seeds from 0 on
 WARM_UP = 3  # decisions before the timed ones
 TOLERANCE = 1.1  # a decision may take this many times the budget, because times vary
@@ -46,6 +48,7 @@ class Request(ComputeRequest):
         peers: Other libraries, or `none`; each is installed on first use, in a Python environment apart from this one.
         seeds: Number of starts, of seeds 0, 1, 2 and so on; every planner plays all of them.
         tuning_seeds: Number of starts, of seeds 100, 101 and so on, on which settings of other planners are chosen.
+        budgets: What is the same for every planner: `evaluations`, `milliseconds`, or both, one after the other.
         samples: Candidates per iteration.
         iterations: Iterations per decision at equal evaluations.
         budget_ms: Milliseconds per decision at equal time; None takes those of this library's first planner at equal
@@ -61,6 +64,7 @@ class Request(ComputeRequest):
     peers: tuple[str, ...] = option(tuple(PEERS), separator=",")
     seeds: int = 10
     tuning_seeds: int = 3
+    budgets: tuple[str, ...] = option(BUDGETS, separator=",")
     samples: int = 100
     iterations: int = 3
     budget_ms: float | None = None
@@ -76,6 +80,9 @@ class Request(ComputeRequest):
         for name in self.problems:
             if name not in PROBLEM_NAMES:
                 raise_unknown("problem", name, PROBLEM_NAMES)
+        for name in self.budgets:
+            if name not in BUDGETS:
+                raise_unknown("budget", name, BUDGETS)
         for name in () if self.peers == ("none",) else self.peers:
             if name not in PEERS:
                 raise_unknown("peer", name, [*PEERS, "none"])
@@ -92,6 +99,7 @@ class Arm:
         process: The process of the library.
         choices: Settings to choose from.
         settings: The chosen settings.
+        tuning_cost: Mean cost of the chosen settings on the tuning seeds.
     """
 
     library: str
@@ -100,6 +108,7 @@ class Arm:
     process: JsonProcess
     choices: list[dict[str, Any]]
     settings: dict[str, Any] = field(default_factory=dict)
+    tuning_cost: float = math.inf
 
     def ask(self, do: str, iterations: int, request: Request, **given: Any) -> dict[str, Any]:
         """The answer of the library's process.
@@ -116,12 +125,13 @@ class Arm:
     def choose(self, request: Request) -> None:
         """Takes the settings with the lowest cost on the tuning seeds."""
         seeds = range(FIRST_TUNING_SEED, FIRST_TUNING_SEED + request.tuning_seeds)
-        costs: list[float] = []
-        for settings in self.choices if len(self.choices) > 1 else ():
+        costs = []
+        for settings in self.choices:
             self.settings = settings
             cost = fmean(self.ask("run", request.iterations, request, seeds=list(seeds))["costs"])
-            costs.append(cost if cost == cost else float("inf"))
-        self.settings = self.choices[costs.index(min(costs))] if costs else self.choices[0]
+            costs.append(cost if math.isfinite(cost) else math.inf)
+        self.tuning_cost = min(costs)
+        self.settings = self.choices[costs.index(self.tuning_cost)]
 
 
 def run(request: Request) -> int:
@@ -240,12 +250,15 @@ def compare(arms: Sequence[Arm], request: Request, left_out: dict[str, str]) -> 
     if not arms:
         return []
     times = take_turns(arms, base, request)
-    rows = [make_row("evaluations", arm, equal, base, times, request) for arm in arms]
+    rows = [make_row("evaluations", arm, equal, base, times) for arm in arms]
+    if "milliseconds" not in request.budgets:
+        return rows
     counts = fit_counts(arms, request.budget_ms or times[id(arms[0])], times, request)
     timely = {**equal, **play(counts, [arm for arm in arms if counts[id(arm)] != request.iterations])}
     arms = [arm for arm in arms if id(arm) in timely]
     times = take_turns(arms, counts, request)
-    return rows + [make_row("milliseconds", arm, timely, counts, times, request) for arm in arms]
+    rows = rows if "evaluations" in request.budgets else []
+    return rows + [make_row("milliseconds", arm, timely, counts, times) for arm in arms]
 
 
 def fit_counts(arms: Sequence[Arm], budget_ms: float, times: dict[int, float], request: Request) -> dict[int, int]:
@@ -295,7 +308,6 @@ def make_row(
     played: dict[int, Any],
     counts: dict[int, int],
     times: dict[int, float],
-    request: Request,
 ) -> dict[str, Any]:
     """One row of the result."""
     costs = played[id(arm)]["costs"]
@@ -310,20 +322,24 @@ def make_row(
         "ms_p50": times[id(arm)],
         "iterations": counts[id(arm)],
         "settings": arm.settings,
+        "tuning_cost": arm.tuning_cost,
         "costs": costs,
     }
 
 
 def compare_best(rows: Sequence[dict[str, Any]], problem: str) -> Iterator[dict[str, Any]]:
-    """Of each budget, the best planner of this and of other libraries, and the difference, paired over the seeds."""
+    """Of each budget, the best planner of this and of other libraries, and the difference, paired over the seeds.
+
+    The best planners are those with the lowest cost on the tuning seeds at equal evaluations.
+    """
     from latentplan.evaluation.statistics import confidence_interval
 
-    for budget in ("evaluations", "milliseconds"):
+    for budget in BUDGETS:
         here = [row for row in rows if row["problem"] == problem and row["budget"] == budget]
         own = [row for row in here if row["library"] == OURS]
         peers = [row for row in here if row["library"] != OURS]
         if own and peers:
-            ours, peer = (min(side, key=lambda row: row["cost_mean"]) for side in (own, peers))
+            ours, peer = (min(side, key=lambda row: row["tuning_cost"]) for side in (own, peers))
             differences = [left - right for left, right in zip(ours["costs"], peer["costs"], strict=True)]
             yield {
                 "problem": problem,
@@ -339,17 +355,15 @@ def compare_best(rows: Sequence[dict[str, Any]], problem: str) -> Iterator[dict[
 
 def cost_table(rows: Sequence[dict[str, Any]]) -> str:
     """The rows of one problem as a text table: a line for each planner, both budgets side by side."""
-    lines = []
+    planners: dict[tuple[str, str], dict[str, Any]] = {}
     for row in rows:
-        if row["budget"] == "evaluations":
-            others = [other for other in rows if other["budget"] == "milliseconds"]
-            key = (row["library"], row["planner"])
-            timely = next((other for other in others if (other["library"], other["planner"]) == key), None)
-            lines.append(
-                [f"{row['library']} {row['planner']}", *_cells(row), *(_cells(timely) if timely else ["-"] * 4)]
-            )
-    header = ["planner", "cost", "sd", "sequences", "ms p50", "cost, equal ms", "sd", "sequences", "ms p50"]
-    return format_table(header, lines)
+        planners.setdefault((row["library"], row["planner"]), {})[row["budget"]] = row
+    lines = [
+        [" ".join(name), *(cell for budget in BUDGETS for cell in _cells(found.get(budget)))]
+        for name, found in planners.items()
+    ]
+    columns = ["cost", "sd", "sequences", "ms p50"]
+    return format_table(["planner", *columns, *(f"{name}, equal ms" for name in columns)], lines)
 
 
 def best_table(best: Sequence[dict[str, Any]]) -> str:
@@ -365,11 +379,9 @@ def best_table(best: Sequence[dict[str, Any]]) -> str:
     return format_table(["problem", "best of ours", "cost", "best other", "cost", "difference", "95 %"], lines)
 
 
-def _cells(row: dict[str, Any]) -> list[str]:
-    return [
-        format_number(row[key], digits)
-        for key, digits in zip(("cost_mean", "cost_sd", "evaluations", "ms_p50"), (2, 2, 0, 1), strict=True)
-    ]
+def _cells(row: dict[str, Any] | None) -> list[str]:
+    digits = {"cost_mean": 2, "cost_sd": 2, "evaluations": 0, "ms_p50": 1}
+    return [format_number(row[key] if row else None, number) for key, number in digits.items()]
 
 
 @contextmanager

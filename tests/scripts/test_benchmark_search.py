@@ -87,7 +87,11 @@ def test_rows_have_the_promised_keys_for_every_planner_and_budget(result):
     found = [(row["problem"], row["planner"], row["budget"]) for row in result["rows"]]
     budgets = ("evaluations", "milliseconds")
     assert sorted(found) == sorted(
-        (problem, planner, budget) for problem in ("lq", "navigation") for planner in PLANNERS for budget in budgets
+        (problem, planner + width, budget)
+        for problem in ("lq", "navigation")
+        for planner in PLANNERS
+        for width in ("", "-wide")
+        for budget in budgets
     )
 
 
@@ -101,7 +105,7 @@ def test_rows_summarise_the_cost_of_every_seed(result):
 
 def test_every_planner_evaluates_about_the_same_number_of_sequences(result):
     evaluations = [row["evaluations"] for row in result["rows"] if row["budget"] == "evaluations"]
-    assert all(16 <= number <= 16 + 6 for number in evaluations)  # a few more choose the executed sequence
+    assert all(16 <= number <= 16 + 20 for number in evaluations)  # a few more choose or refine the executed sequence
 
 
 def test_play_repeats_and_does_not_depend_on_the_other_seeds():
@@ -125,13 +129,20 @@ def test_earlier_rows_join_the_result(result, tmp_path, capsys):
     assert "other cem" in capsys.readouterr().out
 
 
-def test_best_planners_are_compared_seed_by_seed():
-    def row(library, planner, costs):
-        facts = {"problem": "lq", "budget": "evaluations", "library": library, "planner": planner}
-        return {**facts, "costs": costs, "cost_mean": fmean(costs)}
+def test_one_budget_alone_can_be_asked_for(tmp_path):
+    path = tmp_path / "result.json"
+    flags = ["--problems", "lq", "--planners", "icem", "--seeds", "2", "--budgets", "milliseconds"]
+    assert benchmark.main(["search", *SMALL, *flags, "--json", str(path)]) == 0
+    assert [row["budget"] for row in json.loads(path.read_text())["rows"]] == ["milliseconds"]
 
-    rows = [row("latentplan", "cem", [9.0, 9.0]), row("latentplan", "icem", [1.0, 3.0])]
-    rows += [row("peer", "A", [2.0, 6.0]), row("peer", "B", [2.0, 7.0])]
+
+def test_best_planners_of_the_tuning_seeds_are_compared_seed_by_seed():
+    def row(library, planner, tuning_cost, costs):
+        facts = {"problem": "lq", "budget": "evaluations", "library": library, "planner": planner}
+        return {**facts, "tuning_cost": tuning_cost, "costs": costs, "cost_mean": fmean(costs)}
+
+    rows = [row("latentplan", "cem", 9.0, [0.0, 0.0]), row("latentplan", "icem", 2.0, [1.0, 3.0])]
+    rows += [row("peer", "A", 3.0, [2.0, 6.0]), row("peer", "B", 4.0, [0.0, 0.0])]
     (best,) = compare_best(rows, "lq")
     assert (best["ours"], best["peer"]) == ("icem", "peer A")
     assert best["difference"] == -2.0
@@ -158,6 +169,7 @@ def test_settings_with_the_lowest_finite_cost_are_chosen():
     arm = Arm("peer", "A", "lq", FakeProcess(), choices)
     arm.choose(search.Request())
     assert arm.settings == {"cost": 2.0}
+    assert arm.tuning_cost == 2.0
 
 
 def test_library_that_cannot_be_installed_is_left_out_in_one_line(tmp_path, monkeypatch, capsys):
@@ -175,6 +187,7 @@ def test_library_that_cannot_be_installed_is_left_out_in_one_line(tmp_path, monk
         (["--peers", "torchlr"], "'torchrl'"),
         (["--planners", "icme", "--peers", "none"], "'icem'"),
         (["--seeds", "1"], "--seeds"),
+        (["--budgets", "evaluation"], "'evaluations'"),
         (["--budget-ms", "0"], "--budget-ms"),
         (["--earlier", "no_such.json"], "no_such.json"),
     ],

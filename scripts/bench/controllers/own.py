@@ -1,4 +1,7 @@
-"""This library's planners, with their own defaults: only the problem and the budget are named."""
+"""This library's planners, with their own defaults: only the problem and the budget are named.
+
+A planner `NAME-wide` starts with a standard deviation of half the range of the actions, in place of a quarter.
+"""
 
 from __future__ import annotations
 
@@ -12,7 +15,7 @@ from bench.controllers.task import Act, Task
 from latentplan.planning import PLANNERS, ModelPredictiveController, make_planner
 
 
-def controller(name: str) -> Callable[[Task, Sequence[int]], Act]:
+def controller(name: str, is_wide: bool = False) -> Callable[[Task, Sequence[int]], Act]:
     """A function that makes the controller of a registered planner."""
 
     def make(task: Task, seeds: Sequence[int]) -> Act:
@@ -24,7 +27,8 @@ def controller(name: str) -> Callable[[Task, Sequence[int]], Act]:
         else:
             iterations = {"num_iterations": task.iterations, "warm_start_iterations": task.iterations}
             budget = {"num_samples": task.samples, **iterations}
-        planner = make_planner(name, **size, **bounds, **budget, **task.settings)
+        width = {"init_std": task.scale[1]} if is_wide else {}
+        planner = make_planner(name, **size, **bounds, **budget, **width, **task.settings)
         streams = [torch.Generator().manual_seed(seed) for seed in seeds]
         return ModelPredictiveController(planner, task.model(), generator=streams).act
 
@@ -32,4 +36,5 @@ def controller(name: str) -> Callable[[Task, Sequence[int]], Act]:
 
 
 if __name__ == "__main__":
-    serve({name: Entry(controller(name), is_batched=True) for name in PLANNERS})
+    narrow = {name: Entry(controller(name), is_batched=True) for name in PLANNERS}
+    serve(narrow | {f"{name}-wide": Entry(controller(name, is_wide=True), is_batched=True) for name in PLANNERS})
