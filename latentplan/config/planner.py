@@ -48,8 +48,8 @@ class SearchOptions:
             the mean and another sequence, by predicted return: the policy's own sequence, or the best candidate where
             the policy makes no proposals or constraints or an objective that it was not trained for are set.
         noise_beta: Exponent of coloured sampling noise, in [0, 100]; 0 is white, larger is smoother over the horizon.
-        white_noise_share: Share of the samples whose noise is white although `noise_beta` is above 0, in [0, 1]. Above 0
-            the smooth samples explore further than `init_std`, and the white ones stay closer to the mean.
+        white_noise_share: Share of the samples whose noise is white although `noise_beta` is above 0, in [0, 1]. Where
+            both kinds exist, the smooth ones explore further than `init_std`, and the white ones less far.
         keep_elite_fraction: Share of the elites that stay candidates in the next iteration and plan, in [0, 1].
         temperature: Elites are weighted by exp(return / (temperature * spread)) as in MPPI, where the spread is the
             standard deviation of their returns; null weights all elites alike.

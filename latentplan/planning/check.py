@@ -126,8 +126,8 @@ def _explain_rows(state: State) -> list[str]:
     shapes = [tuple(leaf.shape) for leaf in tree_leaves(state)]
     if len(shapes) == 1 and len(shapes[0]) == 1:
         return [
-            f"perhaps: a state of shape {shapes[0]} is {shapes[0][0]} environments with one number each; pass state[None] "
-            "if it is one environment"
+            f"perhaps: a state of shape {shapes[0]} is {shapes[0][0]} environments with one number each; "
+            "pass state[None] if it is one environment"
         ]
     if any(len(shape) > 2 for shape in shapes):
         shape = next(shape for shape in shapes if len(shape) > 2)

@@ -206,7 +206,7 @@ class ModelPredictiveController:
 
     def _search(self, state: State, previous: Plan | None, generator: Generators, last_action: Tensor | None) -> Plan:
         """Returns a new plan, of which no action has been executed."""
-        given = {"keep": self.keep, "callback": self.callback, "last_action": last_action}
+        given: dict[str, Any] = {"keep": self.keep, "callback": self.callback, "last_action": last_action}
         plan = self.planner.plan(
             self.model,
             state,

@@ -193,7 +193,7 @@ def _register_dataclass(leaf: Any) -> bool:
     if isinstance(leaf, Tensor) or isinstance(leaf, type) or not dataclasses.is_dataclass(leaf):
         return False
     kind = type(leaf)
-    names = [field.name for field in dataclasses.fields(kind)]
+    names = [field.name for field in dataclasses.fields(leaf)]
 
     def flatten(value: Any) -> tuple[list[Any], None]:
         return [getattr(value, name) for name in names], None

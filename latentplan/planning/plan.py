@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable
-from dataclasses import dataclass, replace
-from typing import Any, NamedTuple
+from dataclasses import dataclass, fields, replace
+from typing import Any
 
 import torch
 from einops import rearrange
@@ -16,7 +16,8 @@ from torch.utils._pytree import tree_map
 TENSORS = ("actions", "mean", "var", "expected_return", "elites", "is_warm", "elapsed", "is_followed")
 
 
-class Iteration(NamedTuple):
+@dataclass(frozen=True)
+class Iteration:
     """One iteration of a search: what a callback receives, and what a plan keeps of its candidates.
 
     Attributes:
@@ -48,7 +49,8 @@ class Iteration(NamedTuple):
         def select(value: Any) -> Any:
             return value[rows.to(value.device)] if isinstance(value, Tensor) else value
 
-        return Iteration(*(tree_map(select, value) for value in self))
+        values = {field.name: tree_map(select, getattr(self, field.name)) for field in fields(self)}
+        return Iteration(**values)
 
 
 @dataclass(frozen=True)
@@ -136,6 +138,7 @@ class Plan:
         """The action executed last, (batch, action); NaN where the plan has none or another agent acted."""
         index = (self.elapsed.clamp(1, self.actions.shape[1]) - 1).to(self.actions.device)
         action = torch.take_along_dim(self.actions, index[:, None, None], dim=1)[:, 0]
+        assert self.is_followed is not None
         is_known = self.is_warm & self.is_followed & (self.elapsed > 0) & (self.elapsed <= self.actions.shape[1])
         return action.masked_fill(~is_known.to(action.device)[:, None], torch.nan)
 
@@ -246,7 +249,7 @@ def shift_plan(
         previous: The previous plan, of any length.
         rest: The start of a cold search, (batch, horizon, action), in the precision of the next plan.
         tail: How the tail is filled: `zero` (with `rest`), `hold` (the last action repeated) or `policy`.
-        fit: `fit(sequence) -> sequence` makes the actions allowed ones, for (batch, horizon, action) and (batch, kept, ...).
+        fit: `fit(sequence) -> sequence` makes actions allowed, for (batch, horizon, action) and (batch, kept, ...).
         policy_tail: `policy_tail(sequence, is_tail) -> sequence` fills the tail with the model's policy.
     """
     length, horizon = previous.mean.shape[1], rest.shape[1]

@@ -16,7 +16,8 @@ from latentplan.planning.objectives import Constraint, Term
 from latentplan.planning.plan import Iteration, Plan
 from latentplan.planning.search.choices import read_choices
 from latentplan.planning.search.deadline import Pace
-from latentplan.planning.search.loop import Problem, Search, View
+from latentplan.planning.search.loop import Search
+from latentplan.planning.search.problem import Problem, View
 from latentplan.planning.search.purity import FirstSearches
 from latentplan.planning.search.sampling import Generators
 
@@ -129,6 +130,7 @@ class CEMPlanner(SearchOptions):
             keep: `candidates` keeps the candidates of every iteration in `Plan.candidates`, with returns and
                 feasibility; `states` keeps their imagined states too; None keeps nothing.
             callback: `callback(iteration)` is called after every iteration, with the same fields.
+
         Returns:
             The plan; `Plan` describes the diagnostics in its `info`.
 
@@ -215,7 +217,7 @@ def cem_gradient_planner(**settings: Any) -> CEMPlanner:
 
 
 # By planner, the options for which it has a value of its own.
-OWN_OPTIONS: dict[Callable[..., CEMPlanner], set[str]] = {
+OWN_OPTIONS: dict[Callable[..., Any], set[str]] = {
     CEMPlanner: set(),
     cem_gradient_planner: {"gradient_steps"},
     icem_planner: {"noise_beta", "white_noise_share", "keep_elite_fraction", "final"},

@@ -54,8 +54,8 @@ class Choices:
         Args:
             points: (batch, sample, length, action).
             probabilities: (batch, length, discrete, value).
-            noise: Unit Gaussian noise, (1 or batch, sample, length, action): its quantile chooses the value, so coloured
-                noise keeps a value for several steps.
+            noise: Unit Gaussian noise, (1 or batch, sample, length, action). Its quantile chooses the value, so
+                coloured noise keeps a value for several steps.
         """
         quantile = torch.special.ndtr(noise[..., self.dims])[..., None]
         index = (probabilities.cumsum(dim=-1)[:, None] < quantile).sum(dim=-1)

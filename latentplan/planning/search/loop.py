@@ -15,23 +15,19 @@ parts that would end too late (`deadline`). Scores come from `scorer`, and the e
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
-from typing import Any, NamedTuple
+from collections.abc import Callable, Sequence
 
 import torch
 from torch import Tensor
-from torch.utils._pytree import tree_map
 
 from latentplan.config.planner import SearchOptions
-from latentplan.planning.model import Model, State, action_dtype, count_rows, has_policy, is_sampling, state_device
-from latentplan.planning.objectives import Constraint, Objective, Term, apply_view
+from latentplan.planning.model import State, action_dtype, count_rows, has_policy, is_sampling, state_device
+from latentplan.planning.objectives import apply_view
 from latentplan.planning.plan import Iteration, Plan, WarmStart, shift_plan
 from latentplan.planning.search.choice import Choice, Finalists, choose
 from latentplan.planning.search.choices import Choices
 from latentplan.planning.search.deadline import Budget, Pace
 from latentplan.planning.search.elites import (
-    Elites,
     Scores,
     mean_return,
     move_towards,
@@ -39,119 +35,22 @@ from latentplan.planning.search.elites import (
     spread_of_returns,
 )
 from latentplan.planning.search.gradient import Pause, Refined, ascend
+from latentplan.planning.search.problem import (
+    Problem,
+    View,
+    find_spreads,
+    fit_steps,
+    make_space,
+    split_limits,
+)
+from latentplan.planning.search.progress import Progress
 from latentplan.planning.search.purity import Watch, describe_writing
 from latentplan.planning.search.sampling import Generators, Streams
 from latentplan.planning.search.scorer import Scorer
-from latentplan.planning.search.space import Bounds, Space
+from latentplan.planning.search.space import Bounds
 
 Candidates = tuple[Tensor, Scores]
 """Points (batch, sample, length, action) and the scores of their actions."""
-
-
-@dataclass(frozen=True)
-class Problem:
-    """The problem that one search solves.
-
-    Attributes:
-        model: The model in which action sequences are imagined.
-        state: Start of the plans, rows (batch,).
-        objective: Maximised; None is the predicted return.
-        constraints: Violations that candidates must avoid.
-        low: Lowest action, (1 or batch, 1 or horizon, action).
-        high: Highest action, (1 or batch, 1 or horizon, action).
-        init_mean: Mean at the start of a cold search and end of a shifted plan, (1 or batch, 1 or horizon, action);
-            None takes the middle of the bounds.
-        init_std: Standard deviation at the start of the search, (1, 1, action); None takes a quarter of the action
-            range.
-        discount: Discount per model step, in (0, 1].
-        choices: By dimension, the values of discrete actions.
-        last_action: The action executed last, (batch, action); None takes it from the previous plan.
-        is_new: Whether this is the first search in the model, so that the model is watched for changes of its inputs.
-    """
-
-    model: Model
-    state: State
-    objective: Term | None
-    constraints: Sequence[Constraint]
-    low: Tensor
-    high: Tensor
-    init_mean: Tensor | None
-    init_std: Tensor | None
-    discount: float
-    choices: Mapping[int, Sequence[float]]
-    last_action: Tensor | None
-    is_new: bool
-
-
-@dataclass(frozen=True)
-class View:
-    """What a caller sees of a search.
-
-    Attributes:
-        keep: `candidates` or `states`, which the plan keeps; None keeps neither.
-        callback: Called after each iteration.
-    """
-
-    keep: str | None = None
-    callback: Callable[[Iteration], Any] | None = None
-
-    @property
-    def is_open(self) -> bool:
-        """Whether iterations are described at all."""
-        return self.keep is not None or self.callback is not None
-
-
-class Progress(NamedTuple):
-    """The state of a search between two refits. Dim 0 of every tensor is the environment, and a finished one is frozen.
-
-    Attributes:
-        mean: Mean of the search distribution, (batch, length, action).
-        var: Variance of the search distribution, (batch, length, action).
-        probabilities: Probabilities of discrete values, (batch, length, discrete, value); None without discrete
-            dimensions.
-        elites: Elites of the last refit; None before the first.
-        expected_return: Mean return of the last elites, NaN before the first refit, (batch,).
-        num_nonfinite: Number of candidates so far whose return was not finite, (batch,).
-        iterations: Number of refits so far, (batch,).
-        has_elites: Whether any candidate so far had a finite return, (batch,).
-    """
-
-    mean: Tensor
-    var: Tensor
-    probabilities: Tensor | None
-    elites: Elites | None
-    expected_return: Tensor
-    num_nonfinite: Tensor
-    iterations: Tensor
-    has_elites: Tensor
-
-    def updated(self, mask: Tensor, new: Progress) -> Progress:
-        """Returns this progress, with the environments in mask (batch,) taken from `new`."""
-
-        def select(newer: Any, older: Any) -> Any:
-            if not isinstance(newer, Tensor):
-                return newer
-            return torch.where(mask.reshape(-1, *[1] * (newer.ndim - 1)), newer, older)
-
-        selected: Progress = tree_map(select, new, self)
-        return selected
-
-    def describe(self, history: Sequence[tuple[Tensor, Tensor]], stopped: str) -> dict[str, Any]:
-        """Returns the diagnostics of a plan.
-
-        Args:
-            history: The elites' mean return and the mean sampling std after each refit, both (batch,).
-            stopped: The reason the search ended.
-        """
-        none = self.expected_return.new_zeros(len(self.expected_return), 0)
-        return {
-            "elite_return": torch.stack([elite_return for elite_return, _ in history], dim=1) if history else none,
-            "std": torch.stack([std for _, std in history], dim=1) if history else none,
-            "iterations": self.iterations,
-            "num_nonfinite": self.num_nonfinite,
-            "is_fallback": ~self.has_elites,
-            "stopped": stopped,
-        }
 
 
 class Search:
@@ -186,9 +85,12 @@ class Search:
         choices = Choices(problem.choices, self.dtype, self.device) if problem.choices else None
         self.bounds = Bounds(low, high, choices)
         self._check_previous()
-        limits, constraints = _split_limits(problem.constraints)
-        self.space = self._make_space(limits)
-        self.init_std, self.min_std = self._spreads()
+        limits, constraints = split_limits(problem.constraints)
+        find_last = self._find_last_action()
+        self.space = make_space(options, self.bounds, self.horizon, limits, find_last)
+        init_std = None if problem.init_std is None else self._per_step(problem.init_std, "init_std")
+        spreads = find_spreads(self.bounds, init_std, options.min_std)
+        self.init_std, self.min_std = (self.space.at_points(spread) for spread in spreads)
         rest = (low + high) / 2 if problem.init_mean is None else self._per_step(problem.init_mean, "init_mean")
         self.rest = self.bounds.fit(rest).expand(self.batch, self.horizon, -1)
         self.num_proposals = options.num_proposals(has_policy(model))
@@ -204,7 +106,7 @@ class Search:
             use_continues=options.use_continues,
             penalty=options.constraint_penalty,
             generator=self.streams.model_generator() if is_sampling(model) else None,
-            find_last_action=self._find_last_action(),
+            find_last_action=find_last,
         )
 
     def budget(self, pace: Pace, clock: Callable[[], float], started: float, seconds: float | None) -> Budget:
@@ -242,6 +144,7 @@ class Search:
             refined = self._refine(actions)
             actions, violation = refined.actions, refined.violations
             expected = torch.where(torch.isfinite(refined.returns), refined.returns, expected)
+            assert progress.elites is not None
             pause = pause.renewed(refined.gain, spread_of_returns(progress.elites))
             budget.lap("gradient")
         info = {**progress.describe(history, stopped), "is_policy": torch.zeros_like(progress.has_elites)}
@@ -502,24 +405,6 @@ class Search:
             sizes = f"{self.batch} environments and actions of {self.bounds.action_dim}"
             raise ValueError(f"the last plan is for {batch} environments and actions of {dim}, this search for {sizes}")
 
-    def _make_space(self, limits: Sequence[Tensor]) -> Space:
-        options, choices = self.options, self.bounds.choices
-        max_change = None
-        if limits:
-            max_change = torch.stack([limit.expand(self.bounds.action_dim) for limit in limits]).amin(dim=0)
-            max_change = max_change.to(dtype=self.dtype, device=self.device)
-            if choices is not None:  # a value is taken or not, so it has no rate
-                max_change = max_change.index_fill(0, choices.dims, float("inf"))
-        find_last = self._find_last_action() if limits else None
-        return Space(
-            self.bounds,
-            self.horizon,
-            spline=options.action_spline,
-            num_knots=options.knots(self.horizon),
-            max_change=max_change,
-            last_action=None if find_last is None else find_last(),
-        )
-
     def _find_last_action(self) -> Callable[[], Tensor] | None:
         """Returns the function that returns the action executed last, (batch, action); None if none can be known."""
         given, previous = self.problem.last_action, self.previous
@@ -533,34 +418,8 @@ class Search:
             return None
         return lambda: previous.last_action.to(dtype=self.dtype, device=self.device)
 
-    def _spreads(self) -> tuple[Tensor, Tensor]:
-        """Returns the std at the start and the floor of the sampling std, (1 or batch, 1 or length, action)."""
-        floor = torch.full_like(self.bounds.low, self.options.min_std)
-        if self.problem.init_std is not None:
-            init_std = self._per_step(self.problem.init_std, "init_std")
-        else:
-            init_std = (self.bounds.high - self.bounds.low) / 4
-            floor = torch.minimum(floor, init_std)
-        return self.space.at_points(init_std), self.space.at_points(floor)
-
     def _per_step(self, value: Tensor, name: str) -> Tensor:
-        """Returns a value (1 or batch, 1 or more steps, action) with the steps of this plan, in its precision."""
-        batch, steps, _ = value.shape
-        if batch not in (1, self.batch) or (steps != 1 and steps < self.horizon):
-            given = f"{batch} environments and {steps} steps"
-            raise ValueError(f"{name} is for {given}, the plan for {self.batch} and {self.horizon}")
-        return value[:, : self.horizon].to(dtype=self.dtype, device=self.device)
-
-
-def _split_limits(constraints: Sequence[Constraint]) -> tuple[list[Tensor], list[Constraint]]:
-    """Returns the rate limits among the constraints, which the search space holds, and the other constraints."""
-    limits, others = [], []
-    for constraint in constraints:
-        if isinstance(constraint, Objective) and constraint.max_change is not None:
-            limits.append(torch.tensor(constraint.max_change, dtype=torch.float64))
-        else:
-            others.append(constraint)
-    return limits, others
+        return fit_steps(value, name, self.batch, self.horizon).to(dtype=self.dtype, device=self.device)
 
 
 def _ignore_nan_actions(candidates: Tensor, scores: Scores) -> Scores:

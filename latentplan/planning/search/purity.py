@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import weakref
 from typing import Any
 
@@ -20,13 +21,12 @@ class FirstSearches:
 
     def add(self, model: object) -> bool:
         """Remembers a model; returns whether this is its first search."""
-        known = self._seen.get(id(model))
+        key = id(model)
+        known = self._seen.get(key)
         if known is not None and known() is model:
             return False
-        try:
-            self._seen[id(model)] = weakref.ref(model, lambda _, key=id(model): self._seen.pop(key, None))
-        except TypeError:  # without weak references a model cannot be told from a later one at the same place
-            return True
+        with contextlib.suppress(TypeError):  # without weak references a model cannot be told from a later one
+            self._seen[key] = weakref.ref(model, lambda _: self._seen.pop(key, None))
         return True
 
     def __reduce__(self) -> tuple[type[FirstSearches], tuple[()]]:

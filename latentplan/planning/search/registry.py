@@ -120,7 +120,7 @@ def make_planner(name: str, options: SearchOptions | None = None, **settings: An
     changed: dict[str, Any] = {}
     if options is not None:
         names = {field.name for field in dataclasses.fields(SearchOptions)}
-        own = OWN_OPTIONS.get(PLANNERS[name], names)
+        own = OWN_OPTIONS.get(PLANNERS[name], names)  # a planner of the user chooses all its defaults
         for field in dataclasses.fields(options):  # an agent's settings have defaults of their own
             value = getattr(options, field.name)
             if field.name in names and (field.name not in own or value != field.default):

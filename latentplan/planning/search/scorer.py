@@ -251,8 +251,8 @@ def _check_reward(reward: Tensor, rows: int) -> None:
         raise TypeError(f"step()'s reward must be a tensor of shape ({rows},), got {type(reward).__name__}")
     if reward.shape != (rows,):
         raise ValueError(
-            f"step()'s reward must have shape ({rows},), got {tuple(reward.shape)}: one number per row, and dim 0 of a "
-            "state is its rows (state[None] for one environment, state.flatten(0, 1) for two dimensions of environments)"
+            f"step()'s reward must have shape ({rows},), got {tuple(reward.shape)}: one number per row; dim 0 of a "
+            "state is its rows (state[None] for one environment, state.flatten(0, 1) for two such dimensions)"
         )
 
 

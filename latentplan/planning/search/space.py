@@ -98,17 +98,16 @@ class Space:
     ) -> None:
         self.bounds, self.horizon, self.choices = bounds, horizon, bounds.choices
         self.max_change, self.last_action = max_change, last_action
-        self.length, self.point_bounds, self._steps = horizon, bounds, None
+        self.length, self.point_bounds = horizon, bounds
+        self._steps: Tensor | None = None
         self._matrix: Tensor | None = None
         if spline is None:
             return
-        low = bounds.low
-        constant = {"dtype": low.dtype, "device": low.device}
         self.length = num_knots
-        self._matrix = torch.tensor(_spline_matrix(spline, horizon, num_knots), **constant)
-        self._inverse = torch.linalg.pinv(self._matrix.double()).to(**constant)
-        self._hold = torch.tensor(_spline_matrix("zero", horizon, num_knots), **constant)
-        self._steps = torch.linspace(0, horizon - 1, num_knots).round().long().to(low.device)
+        matrix = torch.tensor(_spline_matrix(spline, horizon, num_knots), dtype=torch.float64)
+        self._matrix, self._inverse = matrix.to(bounds.low), torch.linalg.pinv(matrix).to(bounds.low)
+        self._hold = torch.tensor(_spline_matrix("zero", horizon, num_knots)).to(bounds.low)
+        self._steps = torch.linspace(0, horizon - 1, num_knots).round().long().to(bounds.low.device)
         self.point_bounds = bounds.select(self._steps)
 
     @property
@@ -176,8 +175,8 @@ class Space:
 def _spline_matrix(spline: str, horizon: int, num_knots: int) -> list[list[float]]:
     """Returns the weight of each knot in each action, (horizon, knot).
 
-    `zero` holds each knot for an equal share of the horizon. `linear` and `cubic` have knots at equal distances from the
-    first action to the last; the slopes of the cubic spline at its knots are those of Catmull and Rom.
+    `zero` holds each knot for an equal share of the horizon. `linear` and `cubic` have knots at equal distances from
+    the first action to the last; the slopes of the cubic spline at its knots are those of Catmull and Rom.
     """
     if spline == "zero" or num_knots == 1:
         knot = torch.arange(horizon) * num_knots // horizon

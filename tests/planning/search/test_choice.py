@@ -1,4 +1,4 @@
-"""`final="better"` executes the mean or another sequence, by predicted return: the policy's mode or the best candidate."""
+"""`final="better"` executes the mean or another sequence: the policy's mode, or the best candidate."""
 
 import math
 
