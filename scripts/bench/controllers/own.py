@@ -27,7 +27,7 @@ def controller(name: str, is_wide: bool = False) -> Callable[[Task, Sequence[int
         else:
             iterations = {"num_iterations": task.iterations, "warm_start_iterations": task.iterations}
             budget = {"num_samples": task.samples, **iterations}
-        width = {"init_std": task.scale[1]} if is_wide else {}
+        width: dict[str, Any] = {"init_std": task.scale[1]} if is_wide else {}
         planner = make_planner(name, **size, **bounds, **budget, **width, **task.settings)
         streams = [torch.Generator().manual_seed(seed) for seed in seeds]
         return ModelPredictiveController(planner, task.model(), generator=streams).act
