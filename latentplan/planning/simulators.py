@@ -6,7 +6,7 @@ MuJoCo and jax are imported when a model is made, so that `latentplan.planning` 
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import torch
 from einops import rearrange
 from torch import Tensor
-from torch.utils._pytree import tree_leaves, tree_map, tree_structure, tree_unflatten
+from torch.utils._pytree import TreeSpec, tree_flatten, tree_leaves, tree_structure, tree_unflatten
 
 from latentplan.config.extras import import_extra
 from latentplan.planning.model import State
@@ -187,8 +187,8 @@ class JaxModel:
     """A model whose functions are written in jax for one state; tensors are shared with torch through DLPack.
 
     `jax.vmap` makes the functions work on rows, `jax.jit` compiles them, and `jax.lax.scan` makes one program of a
-    whole plan; the first search of each size waits for the compiler. The model passes no gradients to torch. States in
-    float64 need `jax.config.update("jax_enable_x64", True)`.
+    whole plan; the first search of each size waits for the compiler. Gradients pass through to torch. States in float64
+    need `jax.config.update("jax_enable_x64", True)`.
 
     Args:
         step: `step(state, action) -> (next_state, reward)` for one state, an array or a tuple, NamedTuple, dictionary
@@ -211,36 +211,80 @@ class JaxModel:
 
     def step(self, state: State, action: Tensor) -> tuple[State, Tensor]:
         """Returns the next state, rows (rows,), and the reward of the step, (rows,)."""
-        following, reward = self._compiled["step"](_to_jax(state), _to_jax(action))
-        return _to_torch(following, like=state), _to_torch(reward, like=action)
+        following, reward = self._call("step", (state, action), like=(state, action))
+        return following, reward
 
     def rollout(self, state: State, actions: Tensor) -> tuple[Tensor, State]:
         """Returns the rewards along actions (rows, horizon, action), (rows, horizon), and the last state."""
-        rewards, last = self._compiled["rollout"](_to_jax(state), _to_jax(actions))
-        return _to_torch(rewards, like=actions), _to_torch(last, like=state)
+        last, rewards = self._call("rollout", (state, actions), like=(state, actions))
+        return rewards, last
 
     def _value(self, state: State) -> Tensor:
-        value: Tensor = _to_torch(self._compiled["value"](_to_jax(state)), like=tree_leaves(state)[0])
+        value: Tensor = self._call("value", (state,), like=tree_leaves(state)[0])
         return value
+
+    def _call(self, name: str, arguments: tuple[Any, ...], like: Any) -> Any:
+        """Returns the result of a compiled function, with the structure of `like`."""
+        leaves, structure = tree_flatten(arguments)
+        wanted = tree_structure(like)
+        if torch.is_grad_enabled() and any(leaf.requires_grad for leaf in leaves):
+            return tree_unflatten(_JaxCall.apply(self._compiled, name, structure, wanted, *leaves), wanted)
+        return tree_unflatten(_evaluate(self._compiled[name], structure, wanted, leaves), wanted)
 
     @cached_property
     def _compiled(self) -> dict[str, Callable[..., Any]]:
-        """The compiled functions of rows."""
+        """The compiled functions of rows, and under `name gradient` what maps a gradient of results to arguments."""
         import jax
 
         def rollout(state: Any, actions: Any) -> tuple[Any, Any]:
-            last, rewards = jax.lax.scan(self._step_one, state, actions)
-            return rewards, last
+            return jax.lax.scan(self._step_one, state, actions)  # type: ignore[no-any-return]
 
-        functions = {"step": self._step_one, "rollout": rollout, "value": self._value_one}
-        return {name: jax.jit(jax.vmap(function)) for name, function in functions.items() if function is not None}
+        compiled = {}
+        for name, function in {"step": self._step_one, "rollout": rollout, "value": self._value_one}.items():
+            if function is not None:
+                rows = jax.vmap(function)
+                compiled[name] = jax.jit(rows)
+                compiled[f"{name} gradient"] = jax.jit(
+                    lambda arguments, gradient, rows=rows: jax.vjp(rows, *arguments)[1](gradient)
+                )
+        return compiled
 
     def __getstate__(self) -> dict[str, Any]:
         return {name: value for name, value in self.__dict__.items() if name != "_compiled"}
 
 
-def _to_jax(tree: Any) -> Any:
-    """Returns the same pytree with jax arrays, which share the memory of contiguous tensors."""
+class _JaxCall(torch.autograd.Function):
+    """A compiled function of a `JaxModel` with its gradient."""
+
+    @staticmethod
+    def forward(
+        ctx: Any,
+        compiled: Mapping[str, Callable[..., Any]],
+        name: str,
+        structure: TreeSpec,
+        wanted: TreeSpec,
+        *leaves: Tensor,
+    ) -> tuple[Tensor, ...]:
+        ctx.gradient, ctx.structure, ctx.wanted = compiled[f"{name} gradient"], structure, wanted
+        ctx.save_for_backward(*leaves)
+        return tuple(_evaluate(compiled[name], structure, wanted, leaves))
+
+    @staticmethod
+    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
+        arguments = _to_jax(ctx.saved_tensors, ctx.structure)
+        found = ctx.gradient(arguments, _to_jax(gradients, ctx.wanted))
+        return None, None, None, None, *_to_torch(found, ctx.structure)
+
+
+def _evaluate(
+    function: Callable[..., Any], structure: TreeSpec, wanted: TreeSpec, leaves: Sequence[Tensor]
+) -> list[Tensor]:
+    """Returns the leaves of a compiled function's result, for the leaves of its arguments."""
+    return _to_torch(function(*_to_jax(leaves, structure)), wanted)
+
+
+def _to_jax(leaves: Sequence[Tensor], structure: TreeSpec) -> Any:
+    """Returns the pytree of these leaves with jax arrays, which share the memory of contiguous tensors."""
     import jax
 
     def convert(leaf: Tensor) -> Any:
@@ -249,14 +293,12 @@ def _to_jax(tree: Any) -> Any:
             raise TypeError(f'{leaf.dtype} needs jax.config.update("jax_enable_x64", True); else use 32 bits')
         return array
 
-    return tree_map(convert, tree)
+    return tree_unflatten([convert(leaf) for leaf in leaves], structure)
 
 
-def _to_torch(tree: Any, like: Any) -> Any:
-    """Returns the pytree with tensors, in the order of keys of another pytree of this structure."""
+def _to_torch(tree: Any, structure: TreeSpec) -> list[Tensor]:
+    """Returns the leaves of a pytree of jax arrays as tensors, in the order of keys of a structure."""
     import jax
 
     jax.block_until_ready(tree)
-    structure = tree_structure(like)
-    leaves = structure.flatten_up_to(tree)
-    return tree_unflatten([torch.from_dlpack(leaf) for leaf in leaves], structure)
+    return [torch.from_dlpack(leaf) for leaf in structure.flatten_up_to(tree)]

@@ -187,6 +187,40 @@ def test_jax_model_equals_the_same_equations_in_torch():
     torch.testing.assert_close(last, state)
 
 
+@pytest.mark.parametrize("method", ["step", "rollout"])
+def test_gradient_through_jax_equals_the_gradient_of_the_same_equations_in_torch(method):
+    pytest.importorskip("jax")
+    start, given = (
+        Car(torch.tensor([0.5, -0.3]), torch.tensor([0.0, 0.2])),
+        torch.tensor([[[0.3], [-0.8]], [[0.1], [1.0]]]),
+    )
+    found = []
+    for model in (JaxModel(drive), None):
+        state, actions = Car(*(part.clone().requires_grad_() for part in start)), given.clone().requires_grad_()
+        if model is not None and method == "rollout":
+            rewards, last = model.rollout(state, actions)
+            total = rewards.sum() + last.place.sum()
+        else:
+            current, total = state, 0.0
+            for action in actions.unbind(1):
+                current, reward = model.step(current, action) if model is not None else drive(current, action.T)
+                total = total + reward.sum()
+            total = total + current.place.sum()
+        found.append(torch.autograd.grad(total, [*state, actions]))
+    torch.testing.assert_close(found[0], found[1])
+
+
+def test_gradient_planner_refines_plans_in_a_jax_model():
+    pytest.importorskip("jax")
+    model, state = JaxModel(drive), Car(torch.tensor([0.5]), torch.tensor([0.0]))
+    sizes = {"action_dim": 1, "horizon": 20, "num_samples": 16, "num_iterations": 1}
+    plain, refined = (
+        CEMPlanner(**sizes, gradient_steps=steps).plan(model, state, generator=torch.Generator().manual_seed(0))
+        for steps in (0, 10)
+    )
+    assert float(refined.expected_return) > float(plain.expected_return)
+
+
 def test_jax_model_keeps_the_order_of_dictionary_keys_and_strided_rows():
     pytest.importorskip("jax")
     model = JaxModel(lambda state, action: ({"a": state["a"], "z": state["z"] + action}, action.sum()))
