@@ -135,7 +135,7 @@ class Arm:
 
 
 def run(request: Request) -> int:
-    """Plays every problem with every planner, prints the tables and writes the result."""
+    """Plays every problem with every planner; prints a table and writes the result after each problem."""
     request.use_device(1)
     import torch
 
@@ -143,9 +143,16 @@ def run(request: Request) -> int:
 
     earlier = [row for path in request.earlier for row in read_rows(path, request)]
     rows: list[dict[str, Any]] = []
+    best: list[dict[str, Any]] = []
     left_out: dict[str, str] = {}
     with ExitStack() as stack:
         libraries = start_libraries(request, stack, left_out)
+        others = [name for name in libraries if name != OURS]
+        facts = {
+            "versions": {OURS: __version__, **{name: installed_version(name, FOLDER) for name in others}},
+            "settings": {"samples": request.samples, "seeds": request.seeds, "tuning_seeds": request.tuning_seeds},
+            "machine": describe_machine(torch.device("cpu")),
+        }
         listed = {name: process.ask({"do": "list"})["planners"] for name, process in libraries.items()}
         listed[OURS] = select_planners(request, listed[OURS])
         for problem in request.problems:
@@ -157,20 +164,9 @@ def run(request: Request) -> int:
             found = compare(arms, request, left_out) + [row for row in earlier if row["problem"] == problem]
             rows += found
             print(f"\n{problem}, {request.seeds} seeds\n{cost_table(found)}", flush=True)
-    best = [row for problem in request.problems for row in compare_best(rows, problem)]
-    result = {
-        "rows": rows,
-        "best": best,
-        "versions": {
-            OURS: __version__,
-            **{name: installed_version(name, FOLDER) for name in libraries if name != OURS},
-        },
-        "left_out": left_out,
-        "settings": {"samples": request.samples, "seeds": request.seeds, "tuning_seeds": request.tuning_seeds},
-        "machine": describe_machine(torch.device("cpu")),
-    }
+            best += compare_best(rows, problem)
+            write_json(request.json, {"rows": rows, "best": best, "left_out": left_out, **facts})
     print("\n" + best_table(best))
-    write_json(request.json, result)
     return 0
 
 
