@@ -8,6 +8,7 @@ ARGS ?=
 BIN := .venv/bin
 STAMP := .venv/.installed
 DOCS_STAMP := .venv/.docs-installed
+JAX_STAMP := .venv/.jax-installed
 
 .PHONY: setup train test test-all check doctor bench soak soak-faults docs clean
 
@@ -22,7 +23,7 @@ test: $(STAMP)
 test-all: $(STAMP)
 	$(BIN)/python -m pytest -n auto --dist loadfile -m "not soak"
 
-check: test-all
+check: $(JAX_STAMP) test-all
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
@@ -55,6 +56,11 @@ $(STAMP): pyproject.toml constraints.txt
 
 $(DOCS_STAMP): $(STAMP)
 	$(BIN)/python -m pip install --constraint constraints.txt --editable '.[docs]'
+	@touch $@
+
+# Only the tests of JaxModel need jax, which is large.
+$(JAX_STAMP): $(STAMP)
+	$(BIN)/python -m pip install --constraint constraints.txt --editable '.[jax]'
 	@touch $@
 
 # The first interpreter the project runs on.

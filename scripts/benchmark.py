@@ -17,6 +17,7 @@ COMMANDS = {
     "decide": Command("bench.decide", "milliseconds per decision of planner, actor and exported actor"),
     "paths": Command("bench.paths", "milliseconds of every fast path of the world model beside plain torch"),
     "plan": Command("bench.plan", "milliseconds per search beside other planners, on the same model and settings"),
+    "search": Command("bench.search", "cost that planners of this and other libraries reach in closed loop"),
     "compile": Command("bench.compile", "milliseconds per search in small models, stepped and with compile_rollout"),
     "ablate": Command("bench.ablate", "return of a trained planner without each of its parts, in paired episodes"),
     "zero-shot": Command("bench.zero_shot", "goals that an agent was not trained for: planner, actor, random actions"),

@@ -15,7 +15,7 @@ SIMULATION = {"dm_control", "dm_env", "mujoco", "gymnasium", "OpenGL"}
 BELOW_AGENTS = ("config", "planning", "models", "replay", "objectives")
 ROOMS = {
     "config": ((), {"yaml", "jsonargparse"}),
-    "planning": (("config",), {"torch", "einops"}),
+    "planning": (("config",), {"torch", "einops", "mujoco", "jax"}),
     "models": (("config",), {"torch", "einops"}),
     "replay": (("config",), {"numpy", "torch", "einops"}),
     "reporting": (("config",), {"numpy", "cv2", "matplotlib"}),

@@ -2,7 +2,9 @@
 
 import ast
 import re
+import shutil
 import subprocess
+import sys
 import tomllib
 from importlib import metadata
 from pathlib import Path
@@ -14,10 +16,9 @@ from packaging.version import Version
 
 ROOT = Path(__file__).resolve().parent.parent
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())
-REQUIREMENTS = [
-    Requirement(text)
-    for text in PROJECT["project"]["dependencies"] + PROJECT["project"]["optional-dependencies"]["dev"]
-]
+EXTRAS = PROJECT["project"]["optional-dependencies"]
+LISTED = [Requirement(text) for text in PROJECT["project"]["dependencies"] + EXTRAS["train"] + EXTRAS["dev"]]
+REQUIREMENTS = [requirement for requirement in LISTED if requirement.name != "latentplan"]
 
 
 @pytest.fixture(scope="module")
@@ -53,6 +54,48 @@ def test_python_3_13_gets_every_requirement_of_dm_control_but_labmaze():
     needed = {canonicalize_name(item.name) for item in wanted if not item.marker or item.marker.evaluate(environment)}
     assert needed - listed == {"labmaze"}
     assert "dm-control" not in listed
+
+
+def test_development_brings_what_training_needs():
+    assert "latentplan[train]" in EXTRAS["dev"]
+
+
+def test_package_without_extras_needs_four_libraries():
+    names = {Requirement(text).name for text in PROJECT["project"]["dependencies"]}
+    assert names == {"torch", "einops", "numpy", "safetensors"}
+
+
+@pytest.fixture(scope="module")
+def metadata_of_builds(tmp_path_factory):
+    """What an editable and a plain install require, as the build backend writes it, without an extra being asked."""
+    source = tmp_path_factory.mktemp("source")
+    for name in ("build_backend.py", "pyproject.toml", "README.md", "LICENSE"):
+        shutil.copy(ROOT / name, source)
+    for name in ("latentplan", "configs"):
+        shutil.copytree(ROOT / name, source / name, ignore=shutil.ignore_patterns("__pycache__"))
+    code = "import sys, build_backend as b; print(getattr(b, f'prepare_metadata_for_build_{sys.argv[1]}')(sys.argv[2]))"
+    found = {}
+    for kind in ("editable", "wheel"):
+        out = tmp_path_factory.mktemp(kind)
+        command = [sys.executable, "-c", code, kind, str(out)]
+        done = subprocess.run(command, cwd=source, capture_output=True, text=True, check=True)
+        text = (out / done.stdout.splitlines()[-1] / "METADATA").read_text()
+        listed = [Requirement(line) for line in re.findall(r"^Requires-Dist: (.*)$", text, re.M)]
+        environment = {"extra": "", "python_version": "3.12"}
+        found[kind] = {item.name for item in listed if item.marker is None or item.marker.evaluate(environment)}
+    return found
+
+
+def test_editable_install_brings_what_training_needs(metadata_of_builds):
+    wanted = [Requirement(text) for text in PROJECT["project"]["dependencies"] + EXTRAS["train"]]
+    environment = {"python_version": "3.12"}
+    assert metadata_of_builds["editable"] == {
+        item.name for item in wanted if item.marker is None or item.marker.evaluate(environment)
+    }
+
+
+def test_plain_install_brings_what_planning_needs(metadata_of_builds):
+    assert metadata_of_builds["wheel"] == {"torch", "einops", "numpy", "safetensors"}
 
 
 def test_every_subpackage_is_packaged():

@@ -89,10 +89,10 @@ def _guarded(check: Callable[[], Iterator[Finding]]) -> Iterator[Finding]:
     """The findings of a check, the last of them its failure if it fails: the report must always end."""
     try:
         yield from check()
-    except ImportError as error:
-        yield Finding(_title(check), f"cannot import {error.name}", "pip install -e . in the project's folder")
     except UserError as error:
         yield Finding(_title(check), "does not work", str(error))
+    except ImportError as error:
+        yield Finding(_title(check), f"cannot import {error.name}", "pip install -e . in the project's folder")
     except Exception as error:  # drivers and libraries raise errors of any type
         yield Finding(_title(check), "failed", f"{type(error).__name__}: {error}")
 

@@ -16,6 +16,7 @@ from typing import Any
 
 from latentplan.config import MAX_THREADS, Config, Device, PlannerConfig, UserError, from_dict, to_dict
 from latentplan.config.checks import within
+from latentplan.config.extras import describe_missing, extra_of
 from latentplan.config.files import build_config
 from latentplan.config.parsing import option
 from latentplan.config.planner import override_planner
@@ -35,6 +36,10 @@ def run_guarded(command: Callable[[Sequence[str]], int], argv: Sequence[str]) ->
             sys.stdout.flush()
     except (UserError, FloatingPointError) as error:
         return _refuse(str(error))
+    except ModuleNotFoundError as error:
+        if extra_of(error.name) is None:
+            raise
+        return _refuse(describe_missing(str(error.name), "this command"))
     except KeyboardInterrupt:
         return 130
     except BrokenPipeError:

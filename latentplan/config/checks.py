@@ -83,10 +83,10 @@ def within(config: Any, **bounds: tuple[float, float]) -> None:
         _require(config, name, low <= getattr(config, name) <= high, f"in [{low}, {high}]")
 
 
-def one_of(config: Any, **choices: tuple[str, ...]) -> None:
+def one_of(config: Any, **choices: tuple[str | None, ...]) -> None:
     """Require fields to be one of the values allowed."""
     for name, allowed in choices.items():
-        _require(config, name, getattr(config, name) in allowed, f"one of {', '.join(allowed)}")
+        _require(config, name, getattr(config, name) in allowed, f"one of {', '.join(map(str, allowed))}")
 
 
 def _require(config: Any, name: str, holds: bool, allowed: str) -> None:

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from latentplan.config import EnvConfig, UserError
+from latentplan.config.extras import import_extra
 from latentplan.config.quantities import scales
 from latentplan.objectives.box import BoxView, box_of, planning_degree
 from latentplan.objectives.expression import (
@@ -159,8 +160,7 @@ def read_goal_image(path: str, size: int = GOAL_IMAGE_SIZE) -> NDArray[np.uint8]
     Raises:
         UserError: The file is missing, is not an image, or is not square.
     """
-    import cv2  # only a goal image needs OpenCV
-
+    cv2 = import_extra("cv2", "a goal image")
     try:
         if not Path(path).is_file():
             reason = "is a folder" if Path(path).is_dir() else "does not exist"

@@ -16,18 +16,20 @@ from latentplan.planning.objectives import (
     conditioned,
     goal_term,
     learned_return,
+    rate_limit,
     risk,
     smoothness_penalty,
     terminal_value,
     uncertainty_penalty,
 )
-from latentplan.planning.plan import Plan
+from latentplan.planning.plan import Iteration, Plan
 from latentplan.planning.realtime.planner import BackgroundPlanner, PlanBuffer
 from latentplan.planning.realtime.scheduler import Decision, PlanExecutor, PlanScheduler
 from latentplan.planning.realtime.worker import settle
-from latentplan.planning.search.cem import CEMPlanner, icem_planner, mppi_planner
+from latentplan.planning.search.cem import CEMPlanner, cem_gradient_planner, icem_planner, mppi_planner
 from latentplan.planning.search.elites import refit
 from latentplan.planning.search.registry import PLANNERS, Planner, SupportsPlan, make_planner
+from latentplan.planning.simulators import JaxModel, MuJoCoModel, Physics
 
 __all__ = [
     "PLANNERS",
@@ -36,9 +38,13 @@ __all__ = [
     "CEMTrajectoryOptimizer",
     "Decision",
     "FunctionModel",
+    "Iteration",
+    "JaxModel",
     "Model",
     "ModelPredictiveController",
+    "MuJoCoModel",
     "Objective",
+    "Physics",
     "Plan",
     "PlanBuffer",
     "PlanExecutor",
@@ -49,6 +55,7 @@ __all__ = [
     "SupportsPlan",
     "action_penalty",
     "at_every_state",
+    "cem_gradient_planner",
     "check_model",
     "compile_rollout",
     "conditioned",
@@ -57,6 +64,7 @@ __all__ = [
     "learned_return",
     "make_planner",
     "mppi_planner",
+    "rate_limit",
     "refit",
     "risk",
     "settle",

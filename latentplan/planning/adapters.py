@@ -68,6 +68,9 @@ class CEMTrajectoryOptimizer:
             smoothing=smoothing,
             init_std=half_range,
             min_std=0.0,
+            final="mean",
+            noise_beta=0.0,
+            keep_elite_fraction=0.0,
             action_low=action_low,
             action_high=action_high,
         )

@@ -10,7 +10,21 @@ import torch
 from torch import Tensor
 from torch.utils._pytree import tree_leaves, tree_map, tree_structure
 
-from latentplan.planning.model import Model, State, action_dtype, count_rows, state_device, supports
+from latentplan.planning.model import (
+    Bound,
+    Model,
+    State,
+    action_dtype,
+    call_with,
+    count_rows,
+    describe_step_result,
+    is_sampling,
+    per_step,
+    state_device,
+    supports,
+)
+from latentplan.planning.search.choices import Choices, read_choices
+from latentplan.planning.search.registry import Planner
 
 _ROWS, _HORIZON, _NUM = 4, 3, 2
 _OPTIONAL = ("value", "policy", "continues", "uncertainty", "rollout", "fast_step", "propose", "particles")
@@ -32,32 +46,96 @@ _ARGUMENTS: dict[str, Callable[[State, Tensor], tuple[Any, ...]]] = {
 
 
 @torch.no_grad()
-def check_model(model: Model, state: State, action_dim: int, *, tolerance: float = 1e-3) -> tuple[str, ...]:
+def check_model(
+    model: Model,
+    state: State,
+    action_dim: int | None = None,
+    *,
+    planner: Planner | None = None,
+    action_low: Bound = -1.0,
+    action_high: Bound = 1.0,
+    action_choices: Any = None,
+    tolerance: float = 1e-3,
+) -> tuple[str, ...]:
     """Calls every method of a model and raises an error that lists every problem found.
 
     Args:
         model: The model.
         state: A typical state, any number of rows.
-        action_dim: Numbers in an action; the check uses actions in [-1, 1].
+        action_dim: Numbers in an action.
+        planner: A planner whose `action_dim`, bounds and discrete actions the check uses, in place of the arguments.
+        action_low: Lowest action of the check, see `CEMPlanner`.
+        action_high: Highest action of the check.
+        action_choices: Discrete actions of the check, see `CEMPlanner`.
         tolerance: Relative difference that is allowed between two results that must agree.
 
     Returns:
         Names of the optional methods that the model has.
 
     Raises:
-        TypeError: The state is not a tensor or a pytree of tensors.
+        TypeError: The state is not a tensor or a pytree of tensors, or neither `action_dim` nor `planner` is given.
         ValueError: There are problems; the message lists them, one per line: exceptions, shapes, dtypes, NaN, rows that
             influence each other or come in another order, changed inputs, a rollout that does not agree with steps.
     """
+    if planner is not None:
+        action_dim, action_low, action_high = planner.action_dim, planner.action_low, planner.action_high
+        action_choices = getattr(planner, "action_choices", None)
+    if action_dim is None:
+        raise TypeError("check_model() needs action_dim or planner")
     index = torch.arange(_ROWS) % count_rows(state)
     rows = tree_map(lambda leaf: leaf[index.to(leaf.device)], state)
-    generator = torch.Generator().manual_seed(0)
-    actions = torch.rand(_ROWS, _HORIZON, action_dim, generator=generator, dtype=torch.float64) * 2 - 1
+    actions = _draw_actions(action_dim, action_low, action_high)
     actions = actions.to(dtype=action_dtype(state), device=state_device(state))
-    problems = list(_find_problems(model, rows, actions, tolerance))
+    if choices := read_choices(action_choices, action_dim):
+        actions = Choices(choices, actions.dtype, actions.device).snap(actions)
+    checked = _Seeded(model, actions.device) if is_sampling(model) else model
+    problems = list(_find_problems(checked, rows, actions, tolerance))
     if problems:
+        problems += _explain_rows(state)
         raise ValueError(f"{type(model).__name__} cannot be planned with:\n- " + "\n- ".join(problems))
     return tuple(name for name in _OPTIONAL if supports(model, name))
+
+
+class _Seeded:
+    """A model that samples, with a stream of its own, so that its methods can be called without one."""
+
+    def __init__(self, model: Any, device: torch.device) -> None:
+        self._model = model
+        generator = torch.Generator(device).manual_seed(0)
+        for name in ("step", "fast_step", "rollout"):
+            if supports(model, name):
+                method = getattr(model, name)
+                setattr(self, name, lambda *given, method=method: call_with(method, generator, *given))
+
+    def __getattr__(self, name: str) -> Any:  # called for attributes that this class lacks
+        return getattr(self._model, name)
+
+
+def _draw_actions(action_dim: int, low: Bound, high: Bound) -> Tensor:
+    """Returns actions within the bounds of the first steps and of the first environment, (rows, horizon, action)."""
+    generator = torch.Generator().manual_seed(0)
+    drawn = torch.rand(_ROWS, _HORIZON, action_dim, generator=generator, dtype=torch.float64)
+    lowest, highest = (per_step(bound, action_dim, "a bound")[:1] for bound in (low, high))
+    steps = torch.arange(_HORIZON)
+    lowest, highest = (bound[:, steps.clamp_max(bound.shape[1] - 1)] for bound in (lowest, highest))
+    return lowest + (highest - lowest) * drawn
+
+
+def _explain_rows(state: State) -> list[str]:
+    """Returns what the rows of a state are, if its shape may be the reason of a problem."""
+    shapes = [tuple(leaf.shape) for leaf in tree_leaves(state)]
+    if len(shapes) == 1 and len(shapes[0]) == 1:
+        return [
+            f"perhaps: a state of shape {shapes[0]} is {shapes[0][0]} environments with one number each; "
+            "pass state[None] if it is one environment"
+        ]
+    if any(len(shape) > 2 for shape in shapes):
+        shape = next(shape for shape in shapes if len(shape) > 2)
+        return [
+            f"perhaps: a state of shape {shape} is {shape[0]} environments with features {shape[1:]}; pass "
+            "state.flatten(0, 1) if its first two dimensions are environments"
+        ]
+    return []
 
 
 def _find_problems(model: Any, state: State, actions: Tensor, tolerance: float) -> Iterator[str]:
@@ -101,11 +179,19 @@ def _call(model: Any, name: str, given: tuple[Any, ...], find: Callable[[Any], I
         result = getattr(model, name)(*copies)
         problems = list(find(result))
     except Exception as error:
-        return [f"{name}() raises {type(error).__name__}: {error}"], None
+        return [f"{name}() raises {type(error).__name__}: {error}{_explain_error(error)}"], None
     pairs = zip(tree_leaves(given), tree_leaves(copies), strict=True)
     if any(isinstance(before, Tensor) and not _is_same(before, after) for before, after in pairs):
         problems.append(f"{name}() changes its inputs; it has to return new tensors")
     return problems, result
+
+
+def _explain_error(error: Exception) -> str:
+    """Returns a hint where actions that are floating-point numbers seem to be the reason of an exception."""
+    text = str(error).lower()
+    if any(sign in text for sign in ("used as indices", "expected dtype int64 for index", "only integer tensors")):
+        return "; actions are floating point: use action.long() as an index, and action_choices for discrete actions"
+    return ""
 
 
 def _check_result(name: str, result: Any, inputs: Inputs) -> Iterator[str]:
@@ -115,7 +201,12 @@ def _check_result(name: str, result: Any, inputs: Inputs) -> Iterator[str]:
     if name in ("step", "fast_step", "rollout"):
         shape, order = ((rows,), "(next_state, reward)") if name != "rollout" else ((rows, horizon), "(rewards, state)")
         if not isinstance(result, tuple) or len(result) != 2:
-            yield f"{name}() must return {order}, got {type(result).__name__}"
+            is_step = name == "step"
+            yield (
+                describe_step_result(result)
+                if is_step
+                else f"{name}() must return {order}, got {type(result).__name__}"
+            )
             return
         rewards, last = result if name == "rollout" else result[::-1]
         yield from _check_tensor(f"{name}()'s reward" + "s" * (name == "rollout"), rewards, shape)

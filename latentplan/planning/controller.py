@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import time
 from collections import deque
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 import torch
@@ -15,7 +15,7 @@ from torch.utils._pytree import tree_map
 from latentplan.planning.adapters import CEMTrajectoryOptimizer, RolloutController
 from latentplan.planning.model import Model, State, count_rows, state_device
 from latentplan.planning.objectives import Constraint, Term
-from latentplan.planning.plan import Plan
+from latentplan.planning.plan import Iteration, Plan
 from latentplan.planning.search.registry import Planner
 from latentplan.planning.search.sampling import Generators
 
@@ -32,6 +32,8 @@ class ModelPredictiveController:
         constraints: Violations that plans must avoid.
         generator: One random stream, or a list with one per environment.
         replan_every: Number of actions executed from each plan; at most the planner's horizon.
+        keep: See `CEMPlanner.plan`; the candidates of the last search are in `plan.candidates`.
+        callback: See `CEMPlanner.plan`.
 
     Attributes:
         plan: The plans in use; None before the first action and after a reset.
@@ -55,6 +57,8 @@ class ModelPredictiveController:
         constraints: Sequence[Constraint] = (),
         generator: Generators = None,
         replan_every: int = 1,
+        keep: str | None = None,
+        callback: Callable[[Iteration], Any] | None = None,
     ) -> None:
         horizon = min(planner.horizon, planner.goal_horizon or planner.horizon)
         if not 1 <= replan_every <= horizon:
@@ -65,17 +69,20 @@ class ModelPredictiveController:
         self.constraints = constraints
         self.generator = generator
         self.replan_every = replan_every
+        self.keep = keep
+        self.callback = callback
         self.plan: Plan | None = None
         self._is_stale: Tensor | None = None  # environments whose plan was made for another objective, (batch,) bool
         self._latencies_ms: deque[float] = deque(maxlen=10_000)
 
-    def act(self, state: State) -> Tensor:
+    def act(self, state: State, last_action: Tensor | None = None) -> Tensor:
         """Returns the next action of each environment, (batch, action).
 
         Args:
             state: Present state of each environment, rows (batch,).
+            last_action: The action executed last, (batch, action), if it was another than the controller's.
         """
-        return self._act(state, self.generator)
+        return self._act(state, self.generator, last_action)
 
     def act_where(self, state: State, where: Tensor) -> Tensor:
         """Returns the next action of some environments; in the others another agent acts, and their plans age.
@@ -187,18 +194,18 @@ class ModelPredictiveController:
         p50, p95, p99 = torch.quantile(times, torch.tensor([0.5, 0.95, 0.99], dtype=torch.float64)).tolist()
         return {"mean_ms": float(times.mean()), "p50_ms": p50, "p95_ms": p95, "p99_ms": p99}
 
-    def _act(self, state: State, generator: Generators) -> Tensor:
+    def _act(self, state: State, generator: Generators, last_action: Tensor | None = None) -> Tensor:
         started = time.perf_counter()
         if self.plan is None or self.plan.mean.shape[0] != count_rows(state):
-            self.plan = self._search(state, None, generator)
+            self.plan = self._search(state, None, generator, last_action)
             is_due = torch.ones(count_rows(state), dtype=torch.bool)
         else:
             is_due = ~self.plan.is_warm | (self.plan.elapsed >= self.replan_every) | self._find_stale()
             if bool(is_due.all()):
-                self.plan = self._search(state, self.plan, generator)
+                self.plan = self._search(state, self.plan, generator, last_action)
             elif bool(is_due.any()):
                 with _keep_streams(_select_streams(generator, ~is_due), _select_streams(generator, is_due)):
-                    self.plan = self.plan.updated(is_due, self._search(state, self.plan, generator))
+                    self.plan = self.plan.updated(is_due, self._search(state, self.plan, generator, last_action))
         self._is_stale = None
         action = self.plan.actions[torch.arange(len(is_due)), self.plan.elapsed]
         self.plan = self.plan.executed(self.plan.elapsed + 1)
@@ -212,8 +219,9 @@ class ModelPredictiveController:
         assert self.plan is not None
         return torch.zeros_like(self.plan.is_warm) if self._is_stale is None else self._is_stale
 
-    def _search(self, state: State, previous: Plan | None, generator: Generators) -> Plan:
+    def _search(self, state: State, previous: Plan | None, generator: Generators, last_action: Tensor | None) -> Plan:
         """Returns a new plan, of which no action has been executed."""
+        given: dict[str, Any] = {"keep": self.keep, "callback": self.callback, "last_action": last_action}
         plan = self.planner.plan(
             self.model,
             state,
@@ -221,6 +229,7 @@ class ModelPredictiveController:
             objective=self.objective,
             constraints=self.constraints,
             generator=generator,
+            **{name: value for name, value in given.items() if value is not None},  # not every planner knows them
         )
         return plan.executed(torch.zeros_like(plan.elapsed))
 

@@ -18,10 +18,15 @@ A model needs one method, `step`. Optional methods and attributes are detected b
                                                      the inner model, see `latentplan.planning.conditioned`
 
 Every row of an output must depend on the same row of the inputs only, and a method must not change its inputs.
+
+A method that samples takes a third argument `generator` (`step`, `fast_step`, `rollout`) and draws from it; a search
+passes the same stream to all calls, so that plans repeat.
 """
 
 from __future__ import annotations
 
+import dataclasses
+import inspect
 from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any, Protocol
@@ -29,10 +34,10 @@ from typing import Any, Protocol
 import torch
 from einops import rearrange, repeat
 from torch import Tensor
-from torch.utils._pytree import tree_leaves, tree_map
+from torch.utils._pytree import register_pytree_node, tree_leaves, tree_map
 
-State = Any  # a tensor, or a pytree (tuple, NamedTuple, dict, list) of tensors, dim 0 = rows
-Bound = float | Sequence[float] | Tensor  # one number, or one per action dimension
+State = Any  # a tensor, or a pytree (tuple, NamedTuple, dict, list, dataclass) of tensors, dim 0 = rows
+Bound = float | Sequence[Any] | Tensor  # one number, (action,), (horizon, action) or (batch, horizon, action)
 
 
 class Model(Protocol):
@@ -47,7 +52,7 @@ class FunctionModel:
     """A model made of functions.
 
     Args:
-        dynamics: `dynamics(state, action) -> next_state`.
+        dynamics: `dynamics(state, action) -> next_state`; dynamics that sample take `generator` as a third argument.
         reward: `reward(state, action) -> (rows,)`, of the state before the step.
         value: `value(state) -> (rows,)`, the expected return from the last state of a plan on.
         policy: `policy(state, generator) -> (rows, action)`; the mode if the generator is None.
@@ -68,6 +73,8 @@ class FunctionModel:
     ) -> None:
         self.dynamics = dynamics
         self.reward = reward
+        if takes_generator(dynamics):  # a planner detects by the signature that the step samples
+            self.step = self._sample_step  # type: ignore[method-assign]
         optional = {
             "value": value,
             "policy": policy,
@@ -82,6 +89,11 @@ class FunctionModel:
     def step(self, state: State, action: Tensor) -> tuple[State, Tensor]:
         """Returns the next state, and the reward (rows,) of the step."""
         return self.dynamics(state, action), self.reward(state, action)
+
+    def _sample_step(
+        self, state: State, action: Tensor, generator: torch.Generator | None = None
+    ) -> tuple[State, Tensor]:
+        return self.dynamics(state, action, generator), self.reward(state, action)  # type: ignore[call-arg]
 
 
 def supports(model: object, method: str) -> bool:
@@ -99,21 +111,72 @@ def require(model: object, method: str, reason: str) -> None:
         raise ValueError(f"{reason} needs a model with {method}(), which {type(model).__name__} does not have")
 
 
-def take_step(model: Any, state: State, action: Tensor) -> tuple[State, Tensor]:
-    """Returns the model's step; `fast_step` takes it if the model has one and gradients are off."""
+def has_policy(model: object) -> bool:
+    """Returns whether the model proposes actions, by `policy` or by `propose`."""
+    return supports(model, "policy") or supports(model, "propose")
+
+
+def takes_generator(function: Callable[..., Any]) -> bool:
+    """Returns whether a function has an argument `generator`."""
+    try:
+        return "generator" in inspect.signature(function).parameters
+    except (TypeError, ValueError):  # a compiled function may have no signature
+        return False
+
+
+def is_sampling(model: Any) -> bool:
+    """Returns whether the model's steps or rollouts draw from a generator that they are given."""
+    methods = ("step", "fast_step", "rollout")
+    return any(supports(model, name) and takes_generator(getattr(model, name)) for name in methods)
+
+
+def call_with(function: Callable[..., Any], generator: torch.Generator | None, *arguments: Any) -> Any:
+    """Returns the result of a model's method, which is given the generator if there is one and the method takes it."""
+    if generator is None or not takes_generator(function):
+        return function(*arguments)
+    return function(*arguments, generator=generator)
+
+
+def take_step(
+    model: Any, state: State, action: Tensor, generator: torch.Generator | None = None
+) -> tuple[State, Tensor]:
+    """Returns the model's step; `fast_step` takes it if the model has one and gradients are off.
+
+    Args:
+        model: The model.
+        state: States, rows (rows,).
+        action: Actions, (rows, action).
+        generator: Random stream of a model that samples; None leaves the stream to the model.
+
+    Raises:
+        ValueError: The step does not return two things.
+    """
     is_fast = supports(model, "fast_step") and not torch.is_grad_enabled()
-    following: tuple[State, Tensor] = (model.fast_step if is_fast else model.step)(state, action)
-    return following
+    following = call_with(model.fast_step if is_fast else model.step, generator, state, action)
+    if not isinstance(following, (tuple, list)) or len(following) != 2:
+        raise ValueError(describe_step_result(following))
+    return following[0], following[1]
+
+
+def describe_step_result(result: Any) -> str:
+    """Returns the message for a step that does not return (next_state, reward)."""
+    got = f"a tuple of {len(result)}" if isinstance(result, tuple) else type(result).__name__
+    hint = "; of a gymnasium step, return the first two" if isinstance(result, tuple) and len(result) == 5 else ""
+    return f"step() must return (next_state, reward), got {got}{hint}"
 
 
 def count_rows(state: State) -> int:
     """Returns the size of dim 0, which is the same in every tensor of the state.
+
+    Dataclasses in the state become pytrees: their fields are states too.
 
     Raises:
         TypeError: A leaf of the state is not a tensor.
         ValueError: The state holds no tensor, tensors whose rows differ, or no row.
     """
     leaves = tree_leaves(state)
+    while any(_register_dataclass(leaf) for leaf in leaves):
+        leaves = tree_leaves(state)
     for leaf in leaves:
         if not isinstance(leaf, Tensor):
             raise TypeError(f"a state is a tensor or a pytree of tensors, but holds a {type(leaf).__name__}")
@@ -123,6 +186,26 @@ def count_rows(state: State) -> int:
     if shapes[0][0] == 0:
         raise ValueError(f"a state needs at least one row, got shapes {shapes}")
     return shapes[0][0]
+
+
+def _register_dataclass(leaf: Any) -> bool:
+    """Registers the dataclass of a leaf as a pytree; returns whether the leaf was a dataclass."""
+    if isinstance(leaf, Tensor) or isinstance(leaf, type) or not dataclasses.is_dataclass(leaf):
+        return False
+    kind = type(leaf)
+    names = [field.name for field in dataclasses.fields(leaf)]
+
+    def flatten(value: Any) -> tuple[list[Any], None]:
+        return [getattr(value, name) for name in names], None
+
+    def unflatten(values: Any, _: None) -> Any:
+        made = object.__new__(kind)  # neither __init__ nor __post_init__ has to accept what a pytree holds
+        for name, value in zip(names, values, strict=True):
+            object.__setattr__(made, name, value)
+        return made
+
+    register_pytree_node(kind, flatten, unflatten)
+    return True
 
 
 def repeat_rows(state: State, num: int) -> State:
@@ -159,6 +242,28 @@ def per_dimension(value: float | Sequence[float] | Tensor, action_dim: int, name
     if not bool(torch.isfinite(numbers).all()):
         raise ValueError(f"{name} must be finite, got {numbers.tolist()}")
     return numbers.expand(action_dim) if numbers.ndim == 0 or numbers.numel() == 1 else numbers
+
+
+def per_step(value: Bound, action_dim: int, name: str) -> Tensor:
+    """Returns the value for each environment, step and action dimension, (1 or batch, 1 or horizon, action), float64.
+
+    Args:
+        value: One number, one per dimension (action,), one per step (horizon, action), or (batch, horizon, action).
+        action_dim: Numbers in an action.
+        name: Name for errors.
+
+    Raises:
+        ValueError: The value has another shape, or is not finite.
+    """
+    numbers = torch.as_tensor(value, dtype=torch.float64)
+    if numbers.ndim < 2:
+        return per_dimension(numbers, action_dim, name)[None, None]
+    if numbers.ndim > 3 or numbers.shape[-1] != action_dim:
+        shape = tuple(numbers.shape)
+        raise ValueError(f"{name} must end in {action_dim} numbers per step, (horizon, action), got shape {shape}")
+    if not bool(torch.isfinite(numbers).all()):
+        raise ValueError(f"{name} must be finite, got {numbers.tolist()}")
+    return numbers[None] if numbers.ndim == 2 else numbers
 
 
 def check_shape(name: str, tensor: Tensor, shape: Sequence[int]) -> None:

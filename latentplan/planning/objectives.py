@@ -11,7 +11,7 @@ can be sent to another process if its functions and tensors can.
 from __future__ import annotations
 
 import operator
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
@@ -43,6 +43,8 @@ class Rollout:
         start: State before the first step.
         last_state: State after the last step.
         states: State after each step if a term needs the states, otherwise empty.
+        find_last_action: Returns the action executed last, (batch, action), NaN where unknown; None where no plan came
+            before.
     """
 
     model: Any
@@ -54,6 +56,16 @@ class Rollout:
     start: State
     last_state: State
     states: tuple[State, ...]
+    find_last_action: Callable[[], Tensor] | None = None
+
+    @property
+    def last_action(self) -> Tensor:
+        """The action executed before the first step, (rows, action); NaN where it is unknown."""
+        first = self.actions[:, 0]
+        if self.find_last_action is None:
+            return torch.full_like(first, torch.nan)
+        last = self.find_last_action().to(first)
+        return last.repeat_interleave(len(first) // len(last), dim=0)
 
 
 @dataclass(frozen=True)
@@ -66,6 +78,8 @@ class Objective:
         num_particles: Number of rollouts of each candidate that the term needs.
         needs: Methods that the model must have.
         view: View of the model for a search for this objective alone, see `conditioned`; None for a sum of terms.
+        max_change: Largest change of an action per step, one number or one per dimension, that a search holds for every
+            candidate, see `rate_limit`; None for other terms.
     """
 
     function: Term
@@ -73,6 +87,7 @@ class Objective:
     num_particles: int = 1
     needs: tuple[str, ...] = ()
     view: View | None = None
+    max_change: tuple[float, ...] | None = None
 
     def __call__(self, rollout: Rollout) -> Tensor:
         """Returns the term of each row, (rows,)."""
@@ -159,8 +174,44 @@ def action_penalty() -> Objective:
 
 
 def smoothness_penalty() -> Objective:
-    """Returns the objective: minus the squared change of the action per step, summed over steps and dimensions."""
+    """Returns the objective: minus the squared change of the action per step, summed over steps and dimensions.
+
+    The change from the action executed last to the first action of the plan counts too, where the former is known: from
+    the previous plan, or from the argument `last_action` of `plan`.
+    """
     return Objective(_action_changes)
+
+
+def rate_limit(
+    per_step: float | Sequence[float] | None = None,
+    *,
+    per_second: float | Sequence[float] | None = None,
+    step_seconds: float | None = None,
+) -> Objective:
+    """Returns the constraint that no action changes faster than a limit, from the action executed last on.
+
+    `CEMPlanner` holds this constraint by construction: it limits the changes of every candidate. The bounds of the
+    actions and the values of discrete actions prevail over the limit.
+
+    Args:
+        per_step: Largest change from one step to the next, in action units, one number or one per dimension.
+        per_second: Largest change per second, one number or one per dimension.
+        step_seconds: Duration of a model step in seconds, for `per_second`.
+
+    Raises:
+        ValueError: No limit is given, a limit is not above 0, or one of `per_second` and `step_seconds` is missing.
+    """
+    if (per_second is None) != (step_seconds is None):
+        raise ValueError("a rate limit per second needs both per_second and step_seconds")
+    limits = []
+    if per_step is not None:
+        limits.append(torch.as_tensor(per_step, dtype=torch.float64))
+    if per_second is not None and step_seconds is not None:
+        limits.append(torch.as_tensor(per_second, dtype=torch.float64) * step_seconds)
+    if not limits or any(limit.ndim > 1 or not bool((limit > 0).all()) for limit in limits):
+        raise ValueError(f"a rate limit must be above 0, got per_step {per_step} and per_second {per_second}")
+    numbers = tuple(torch.atleast_1d(torch.minimum(limits[0], limits[-1])).tolist())
+    return Objective(partial(_excess_change, numbers), max_change=numbers)
 
 
 def uncertainty_penalty() -> Objective:
@@ -308,7 +359,20 @@ def _action_size(rollout: Rollout) -> Tensor:
 
 
 def _action_changes(rollout: Rollout) -> Tensor:
-    return -rollout.actions.diff(dim=1).square().sum(dim=(1, 2))
+    first = _first_change(rollout).square().sum(dim=1)
+    return -rollout.actions.diff(dim=1).square().sum(dim=(1, 2)) - first
+
+
+def _excess_change(limit: tuple[float, ...], rollout: Rollout) -> Tensor:
+    largest = torch.tensor(limit).to(rollout.actions)
+    later = (rollout.actions.diff(dim=1).abs() - largest).clamp_min(0.0).sum(dim=(1, 2))
+    return later + (_first_change(rollout).abs() - largest).clamp_min(0.0).sum(dim=1)
+
+
+def _first_change(rollout: Rollout) -> Tensor:
+    """Returns the change from the action executed last to the first action, 0 where the former is unknown."""
+    last = rollout.last_action
+    return torch.where(torch.isnan(last), 0.0, rollout.actions[:, 0] - last)
 
 
 def _uncertainty(rollout: Rollout) -> Tensor:

@@ -4,14 +4,53 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from typing import Any
 
 import torch
 from einops import rearrange
 from torch import Tensor
+from torch.utils._pytree import tree_map
 
-TENSORS = ("actions", "mean", "var", "expected_return", "elites", "is_warm", "elapsed")  # attributes of a `Plan`
+# Attributes of a `Plan` that are tensors with the environment as dim 0.
+TENSORS = ("actions", "mean", "var", "expected_return", "elites", "is_warm", "elapsed", "is_followed")
+
+
+@dataclass(frozen=True)
+class Iteration:
+    """One iteration of a search: what a callback receives, and what a plan keeps of its candidates.
+
+    Attributes:
+        index: Number of the iteration, from 0.
+        actions: Candidates, (batch, sample, horizon, action).
+        returns: Their predicted returns, (batch, sample).
+        is_feasible: Whether a candidate satisfies all constraints and has a finite return, (batch, sample) bool.
+        violations: Constraint violations, (batch, sample); None without constraints.
+        states: Imagined states after each step, leaves (batch, sample, horizon, ...), where they were asked for; a
+            model with particles has (batch, sample, particle, horizon, ...).
+        mean: Mean of the distribution after the refit, (batch, horizon, action).
+        std: Standard deviation of the distribution after the refit, (batch, horizon, action).
+        elite_return: Mean return of the elites, (batch,).
+    """
+
+    index: int
+    actions: Tensor
+    returns: Tensor
+    is_feasible: Tensor
+    violations: Tensor | None
+    states: Any
+    mean: Tensor
+    std: Tensor
+    elite_return: Tensor
+
+    def take(self, rows: Tensor) -> Iteration:
+        """Returns the iteration of the environments at rows (chosen,) int."""
+
+        def select(value: Any) -> Any:
+            return value[rows.to(value.device)] if isinstance(value, Tensor) else value
+
+        values = {field.name: tree_map(select, getattr(self, field.name)) for field in fields(self)}
+        return Iteration(**values)
 
 
 @dataclass(frozen=True)
@@ -37,13 +76,16 @@ class Plan:
         actions: The chosen sequence within the bounds, (batch, horizon, action).
         mean: Mean of the search distribution, (batch, horizon, action).
         var: Variance of the search distribution, (batch, horizon, action).
-        expected_return: Predicted return, (batch,): the mean return of the last elites, or the return of the chosen
-            sequence if the option `final` is `best` or `better`. NaN where no candidate had a finite return.
+        expected_return: Predicted return of the chosen sequence, (batch,); with the option `final` `mean` and without
+            gradient steps it is the mean return of the last elites, which may be higher than the return of their mean.
+            NaN where no candidate had a finite return.
         info: Diagnostics by name, see above.
         elites: Kept elites, (batch, kept, horizon, action), if the planner keeps some.
         is_warm: Whether the next search may start from this plan, (batch,) bool on the CPU.
         elapsed: Number of actions executed since this plan was made, (batch,) on the CPU; the next search shifts the
             plan by this number.
+        is_followed: Whether the action executed last was this plan's, (batch,) bool on the CPU; None is everywhere.
+        candidates: Every iteration of the search, if `plan` was called with `keep`; empty otherwise.
     """
 
     actions: Tensor
@@ -54,11 +96,51 @@ class Plan:
     elites: Tensor | None
     is_warm: Tensor
     elapsed: Tensor
+    is_followed: Tensor | None = None
+    candidates: tuple[Iteration, ...] = ()
+
+    def __post_init__(self) -> None:
+        """Marks the plan as followed where nothing else is known."""
+        if self.is_followed is None:
+            object.__setattr__(self, "is_followed", torch.ones_like(self.is_warm))
+
+    @classmethod
+    def around(cls, actions: Any) -> Plan:
+        """Returns a plan from which a search starts warm: the distribution is centred on these actions.
+
+        Args:
+            actions: A trajectory, (horizon, action), or one for each environment, (batch, horizon, action): a tensor,
+                an array or a sequence. The first action is the one that is due now.
+
+        Raises:
+            ValueError: The actions have another shape.
+        """
+        sequence = torch.as_tensor(actions)
+        sequence = sequence if sequence.is_floating_point() else sequence.float()
+        sequence = sequence[None] if sequence.ndim == 2 else sequence
+        if sequence.ndim != 3:
+            shape = tuple(sequence.shape)
+            raise ValueError(f"a trajectory has shape (horizon, action) or (batch, horizon, action), got {shape}")
+        batch = len(sequence)
+        unknown = sequence.new_full((batch,), torch.nan)
+        none, zeros = torch.zeros(batch, dtype=torch.bool), torch.zeros(batch, dtype=torch.long)
+        info = {"is_fallback": none, "is_policy": none, "num_nonfinite": zeros}
+        var = torch.zeros_like(sequence)
+        return cls(sequence, sequence, var, unknown, info, None, ~none, zeros)
 
     @property
     def action(self) -> Tensor:
         """The first action of the chosen sequence, (batch, action)."""
         return self.actions[:, 0]
+
+    @property
+    def last_action(self) -> Tensor:
+        """The action executed last, (batch, action); NaN where the plan has none or another agent acted."""
+        index = (self.elapsed.clamp(1, self.actions.shape[1]) - 1).to(self.actions.device)
+        action = torch.take_along_dim(self.actions, index[:, None, None], dim=1)[:, 0]
+        assert self.is_followed is not None
+        is_known = self.is_warm & self.is_followed & (self.elapsed > 0) & (self.elapsed <= self.actions.shape[1])
+        return action.masked_fill(~is_known.to(action.device)[:, None], torch.nan)
 
     def action_distribution(self, min_std: float) -> tuple[Tensor, Tensor]:
         """Returns mean and std of the search distribution over the first action, (batch, action) each.
@@ -98,12 +180,13 @@ class Plan:
 
     def executed(self, elapsed: Tensor) -> Plan:
         """Returns this plan with `elapsed` (batch,) as the number of executed actions."""
-        return replace(self, elapsed=elapsed)
+        return replace(self, elapsed=elapsed, is_followed=None)
 
     def aged(self) -> Plan:
         """Returns this plan one step later, after another agent acted; environments without actions left are cold."""
         elapsed = self.elapsed + 1
-        return replace(self, elapsed=elapsed).forget(elapsed >= self.mean.shape[1])
+        nowhere = torch.zeros_like(self.is_warm)
+        return replace(self, elapsed=elapsed, is_followed=nowhere).forget(elapsed >= self.mean.shape[1])
 
     def take(self, rows: Tensor) -> Plan:
         """Returns the plans of the environments at rows (chosen,) int, which may repeat."""
@@ -112,7 +195,8 @@ class Plan:
             return value[rows.to(value.device)] if isinstance(value, Tensor) else value
 
         info = {name: select(value) for name, value in self.info.items()}
-        return Plan(info=info, **{name: select(getattr(self, name)) for name in TENSORS})
+        candidates = tuple(iteration.take(rows) for iteration in self.candidates)
+        return Plan(info=info, candidates=candidates, **{name: select(getattr(self, name)) for name in TENSORS})
 
     def spread(self, mask: Tensor) -> Plan:
         """Returns these plans, in order, at the environments in mask (batch,) bool, and cold copies elsewhere."""
@@ -139,7 +223,10 @@ class Plan:
         return cls(info={name: move(value) for name, value in values["info"].items()}, **moved, **on_cpu)
 
     def updated(self, mask: Tensor, new: Plan) -> Plan:
-        """Returns this plan, with the environments in mask (batch,) bool taken from a newer plan."""
+        """Returns this plan, with the environments in mask (batch,) bool taken from a newer plan.
+
+        The candidates are those of the newer plan, in every environment.
+        """
 
         def select(older: Any, newer: Any) -> Any:
             if not isinstance(older, Tensor) or not isinstance(newer, Tensor) or older.shape != newer.shape:
@@ -148,7 +235,8 @@ class Plan:
             return torch.where(is_newer, newer, older)
 
         info = {name: select(self.info.get(name), value) for name, value in new.info.items()}
-        return Plan(info=info, **{name: select(getattr(self, name), getattr(new, name)) for name in TENSORS})
+        tensors = {name: select(getattr(self, name), getattr(new, name)) for name in TENSORS}
+        return Plan(info=info, candidates=new.candidates, **tensors)
 
 
 @dataclass(frozen=True)
@@ -156,7 +244,8 @@ class WarmStart:
     """The previous plan, shifted to the present.
 
     Attributes:
-        mean: Shifted plan with its tail filled, zeros where cold, within the bounds, (batch, horizon, action).
+        mean: Shifted plan with its tail filled, and the start of a cold search where cold, within the bounds, (batch,
+            horizon, action).
         elites: Shifted elites, (batch, kept, horizon, action), if any were kept.
         is_warm: Environments in which the previous plan is valid, (batch,) bool on the CPU.
     """
@@ -169,40 +258,40 @@ class WarmStart:
 def shift_plan(
     previous: Plan,
     *,
-    horizon: int,
+    rest: Tensor,
     tail: str,
-    bounds: tuple[Tensor, Tensor],
+    fit: Callable[[Tensor], Tensor],
     policy_tail: Callable[[Tensor, Tensor], Tensor],
 ) -> WarmStart:
     """Shifts a plan by the actions executed since it was made, and fills its tail.
 
     Args:
         previous: The previous plan, of any length.
-        horizon: Number of actions of the next plan.
-        tail: How the tail is filled: `zero`, `hold` (the last action repeated) or `policy`.
-        bounds: Lowest and highest action, each (action,).
+        rest: The start of a cold search, (batch, horizon, action), in the precision of the next plan.
+        tail: How the tail is filled: `zero` (with `rest`), `hold` (the last action repeated) or `policy`.
+        fit: `fit(sequence) -> sequence` makes actions allowed, for (batch, horizon, action) and (batch, kept, ...).
         policy_tail: `policy_tail(sequence, is_tail) -> sequence` fills the tail with the model's policy.
     """
-    length = previous.mean.shape[1]
-    device, low, high = previous.mean.device, *bounds
+    length, horizon = previous.mean.shape[1], rest.shape[1]
+    device = previous.mean.device
     position = torch.arange(horizon)[None] + previous.elapsed[:, None]
     is_tail = (position >= length).to(device)[..., None]  # (batch, horizon, 1)
     index = position.clamp_max(length - 1).to(device)[..., None]
 
     def move(sequence: Tensor) -> Tensor:
         """Returns the shifted sequence in this search's precision, its last action repeated past its end (`hold`)."""
-        return torch.take_along_dim(sequence, index, dim=1).to(low.dtype)
+        return torch.take_along_dim(sequence, index, dim=1).to(rest.dtype)
 
     is_warm = previous.is_warm.to(device)[:, None, None]
     mean = move(previous.actions)
     if tail == "zero":
-        mean = torch.where(is_tail, 0.0, mean)
+        mean = torch.where(is_tail, rest, mean)
     elif tail == "policy":
         mean = policy_tail(mean, is_tail)
-    mean = torch.where(is_warm, mean, 0.0).clamp(low, high)
+    mean = fit(torch.where(is_warm, mean, rest))
 
     elites = previous.elites
     if elites is not None:
-        elites = torch.take_along_dim(elites, index[:, None], dim=2).to(low.dtype)
-        elites = torch.where(is_tail[:, None], mean[:, None], elites).clamp(low, high)
+        elites = torch.take_along_dim(elites, index[:, None], dim=2).to(rest.dtype)
+        elites = fit(torch.where(is_tail[:, None], mean[:, None], elites))
     return WarmStart(mean, elites, previous.is_warm)

@@ -5,6 +5,8 @@ from __future__ import annotations
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
+from latentplan.config.extras import require_extra
+
 if TYPE_CHECKING:
     from latentplan.training.distillation.run import distill, resume_distillation
     from latentplan.training.goal_conditioning.run import learn_goals, resume_goals
@@ -23,5 +25,6 @@ def __getattr__(name: str) -> Any:
     """Imports a function when it is first asked for: collection processes use this package without Lightning."""
     for module, names in _MODULES.items():
         if name in names:
+            require_extra("latentplan.training", "lightning", "tensorboard", "rich")
             return getattr(import_module(f"{__name__}.{module}"), name)
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -29,7 +29,10 @@ def timed(search: Search, problem: Problem) -> Callable[[], float]:
 
 
 def planner_search(problem: Problem, dtype: str, batch: int = 1) -> Search:
-    """A cold search of the project's planner from `batch` starts at once, without terminal value."""
+    """A cold search of the project's planner from `batch` starts at once, without terminal value.
+
+    The options are those of a plain cross-entropy method, which the other planners compute too.
+    """
     model, start = build_model(problem, dtype), start_state(problem, batch)
     planner = CEMPlanner(
         action_dim=problem.action_dim,
@@ -40,6 +43,9 @@ def planner_search(problem: Problem, dtype: str, batch: int = 1) -> Search:
         init_std=1.0,
         min_std=0.0,
         terminal_value=False,
+        final="mean",
+        noise_beta=0.0,
+        keep_elite_fraction=0.0,
     )
     return lambda: planner.plan(model, start)
 

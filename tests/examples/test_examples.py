@@ -14,7 +14,10 @@ PUBLIC = {
     "latentplan.planning",
     "latentplan.training",
 }
-NAMES = ("corridor_constraint", "own_environment", "plan_learned_mlp", "plan_your_dynamics", "trained_agent_new_goal")
+NAMES = (
+    *("corridor_constraint", "follow_reference", "own_environment", "plan_in_jax", "plan_in_mujoco"),
+    *("plan_learned_mlp", "plan_your_dynamics", "ros2_timer", "trained_agent_new_goal"),
+)
 
 
 @pytest.fixture
@@ -77,6 +80,31 @@ def test_own_environment_is_learned_within_seconds(run_example, tmp_path):
     assert numbers["planner"][0] > 14.0 > 12.0 > numbers["random"][0]
     assert (tmp_path / "dot" / "checkpoints" / "best").is_dir()
     assert (tmp_path / "dot" / "metrics.csv").is_file()
+
+
+def test_planning_in_mujoco_lifts_the_hand_to_its_target(run_example, tmp_path):
+    numbers = run_example("plan_in_mujoco")
+    assert numbers["planned"][0] < 0.05
+    assert numbers["no torque"][0] > 1.0
+    assert_is_drawn(tmp_path / "arm.png")
+
+
+def test_planning_in_jax_lands_the_drone(run_example):
+    pytest.importorskip("jax")
+    numbers = run_example("plan_in_jax")
+    (distance, speed), (hovering, _) = numbers["planned"], numbers["hovering"]
+    assert distance < 0.3 and speed < 0.5
+    assert hovering > 2.0
+
+
+def test_plan_that_knows_the_reference_follows_it_more_closely(run_example, tmp_path):
+    numbers = run_example("follow_reference")
+    assert numbers["future known"][0] < 0.1 < 0.3 < numbers["future unknown"][0]
+    assert_is_drawn(tmp_path / "reference.png")
+
+
+def test_timer_callback_drives_the_robot_to_its_goal_without_ros(run_example):
+    assert run_example("ros2_timer")["at the end"][0] < 0.2
 
 
 def test_every_example_is_run_here(root):

@@ -39,11 +39,12 @@ def states():
 
 @pytest.fixture
 def make_planner():
-    """Makes a small planner without proposals of the policy, without a floor of the std, as long warm as cold."""
+    """Makes a small planner of plain CEM: white noise, no kept elites, the mean is executed; as long warm as cold."""
 
     def make(**options):
         defaults = {"action_dim": 2, "horizon": 6, "num_samples": 64, "num_elites": 8, "num_iterations": 3}
         defaults |= {"num_policy_samples": 0, "init_std": 1.0, "min_std": 0.0}
+        defaults |= {"final": "mean", "noise_beta": 0.0, "keep_elite_fraction": 0.0}
         defaults["warm_start_iterations"] = options.get("num_iterations", 3)
         return CEMPlanner(**defaults | options)
 

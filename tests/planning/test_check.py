@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from latentplan.planning import FunctionModel, check_model
+from latentplan.planning import CEMPlanner, FunctionModel, check_model
 
 STATE = torch.randn(3, 4, generator=torch.Generator().manual_seed(0))
 
@@ -117,3 +117,40 @@ def test_check_model_finds_a_layer_that_mixes_the_batch():
     layer.train()
     with pytest.raises(ValueError, match="influence each other|Expected more than 1 value"):
         check_model(model, STATE, 2)
+
+
+def test_check_takes_the_bounds_of_a_planner(states):
+    """The throttle may not be negative, and a root of it would be NaN."""
+    model = FunctionModel(
+        lambda state, action: state, lambda state, action: action[:, 0].sqrt() + (action[:, 1] - 3).sqrt()
+    )
+    low = torch.tensor([[0.0, 3.0]] * 2)
+    check_model(model, states, planner=CEMPlanner(action_dim=2, action_low=low, action_high=5.0))
+    check_model(model, states, 2, action_low=(0.0, 3.0), action_high=(1.0, 4.0))
+    with pytest.raises(ValueError, match="NaN"):
+        check_model(model, states, 2)
+    with pytest.raises(TypeError, match="needs action_dim or planner"):
+        check_model(model, states)
+
+
+@pytest.mark.parametrize(
+    ("state", "hint"),
+    [
+        (torch.zeros(4), r"pass state\[None\] if it is one environment"),
+        (torch.zeros(3, 4, 2), r"state.flatten\(0, 1\)"),
+    ],
+)
+def test_check_explains_what_the_rows_of_a_state_are(state, hint):
+    model = FunctionModel(lambda state, action: state, lambda state, action: state[:, 0, 0, 0] * 0)
+    with pytest.raises(ValueError, match=hint):
+        check_model(model, state, 1)
+
+
+def test_check_explains_five_tuples_and_integer_actions(states):
+    gym = type("Gym", (), {"step": lambda self, state, action: (state, action[:, 0], False, False, {})})()
+    with pytest.raises(ValueError, match="got a tuple of 5; of a gymnasium step, return the first two"):
+        check_model(gym, states, 2)
+    table = torch.zeros(3)
+    indexed = FunctionModel(lambda state, action: state, lambda state, action: table[action[:, 0]])
+    with pytest.raises(ValueError, match="actions are floating point"):
+        check_model(indexed, states, 2)

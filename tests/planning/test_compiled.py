@@ -7,7 +7,8 @@ import torch
 
 from latentplan.planning import CEMPlanner, FunctionModel, check_model, compile_rollout, terminal_value
 
-PLANNER = CEMPlanner(action_dim=2, horizon=4, num_samples=32, num_elites=4, num_iterations=2)
+# The mean is executed without a rollout of its own, so that all rollouts have one size.
+PLANNER = CEMPlanner(action_dim=2, horizon=4, num_samples=32, num_elites=4, num_iterations=2, final="mean")
 
 
 @pytest.fixture

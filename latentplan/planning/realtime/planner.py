@@ -14,7 +14,7 @@ from typing import Any
 from torch import Tensor
 from torch.utils._pytree import tree_map
 
-from latentplan.planning.model import Model, State
+from latentplan.planning.model import Model, State, count_rows
 from latentplan.planning.objectives import Constraint, Term
 from latentplan.planning.plan import Plan
 from latentplan.planning.realtime.worker import (
@@ -193,6 +193,7 @@ class BackgroundPlanner:
             return False
         self._is_idle = False
         goals, self._goals = self._goals, None
+        count_rows(state)  # refuses what is no state, and makes dataclasses in it pytrees
         copied = tree_map(lambda leaf: leaf.detach().clone(), state)
         self._requests.put(Request(copied, tick, previous, seed, goals))
         return True

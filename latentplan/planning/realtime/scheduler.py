@@ -15,7 +15,7 @@ from latentplan.planning.model import (
     State,
     action_dtype,
     count_rows,
-    per_dimension,
+    per_step,
     state_device,
     supports,
     take_step,
@@ -85,7 +85,8 @@ class PlanScheduler:
 
         1. polls the executor, and puts a finished plan into the buffer at the tick of its request;
         2. takes this tick's action from the buffer, corrected by the policy if the model has one (see
-           `NominalTrajectory`); without a plan it takes the policy's action, or zeros without a policy;
+           `NominalTrajectory`); without a plan it takes the policy's action, or the middle of the bounds without a
+           policy;
         3. requests the next plan if the executor is idle: it predicts how many ticks the search takes, steps the model
            by the actions of these ticks (this action, then the buffer's, then the policy's), and requests a plan from
            that state, warm-started from the last plan shifted to the same tick.
@@ -230,22 +231,23 @@ class PlanScheduler:
     def _act_by_plan(self, state: State, tick: int, age: int) -> Tensor:
         """Returns the action (batch, action) of the plan that has this age at a tick, corrected by the policy."""
         nominal = self._nominals[tick - age]
-        if not supports(self._acting, "policy"):
-            return nominal.actions[:, age]
-        return nominal.correct(age, state, self._act_by_policy).clamp(*self._bounds(state))
+        if not supports(self._acting, "policy") or getattr(self.planner, "action_choices", None) is not None:
+            return nominal.actions[:, age]  # a discrete action plus a correction is no action
+        return nominal.correct(age, state, self._act_by_policy).clamp(*self._bounds(state, age))
 
     def _act_by_policy(self, state: State) -> Tensor:
-        """Returns the policy's mode, or zeros without a policy, within the bounds, (batch, action)."""
+        """Returns the policy's mode, or the middle of the bounds without a policy, (batch, action)."""
         low, high = self._bounds(state)
         if not supports(self._acting, "policy"):
-            return torch.zeros(count_rows(state), len(low), device=low.device, dtype=low.dtype).clamp(low, high)
+            return ((low + high) / 2).expand(count_rows(state), -1)
         return self._acting.policy(state, None).to(low.dtype).clamp(low, high)  # type: ignore[no-any-return]
 
-    def _bounds(self, state: State) -> tuple[Tensor, Tensor]:
+    def _bounds(self, state: State, step: int = 0) -> tuple[Tensor, Tensor]:
+        """Returns lowest and highest action of a step of a plan, each (1 or batch, action)."""
         planner, dtype, device = self.planner, action_dtype(state), state_device(state)
         bounds: Any = (planner.action_low, planner.action_high)
-        low, high = (per_dimension(bound, planner.action_dim, "bounds").to(device, dtype) for bound in bounds)
-        return low, high
+        low, high = (per_step(bound, planner.action_dim, "bounds").to(device, dtype) for bound in bounds)
+        return low[:, min(step, low.shape[1] - 1)], high[:, min(step, high.shape[1] - 1)]
 
 
 class NominalTrajectory:

@@ -4,19 +4,24 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from typing import Any
 
 import torch
 
 from latentplan.config.planner import WIDEST_STD, SearchOptions, check_whole
-from latentplan.planning.model import Bound, Model, State, per_dimension
+from latentplan.planning.model import Bound, Model, State, per_dimension, per_step
 from latentplan.planning.objectives import Constraint, Term
-from latentplan.planning.plan import Plan
+from latentplan.planning.plan import Iteration, Plan
+from latentplan.planning.search.choices import read_choices
 from latentplan.planning.search.deadline import Pace
-from latentplan.planning.search.loop import Problem, Search
+from latentplan.planning.search.loop import Search
+from latentplan.planning.search.problem import Problem, View
+from latentplan.planning.search.purity import FirstSearches
 from latentplan.planning.search.sampling import Generators
+
+SIDES = ("low", "high")
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -28,8 +33,13 @@ class CEMPlanner(SearchOptions):
 
     Attributes:
         action_dim: Numbers in an action.
-        action_low: Lowest action, one number or one per dimension.
-        action_high: Highest action, one number or one per dimension.
+        action_low: Lowest action: one number, one per dimension, one per step (horizon, action), or (batch, horizon,
+            action). The first step is the present one.
+        action_high: Highest action, like `action_low`.
+        action_choices: Discrete actions. A number n lets every dimension take the values 0 to n - 1, and a sequence
+            lists the values. A mapping from dimensions to numbers or sequences makes the other dimensions continuous.
+        init_mean: Mean of a search that starts without a previous plan, and end of a shifted plan with the tail `zero`:
+            a value like `action_low`, or a `Plan`; None takes the middle between `action_low` and `action_high`.
         init_std: See `SearchOptions`; here also one number per action dimension.
         discount: Discount per model step, in (0, 1].
         clock: Returns the time in seconds; None takes `time.perf_counter`.
@@ -38,6 +48,8 @@ class CEMPlanner(SearchOptions):
     action_dim: int
     action_low: Bound = -1.0
     action_high: Bound = 1.0
+    action_choices: Any = None
+    init_mean: Bound | Plan | None = None
     init_std: Bound | None = None  # type: ignore[assignment]  # wider than the setting, which is one number
     discount: float = 1.0
     clock: Callable[[], float] | None = None
@@ -61,6 +73,25 @@ class CEMPlanner(SearchOptions):
         return cls(action_dim=action_dim, discount=discount, action_low=action_low, action_high=action_high, **options)
 
     @cached_property
+    def choices(self) -> dict[int, tuple[float, ...]]:
+        """By discrete dimension, the values that an action takes there; empty for continuous actions."""
+        return read_choices(self.action_choices, self.action_dim)
+
+    @cached_property
+    def bounds(self) -> tuple[torch.Tensor, torch.Tensor]:
+        """Lowest and highest action, each (1 or batch, 1 or horizon, action), float64."""
+        low, high = (per_step(getattr(self, f"action_{side}"), self.action_dim, f"action_{side}") for side in SIDES)
+        low, high = (bound.clone() for bound in (low, high))
+        for dim, values in self.choices.items():
+            low[..., dim], high[..., dim] = min(values), max(values)
+        return low, high
+
+    @cached_property
+    def first_searches(self) -> FirstSearches:
+        """The models that this planner has searched in; the first search in each watches the model."""
+        return FirstSearches()
+
+    @cached_property
     def pace(self) -> Pace:
         """Durations of earlier searches, from which a search with a deadline predicts the parts that fit."""
         return Pace()
@@ -75,22 +106,12 @@ class CEMPlanner(SearchOptions):
         constraints: Sequence[Constraint] = (),
         generator: Generators = None,
         deadline_ms: float | None = None,
+        last_action: Any = None,
+        bounds: tuple[Bound, Bound] | None = None,
+        keep: str | None = None,
+        callback: Callable[[Iteration], Any] | None = None,
     ) -> Plan:
         """Searches the best action sequence from each state.
-
-        The `info` of the plan has these entries:
-
-        - `elite_return`: mean return of the elites after each refit, (batch, iteration);
-        - `std`: mean standard deviation of the samples after each refit, (batch, iteration);
-        - `iterations`: number of refits, (batch,);
-        - `num_nonfinite`: number of candidates whose return was not finite, (batch,);
-        - `is_fallback`: whether no candidate had a finite return or no iteration fitted the deadline, so that the
-          actions are the tail of the previous plan, zeros, or the policy's, (batch,);
-        - `is_policy`: whether no iteration fitted the deadline and the actions are the policy's, (batch,); false
-          unless the policy makes proposals, and false with constraints or an objective for which the policy was not
-          trained;
-        - `violation`: violation of the chosen sequence, only with constraints, (batch,);
-        - `stopped`: the reason the search ended, "iterations" or "deadline".
 
         Args:
             model: The model in which action sequences are imagined; see `latentplan.planning.model`.
@@ -103,6 +124,12 @@ class CEMPlanner(SearchOptions):
                 environment's plan does not depend on the others.
             deadline_ms: Milliseconds that this call may take; None takes the planner's own limit, infinity lifts it. A
                 part of the search starts only if earlier durations of such parts predict that it ends in time.
+            last_action: The action executed last, (batch, action), for `smoothness_penalty` and `rate_limit`; None
+                takes it from the previous plan.
+            bounds: Lowest and highest action of this call, in place of `action_low` and `action_high`.
+            keep: `candidates` keeps the candidates of every iteration in `Plan.candidates`, with returns and
+                feasibility; `states` keeps their imagined states too; None keeps nothing.
+            callback: `callback(iteration)` is called after every iteration, with the same fields.
 
         Returns:
             The plan; `Plan` describes the diagnostics in its `info`.
@@ -116,59 +143,101 @@ class CEMPlanner(SearchOptions):
         deadline_ms = self.deadline_ms if deadline_ms is None else deadline_ms
         if deadline_ms is not None and not deadline_ms >= 0.0:
             raise ValueError(f"deadline_ms must be at least 0, got {deadline_ms}")
+        if keep not in (None, "candidates", "states"):
+            raise ValueError(f"keep must be candidates, states or None, got {keep!r}")
         # In inference mode the plan could not be a training target, and gradient steps would fail.
         with torch.inference_mode(False), torch.no_grad():
-            search = Search(self, self._problem(model, state, objective, constraints), generator)
+            low, high = self.bounds if bounds is None else self._replace_bounds(bounds)
+            last = None if last_action is None else torch.as_tensor(last_action)
+            is_new = self.first_searches.add(model)
+            start, spread, discount = self._init_mean, self._init_std, self.discount
+            goals = (objective, constraints)
+            problem = Problem(model, state, *goals, low, high, start, spread, discount, self.choices, last, is_new)
+            search = Search(self, problem, generator, previous, View(keep, callback))
             seconds = None if deadline_ms is None else deadline_ms / 1000
-            return search.run(previous, search.budget(self.pace, clock, started, seconds))
+            return search.run(search.budget(self.pace, clock, started, seconds))
 
-    def _problem(
-        self, model: Model, state: State, objective: Term | None, constraints: Sequence[Constraint]
-    ) -> Problem:
-        low, high = (self._per_dimension(name) for name in ("action_low", "action_high"))
-        init_std = None if self.init_std is None else self._per_dimension("init_std")
-        return Problem(model, state, objective, constraints, low, high, init_std, self.discount)
+    @cached_property
+    def _init_mean(self) -> torch.Tensor | None:
+        if self.init_mean is None:
+            return None
+        if not isinstance(self.init_mean, Plan):
+            return per_step(self.init_mean, self.action_dim, "init_mean")
+        actions = self.init_mean.actions.double()
+        missing = max(self.horizon, self.goal_horizon or 0) - actions.shape[1]
+        return torch.cat([actions, actions[:, -1:].expand(-1, max(0, missing), -1)], dim=1)
 
-    def _per_dimension(self, name: str) -> torch.Tensor:
-        return per_dimension(getattr(self, name), self.action_dim, name)
+    @cached_property
+    def _init_std(self) -> torch.Tensor | None:
+        return None if self.init_std is None else per_step(self.init_std, self.action_dim, "init_std")
+
+    def _replace_bounds(self, bounds: tuple[Bound, Bound]) -> tuple[torch.Tensor, torch.Tensor]:
+        return replace(self, action_low=bounds[0], action_high=bounds[1]).bounds
 
 
 def icem_planner(**settings: Any) -> CEMPlanner:
     """Returns the improved CEM of Pinneri et al. 2020: coloured noise, kept and shifted elites, best candidate.
 
     Args:
-        **settings: Arguments of `CEMPlanner`; they replace `noise_beta` 2, `keep_elite_fraction` 0.3 and `final`
-            "best".
+        **settings: Arguments of `CEMPlanner`; they replace `noise_beta` 2, `white_noise_share` 0, `keep_elite_fraction`
+            0.3 and `final` "best".
     """
-    own: dict[str, Any] = {"noise_beta": 2.0, "keep_elite_fraction": 0.3, "final": "best"}
+    own: dict[str, Any] = {"noise_beta": 2.0, "white_noise_share": 0.0, "keep_elite_fraction": 0.3, "final": "best"}
     return CEMPlanner(**own | settings)
 
 
 def mppi_planner(**settings: Any) -> CEMPlanner:
-    """Returns MPPI (Williams et al. 2017): one refit to all candidates, weighted by exp(return / temperature).
+    """Returns MPPI (Williams et al. 2017): refits to all candidates, weighted by exp(return / (temperature * spread)).
+
+    The spread is the standard deviation of the candidates' returns, so one temperature serves returns of any scale.
 
     Args:
-        **settings: Arguments of `CEMPlanner`; they replace `temperature` 1, `smoothing` 1, `num_iterations` 1,
-            `adapt_std` False, and `num_elites`, which is all of `num_samples`. A warm start has at most
-            `num_iterations` refits.
+        **settings: Arguments of `CEMPlanner`; they replace `temperature` 0.1, `smoothing` 1, `num_iterations` 1,
+            `adapt_std` False, `keep_elite_fraction` 0, `noise_beta` 2, `white_noise_share` 0.5, `final` "better",
+            `num_elites`, which is all of `num_samples`, and `warm_start_iterations`, which is `num_iterations`.
     """
-    num_samples = settings.get("num_samples", SearchOptions.num_samples)
-    own: dict[str, Any] = {"num_elites": num_samples, "num_iterations": 1}
-    own |= {"smoothing": 1.0, "temperature": 1.0, "adapt_std": False}
+    own: dict[str, Any] = {"num_elites": settings.get("num_samples", SearchOptions.num_samples), "num_iterations": 1}
+    own |= {"smoothing": 1.0, "temperature": 0.1, "adapt_std": False, "keep_elite_fraction": 0.0}
+    own |= {"noise_beta": 2.0, "white_noise_share": 0.5, "final": "better"}
     merged = own | settings
-    if (merged.get("warm_start_iterations") or 1) > merged["num_iterations"]:
+    if merged.get("warm_start_iterations") is None:
         merged["warm_start_iterations"] = merged["num_iterations"]
     return CEMPlanner(**merged)
+
+
+def cem_gradient_planner(**settings: Any) -> CEMPlanner:
+    """Returns the cross-entropy method, and after it gradient ascent on the chosen sequence, in a differentiable model.
+
+    The ascent pauses for some searches where it does not raise the return by a tenth of the elites' standard deviation.
+
+    Args:
+        **settings: Arguments of `CEMPlanner`; they replace `gradient_steps` 5.
+    """
+    return CEMPlanner(**{"gradient_steps": 5} | settings)
+
+
+# By planner, the options for which it has a value of its own.
+OWN_OPTIONS: dict[Callable[..., Any], set[str]] = {
+    CEMPlanner: set(),
+    cem_gradient_planner: {"gradient_steps"},
+    icem_planner: {"noise_beta", "white_noise_share", "keep_elite_fraction", "final"},
+    mppi_planner: {"num_elites", "num_iterations", "warm_start_iterations", "smoothing", "temperature", "adapt_std"}
+    | {"keep_elite_fraction", "noise_beta", "white_noise_share", "final"},
+}
 
 
 def _check_problem(planner: CEMPlanner) -> None:
     check_whole(planner, 1, "action_dim")
     if not 0.0 < planner.discount <= 1.0:
         raise ValueError(f"discount must lie in (0, 1], got {planner.discount}")
-    low = per_dimension(planner.action_low, planner.action_dim, "action_low")
-    high = per_dimension(planner.action_high, planner.action_dim, "action_high")
+    low, high = planner.bounds
     if not bool((low < high).all()):
-        raise ValueError(f"action_low {low.tolist()} must lie below action_high {high.tolist()}")
+        raise ValueError(f"action_low {low.squeeze().tolist()} must lie below action_high {high.squeeze().tolist()}")
+    if isinstance(planner.init_mean, Plan) and planner.init_mean.actions.shape[-1] != planner.action_dim:
+        dim = planner.init_mean.actions.shape[-1]
+        raise ValueError(f"init_mean is a plan of {dim} numbers per action, action_dim is {planner.action_dim}")
+    if planner.init_mean is not None and not isinstance(planner.init_mean, Plan):
+        per_step(planner.init_mean, planner.action_dim, "init_mean")
     if planner.init_std is not None:
         init_std = per_dimension(planner.init_std, planner.action_dim, "init_std")
         if not bool(((init_std >= 0) & (init_std <= WIDEST_STD)).all()):

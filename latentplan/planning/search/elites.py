@@ -82,7 +82,8 @@ def refit(
         var: Variance of this distribution, shaped like `mean`.
         num_elites: Number of elites.
         smoothing: Weight of the new statistics, in (0, 1].
-        temperature: Elites are weighted by exp(return / temperature) as in MPPI; None weights all alike.
+        temperature: Elites are weighted by exp(return / (temperature * spread)) as in MPPI, where the spread is the
+            standard deviation of their returns; None weights all alike.
 
     Returns:
         New mean and variance, shaped like `mean`.
@@ -135,7 +136,7 @@ def select_elites(candidates: Tensor, scores: Scores, *, num_elites: int, temper
     if temperature is not None:
         exponents = best if violation is None or not is_ranked else _weight_exponents(best, violation)
         exponents = torch.where(is_valid[:, :1], exponents, 0.0)  # a softmax over nothing would be NaN
-        weights = weights * torch.softmax(exponents / temperature, dim=1)
+        weights = weights * torch.softmax(exponents / (temperature * _spread(exponents)), dim=1)
     weights = weights / weights.sum(dim=1, keepdim=True).clamp_min(torch.finfo(weights.dtype).tiny)
     chosen = torch.take_along_dim(candidates, index[:, :, None, None], dim=1)
     # A NaN action would make the weighted mean NaN, even with weight 0.
@@ -171,6 +172,12 @@ def mean_return(elites: Elites) -> Tensor:
     return total.masked_fill(elites.weights.sum(dim=1) == 0, float("nan"))
 
 
+def spread_of_returns(elites: Elites) -> Tensor:
+    """Returns the standard deviation of the elites' returns, above 0, (batch,)."""
+    returns = elites.scores.returns.masked_fill(elites.weights == 0, float("-inf"))
+    return _spread(returns)[:, 0]
+
+
 def _same_precision(*tensors: Tensor) -> list[Tensor]:
     """Returns the tensors in one floating-point precision that holds them all."""
     dtype = reduce(torch.promote_types, (tensor.dtype for tensor in tensors))
@@ -183,6 +190,16 @@ def _feasible_first(returns: Tensor, violations: Tensor) -> Tensor:
     by_return = torch.argsort(returns, dim=1, descending=True, stable=True)
     by_violation = torch.argsort(violations.gather(1, by_return), dim=1, stable=True)
     return by_return.gather(1, by_violation)
+
+
+def _spread(exponents: Tensor) -> Tensor:
+    """Returns the standard deviation of the finite exponents of each environment, above 0, (batch, 1)."""
+    is_finite = torch.isfinite(exponents)
+    num = is_finite.sum(dim=1, keepdim=True).clamp_min(1)
+    known = exponents.masked_fill(~is_finite, 0.0)
+    mean = known.sum(dim=1, keepdim=True) / num
+    var = (known - mean).masked_fill(~is_finite, 0.0).square().sum(dim=1, keepdim=True) / num
+    return var.sqrt().clamp_min(torch.finfo(exponents.dtype).tiny)
 
 
 def _weight_exponents(returns: Tensor, violations: Tensor) -> Tensor:

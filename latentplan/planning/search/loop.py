@@ -6,113 +6,51 @@
 2.  let the model's policy propose action sequences;
 3.  repeat: sample candidates from the distribution, score them in the model, select the elites, and move mean and
     variance towards the elites;
-4.  choose the sequence to execute: the mean, the best candidate, or the better of the mean and the policy's sequence;
-5.  if asked, refine this sequence by gradient ascent.
+4.  choose the sequence to execute (`choice`);
+5.  if asked, refine this sequence by gradient ascent (`gradient`).
 
-A search with a deadline skips the parts that would end too late (`deadline`). Scores come from `scorer`, and the
-equations of step 3 from `elites`.
+The distribution lives in the space of `space`, and candidates become actions there. A search with a deadline skips the
+parts that would end too late (`deadline`). Scores come from `scorer`, and the equations of step 3 from `elites`.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
-from torch.utils._pytree import tree_map
 
 from latentplan.config.planner import SearchOptions
-from latentplan.planning.model import Model, State, action_dtype, count_rows, state_device, supports
-from latentplan.planning.objectives import Constraint, Term, apply_view
-from latentplan.planning.plan import Plan, WarmStart, shift_plan
+from latentplan.planning.model import State, action_dtype, count_rows, has_policy, is_sampling, state_device
+from latentplan.planning.objectives import apply_view
+from latentplan.planning.plan import Iteration, Plan, WarmStart, shift_plan
+from latentplan.planning.search.choice import Choice, Finalists, choose
+from latentplan.planning.search.choices import Choices
 from latentplan.planning.search.deadline import Budget, Pace
-from latentplan.planning.search.elites import Elites, Scores, mean_return, move_towards, select_elites
-from latentplan.planning.search.gradient import ascend
+from latentplan.planning.search.elites import (
+    Scores,
+    mean_return,
+    move_towards,
+    select_elites,
+    spread_of_returns,
+)
+from latentplan.planning.search.gradient import Pause, Refined, ascend
+from latentplan.planning.search.problem import (
+    Problem,
+    View,
+    find_spreads,
+    fit_steps,
+    make_space,
+    split_limits,
+)
+from latentplan.planning.search.progress import Progress
+from latentplan.planning.search.purity import Watch, describe_writing
 from latentplan.planning.search.sampling import Generators, Streams
 from latentplan.planning.search.scorer import Scorer
+from latentplan.planning.search.space import Bounds
 
 Candidates = tuple[Tensor, Scores]
-"""Sequences (batch, sample, horizon, action) and their scores."""
-
-Choice = tuple[Tensor, Tensor, Tensor | None]
-"""Sequences (batch, horizon, action), their expected returns (batch,) and, with constraints, violations (batch,)."""
-
-
-@dataclass(frozen=True)
-class Problem:
-    """The problem that one search solves.
-
-    Attributes:
-        model: The model in which action sequences are imagined.
-        state: Start of the plans, rows (batch,).
-        objective: Maximised; None is the predicted return.
-        constraints: Violations that candidates must avoid.
-        low: Lowest action, (action,).
-        high: Highest action, (action,).
-        init_std: Standard deviation at the start of the search, (action,); None takes a quarter of the action range.
-        discount: Discount per model step, in (0, 1].
-    """
-
-    model: Model
-    state: State
-    objective: Term | None
-    constraints: Sequence[Constraint]
-    low: Tensor
-    high: Tensor
-    init_std: Tensor | None
-    discount: float
-
-
-class Progress(NamedTuple):
-    """The state of a search between two refits. Dim 0 of every tensor is the environment, and a finished one is frozen.
-
-    Attributes:
-        mean: Mean of the search distribution, (batch, horizon, action).
-        var: Variance of the search distribution, (batch, horizon, action).
-        elites: Elites of the last refit; None before the first.
-        expected_return: Mean return of the last elites, NaN before the first refit, (batch,).
-        num_nonfinite: Number of candidates so far whose return was not finite, (batch,).
-        iterations: Number of refits so far, (batch,).
-        has_elites: Whether any candidate so far had a finite return, (batch,).
-    """
-
-    mean: Tensor
-    var: Tensor
-    elites: Elites | None
-    expected_return: Tensor
-    num_nonfinite: Tensor
-    iterations: Tensor
-    has_elites: Tensor
-
-    def updated(self, mask: Tensor, new: Progress) -> Progress:
-        """Returns this progress, with the environments in mask (batch,) taken from `new`."""
-
-        def select(newer: Any, older: Any) -> Any:
-            if not isinstance(newer, Tensor):
-                return newer
-            return torch.where(mask.reshape(-1, *[1] * (newer.ndim - 1)), newer, older)
-
-        selected: Progress = tree_map(select, new, self)
-        return selected
-
-    def describe(self, history: Sequence[tuple[Tensor, Tensor]], stopped: str) -> dict[str, Any]:
-        """Returns the diagnostics of a plan.
-
-        Args:
-            history: The elites' mean return and the mean sampling std after each refit, both (batch,).
-            stopped: The reason the search ended.
-        """
-        none = self.expected_return.new_zeros(len(self.expected_return), 0)
-        return {
-            "elite_return": torch.stack([elite_return for elite_return, _ in history], dim=1) if history else none,
-            "std": torch.stack([std for _, std in history], dim=1) if history else none,
-            "iterations": self.iterations,
-            "num_nonfinite": self.num_nonfinite,
-            "is_fallback": ~self.has_elites,
-            "stopped": stopped,
-        }
+"""Points (batch, sample, length, action) and the scores of their actions."""
 
 
 class Search:
@@ -122,36 +60,53 @@ class Search:
         options: Options of the search.
         problem: Model, start, objective and bounds.
         generator: See `CEMPlanner.plan`.
+        previous: The previous plan; None starts everywhere without one.
+        view: What the caller sees of the search.
 
     Raises:
-        ValueError: The model lacks a method that an option needs.
+        ValueError: The model lacks a method that an option needs, or a size does not fit the state.
     """
 
-    def __init__(self, options: SearchOptions, problem: Problem, generator: Generators) -> None:
+    def __init__(
+        self,
+        options: SearchOptions,
+        problem: Problem,
+        generator: Generators,
+        previous: Plan | None = None,
+        view: View | None = None,
+    ) -> None:
         model, objective = apply_view(problem.model, problem.objective)
-        self.options, self.model, self.state = options, model, problem.state
+        self.options, self.model, self.state, self.view = options, model, problem.state, view or View()
         self.batch, self.device = count_rows(self.state), state_device(self.state)
         self.dtype = action_dtype(self.state)
-        self.low, self.high = self._constant(problem.low), self._constant(problem.high)
+        self.problem, self.previous = problem, previous
         self.horizon = options.horizon if objective is None else options.goal_horizon or options.horizon
-        self.min_std = torch.full_like(self.low, options.min_std)
-        if problem.init_std is None:
-            self.init_std = (self.high - self.low) / 4
-            self.min_std = torch.minimum(self.min_std, self.init_std)
-        else:
-            self.init_std = self._constant(problem.init_std)
-        self.num_proposals = options.num_proposals(supports(model, "policy"))
+        low, high = (self._per_step(value, name) for name, value in (("low", problem.low), ("high", problem.high)))
+        choices = Choices(problem.choices, self.dtype, self.device) if problem.choices else None
+        self.bounds = Bounds(low, high, choices)
+        self._check_previous()
+        limits, constraints = split_limits(problem.constraints)
+        find_last = self._find_last_action()
+        self.space = make_space(options, self.bounds, self.horizon, limits, find_last)
+        init_std = None if problem.init_std is None else self._per_step(problem.init_std, "init_std")
+        spreads = find_spreads(self.bounds, init_std, options.min_std)
+        self.init_std, self.min_std = (self.space.at_points(spread) for spread in spreads)
+        rest = (low + high) / 2 if problem.init_mean is None else self._per_step(problem.init_mean, "init_mean")
+        self.rest = self.bounds.fit(rest).expand(self.batch, self.horizon, -1)
+        self.num_proposals = options.num_proposals(has_policy(model))
         # The policy was trained on the task's reward, so it may not replace a plan for another objective.
-        self.may_use_policy = self.num_proposals > 0 and objective is None and not problem.constraints
+        self.may_use_policy = self.num_proposals > 0 and objective is None and not constraints
         self.streams = Streams(generator, self.batch, self.device)
         self.scorer = Scorer.build(
             model,
             objective,
-            problem.constraints,
+            constraints,
             problem.discount ** torch.arange(self.horizon + 1, dtype=self.dtype, device=self.device),
             terminal_value=options.terminal_value,
             use_continues=options.use_continues,
             penalty=options.constraint_penalty,
+            generator=self.streams.model_generator() if is_sampling(model) else None,
+            find_last_action=find_last,
         )
 
     def budget(self, pace: Pace, clock: Callable[[], float], started: float, seconds: float | None) -> Budget:
@@ -161,53 +116,70 @@ class Search:
         size = (kind, self.batch, self.horizon, self.scorer.num_particles, self.dtype, self.device)
         return Budget(pace, size, clock, started, seconds, self.device)
 
-    def run(self, previous: Plan | None, budget: Budget) -> Plan:
+    def run(self, budget: Budget) -> Plan:
         """Returns the plan; the environments in which the previous plan is still valid start from it.
 
         Args:
-            previous: The previous plan; None starts everywhere without one.
             budget: The time that the search may take.
         """
-        options = self.options
-        shifted = self._cold_start() if previous is None else self._shift(previous)
+        options, space = self.options, self.space
+        shifted = self._cold_start() if self.previous is None else self._shift(self.previous)
         start = shifted if options.warm_start else self._cold_start()
         if not budget.allows("propose", "iteration", "choose"):
             return self._fall_back(shifted, budget)
         budget.lap()
         proposals = self._propose(budget) if self.num_proposals else None
-        progress, history, stopped = self._iterate(start, proposals, budget)
-        # Without a finite candidate the plan is the tail of the previous plan, or zeros clamped into the bounds.
-        mean = torch.where(progress.has_elites[:, None, None], progress.mean, shifted.mean).clamp(self.low, self.high)
-        mode = proposals[:, 0] if proposals is not None and self.may_use_policy else None
-        actions, expected, violation = choose(options.final, self.scorer, self.state, progress, mean, mode)
+        progress, iterations, history, stopped = self._iterate(self._encode(start), proposals, budget)
+        # Without a finite candidate the plan is the tail of the previous plan, or the start of a cold search.
+        has_elites = progress.has_elites[:, None, None]
+        mean = space.decode(space.clean(torch.where(has_elites, progress.mean, space.encode(shifted.mean))))
+        actions, expected, violation = self._choose(progress, mean, proposals)
         budget.lap("choose")
-        if options.gradient_steps and not budget.allows("gradient"):
+        pause = self._pause() if options.gradient_steps else None
+        if pause is not None and bool((pause.left > 0).all()):
+            pause = pause.waited()
+        elif pause is not None and not budget.allows("gradient"):
             stopped = "deadline"
-        elif options.gradient_steps:
-            actions, refined, violation = self._refine(actions)
-            expected = torch.where(torch.isfinite(refined), refined, expected)
+        elif pause is not None:
+            refined = self._refine(actions)
+            actions, violation = refined.actions, refined.violations
+            expected = torch.where(torch.isfinite(refined.returns), refined.returns, expected)
+            assert progress.elites is not None
+            pause = pause.renewed(refined.gain, spread_of_returns(progress.elites))
             budget.lap("gradient")
         info = {**progress.describe(history, stopped), "is_policy": torch.zeros_like(progress.has_elites)}
         if violation is not None:
             info["violation"] = violation
+        if pause is not None:
+            info |= {"gradient_pause": pause.length, "gradient_wait": pause.left}
+        if progress.probabilities is not None:
+            info["probabilities"] = progress.probabilities
         kept = None
         if progress.elites is not None and options.num_kept:
-            kept = progress.elites.actions[:, : options.num_kept]
+            kept = space.decode(progress.elites.actions[:, : options.num_kept])
         ones = torch.ones(self.batch, dtype=torch.long)
-        return Plan(actions, mean, progress.var, expected, info, kept, ones.bool(), ones)
+        var = space.decode_var(progress.var)
+        return Plan(actions, mean, var, expected, info, kept, ones.bool(), ones, candidates=tuple(iterations))
+
+    def _choose(self, progress: Progress, mean: Tensor, proposals: Tensor | None) -> Choice:
+        assert progress.elites is not None
+        best = self.space.decode(progress.elites.actions[:, :1])[:, 0]
+        mode = proposals[:, 0] if proposals is not None and self.may_use_policy else None
+        finalists = Finalists(mean, best, progress.elites.scores.first(1), progress.expected_return, mode)
+        return choose(self.options.final, self.scorer, self.state, finalists)
 
     def _propose(self, budget: Budget) -> Tensor:
-        generators, bounds = self.streams.policy_generators(), (self.low, self.high)
-        proposals = self.scorer.propose(self.state, self.num_proposals, generators, bounds)
+        generators = self.streams.policy_generators()
+        proposals = self.scorer.propose(self.state, self.num_proposals, generators, self.bounds)
         budget.lap("propose")
-        return proposals
+        return proposals if self.space.is_plain else self.space.decode(self.space.encode(proposals))
 
     def _fall_back(self, shifted: WarmStart, budget: Budget) -> Plan:
         """Returns a plan when the deadline is too short for a search.
 
-        The actions are the policy's sequence, else the shifted previous plan, else zeros. The policy's sequence is a
-        rollout of its mode if the budget allows a rollout, else its action in the present state, repeated. Environments
-        that would start cold stay cold.
+        The actions are the policy's sequence, else the shifted previous plan, else the start of a cold search. The
+        policy's sequence is a rollout of its mode if the budget allows a rollout, else its action in the present state,
+        repeated. Environments that would start cold stay cold.
         """
         actions, is_policy = shifted.mean, torch.zeros(self.batch, dtype=torch.bool, device=self.device)
         if self.may_use_policy:
@@ -215,46 +187,46 @@ class Search:
             if budget.allows("propose"):
                 mode = self._propose(budget)[:, 0]
             else:
-                mode = self.scorer.act(self.state, (self.low, self.high))[:, None].expand_as(actions)
+                mode = self.bounds.fit(self.scorer.act(self.state, self.bounds)[:, None].expand_as(actions))
             is_policy = torch.isfinite(mode).flatten(1).all(1)
             actions = torch.where(is_policy[:, None, None], mode, actions)
-        progress = self._begin(shifted)
+        progress = self._begin(self._encode(shifted))
         info = {**progress.describe([], "deadline"), "is_policy": is_policy}
         if self.scorer.constraints:
             info["violation"] = torch.full_like(progress.expected_return, float("nan"))
         ones = torch.ones(self.batch, dtype=torch.long)
-        elites, is_warm = shifted.elites, shifted.is_warm
-        return Plan(actions, shifted.mean, progress.var, progress.expected_return, info, elites, is_warm, ones)
+        elites, is_warm, var = shifted.elites, shifted.is_warm, self.space.decode_var(progress.var)
+        return Plan(actions, shifted.mean, var, progress.expected_return, info, elites, is_warm, ones)
 
     def _iterate(
         self, start: WarmStart, proposals: Tensor | None, budget: Budget
-    ) -> tuple[Progress, list[tuple[Tensor, Tensor]], str]:
+    ) -> tuple[Progress, list[Iteration], list[tuple[Tensor, Tensor]], str]:
         """Refits the distribution until the iterations or the time are used up.
 
         Returns:
-            The last progress, the elites' mean return and the mean sampling std (batch,) after each refit, and the
-            reason the loop ended: "iterations" or "deadline".
+            The last progress, the iterations that the caller keeps, the elites' mean return and the mean sampling std
+            (batch,) after each refit, and the reason the loop ended: "iterations" or "deadline".
         """
         options, num_fresh = self.options, self.options.num_samples - self.num_proposals
         progress = self._begin(start)
-        std = self._sampling_std(progress.var)[:, None]
         limit = torch.where(start.is_warm, options.num_warm_iterations, options.num_iterations)
         num_common = int(limit.min())
         known: list[Candidates] = []
+        kept: list[Iteration] = []
         history, stopped = [], "iterations"
         for iteration in range(int(limit.max())):
             is_first = iteration == 0
             if not is_first and not budget.allows("iteration", "choose"):
                 stopped = "deadline"
                 break
-            fresh = self._sample(progress.mean[:, None], std, num_fresh)
-            fresh[:, 0] = start.mean if is_first else progress.mean.clamp(self.low, self.high)
+            fresh = self._sample(progress, num_fresh)
+            fresh[:, 0] = start.mean if is_first else self.space.clean(progress.mean)
             if is_first:
                 self._place_elites(fresh, start)
-                fresh = fresh if proposals is None else torch.cat([fresh, proposals], dim=1)
+                fresh = fresh if proposals is None else torch.cat([fresh, self.space.encode(proposals)], dim=1)
             if iteration <= 1:  # later iterations have as many candidates as the second, which has no new proposals
                 rows = self.scorer.start_rows(self.state, fresh.shape[1])
-            scores = self.scorer.score(rows, fresh)
+            scores, states = self._score(rows, fresh, is_new=is_first and self.problem.is_new)
             if is_first:
                 scores = _ignore_nan_actions(fresh, scores)
             updated = self._refit(progress, [(fresh, scores), *known, *self._keep(progress, known)], scores.returns)
@@ -263,23 +235,74 @@ class Search:
             elif iteration >= num_common:  # environments that have used up their iterations stay as they are
                 updated = progress.updated((limit > iteration).to(self.device), updated)
             progress = updated
-            std = self._sampling_std(progress.var)[:, None]
-            history.append((progress.expected_return, std.mean(dim=(1, 2, 3))))
+            std = self._sampling_std(progress.var)
+            history.append((progress.expected_return, std.mean(dim=(1, 2))))
+            if self.view.is_open:
+                self._show(iteration, fresh, scores, states, progress, kept)
             budget.lap("iteration")
-        return progress, history, stopped
+        return progress, kept, history, stopped
+
+    def _score(self, rows: State, points: Tensor, *, is_new: bool) -> tuple[Scores, State]:
+        """Returns the scores of points, and the states of their rollouts if the caller keeps them, else None."""
+        actions = self.space.decode(points)
+        watch = Watch(rows, actions) if is_new else None
+        with_states = self.view.keep == "states"
+        try:
+            rollout = self.scorer.imagine(rows, actions, with_states=with_states)
+            scores = self.scorer.score_rollout(rollout)
+        except Exception as error:
+            if is_new and "single memory location" in str(error):  # rows of one environment share their memory
+                raise ValueError(describe_writing(self.model, "state")) from error
+            if is_new:
+                error.add_note("check_model(model, state, planner=planner) lists everything that a planner needs")
+            raise
+        if watch is not None:
+            watch.check(self.model)
+        return scores, self.scorer.arrange_states(rollout) if with_states else None
+
+    def _show(
+        self, index: int, points: Tensor, scores: Scores, states: State, progress: Progress, kept: list[Iteration]
+    ) -> None:
+        """Describes an iteration to the callback and among the kept ones."""
+        is_feasible = torch.isfinite(scores.returns)
+        if scores.violations is not None:
+            is_feasible = is_feasible & (scores.violations == 0)
+        described = Iteration(
+            index,
+            self.space.decode(points),
+            scores.returns,
+            is_feasible,
+            scores.violations,
+            states,
+            self.space.decode(self.space.clean(progress.mean)),
+            self.space.decode_var(progress.var).sqrt(),
+            progress.expected_return,
+        )
+        if self.view.keep is not None:
+            kept.append(described)
+        if self.view.callback is not None:
+            self.view.callback(described)
 
     def _begin(self, start: WarmStart) -> Progress:
         """Returns the progress before the first refit."""
         zeros = torch.zeros(self.batch, dtype=torch.long, device=self.device)
         unknown = torch.full((self.batch,), float("nan"), dtype=self.dtype, device=self.device)
         var = self.init_std.square().expand_as(start.mean)
-        return Progress(start.mean, var, None, unknown, zeros, zeros, zeros.bool())
+        choices, probabilities = self.space.choices, None
+        if choices is not None:
+            probabilities = choices.start(start.mean, start.is_warm.to(self.device))
+        return Progress(start.mean, var, probabilities, None, unknown, zeros, zeros, zeros.bool())
 
-    def _sample(self, mean: Tensor, std: Tensor, num: int) -> Tensor:
-        """Returns `num` sequences per environment within the bounds, (batch, num, horizon, action)."""
-        noise = self.streams.noise(num, self.horizon, len(self.low), self.options.noise_beta, self.dtype)
+    def _sample(self, progress: Progress, num: int) -> Tensor:
+        """Returns `num` clean points per environment, (batch, num, length, action)."""
+        mean, std = progress.mean[:, None], self._sampling_std(progress.var)[:, None]
+        beta, white_share = self.options.noise_beta, self.options.white_noise_share
+        noise = self.streams.noise(num, self.space.length, self.bounds.action_dim, beta, white_share, self.dtype)
         samples = torch.addcmul(mean, std, noise)
-        return torch.minimum(torch.maximum(samples, self.low, out=samples), self.high, out=samples)
+        if progress.probabilities is not None:
+            assert self.space.choices is not None
+            samples = self.space.choices.sample(samples, progress.probabilities, noise)
+        return self.space.clean(samples, in_place=True)
 
     def _place_elites(self, fresh: Tensor, start: WarmStart) -> None:
         """Puts the shifted elites of the previous plan among the candidates of the warm environments."""
@@ -294,6 +317,7 @@ class Search:
         Elites that are also among the `known` candidates get the return NaN, so that no sequence counts twice.
         """
         needs_best = self.options.final == "best" or bool(self.scorer.constraints)
+        needs_best = needs_best or (self.options.final == "better" and not self.may_use_policy)
         num = max(self.options.num_kept, int(needs_best))
         if progress.elites is None or num == 0:
             return []
@@ -307,16 +331,21 @@ class Search:
         elites = select_elites(
             torch.cat([actions for actions, _ in candidates], dim=1),
             Scores.join([scores for _, scores in candidates]),
-            num_elites=options.num_elites,
+            num_elites=options.num_best,
             temperature=options.temperature,
         )
         mean, var = move_towards(
             elites, progress.mean, progress.var, smoothing=options.smoothing, adapt_std=options.adapt_std
         )
+        probabilities = progress.probabilities
+        if probabilities is not None and self.space.choices is not None:
+            probabilities = self.space.choices.refit(probabilities, elites, options.smoothing)
+            mean, var = self.space.choices.describe(mean, var, probabilities)
         has_elites = elites.weights.sum(dim=1) > 0
         return Progress(
             mean,
             var,
+            probabilities,
             elites,
             torch.where(has_elites, mean_return(elites), progress.expected_return),
             progress.num_nonfinite + (~torch.isfinite(fresh_returns)).sum(dim=1),
@@ -324,98 +353,73 @@ class Search:
             progress.has_elites | has_elites,
         )
 
-    def _refine(self, actions: Tensor) -> Choice:
+    def _pause(self) -> Pause:
+        """Returns the pause of gradient refinement, which the previous plan hands on; none where a plan starts cold."""
+        none = torch.zeros(self.batch, dtype=torch.long, device=self.device)
+        info = {} if self.previous is None else self.previous.info
+        if self.previous is None or "gradient_pause" not in info:
+            return Pause(none, none)
+        is_warm = self.previous.is_warm.to(self.device)
+        pause = (info[name].to(self.device) for name in ("gradient_pause", "gradient_wait"))
+        return Pause(*(torch.where(is_warm, part, none) for part in pause))
+
+    def _refine(self, actions: Tensor) -> Refined:
         return ascend(
             self.scorer,
             self.state,
             actions,
             num_steps=self.options.gradient_steps,
             step_size=self.options.gradient_step_size,
-            bounds=(self.low, self.high),
+            space=self.space,
         )
 
     def _cold_start(self) -> WarmStart:
-        shape = (self.batch, self.horizon, len(self.low))
-        mean = torch.zeros_like(self.low).clamp(self.low, self.high).expand(shape)
-        return WarmStart(mean, None, torch.zeros(self.batch, dtype=torch.bool))
+        return WarmStart(self.rest, None, torch.zeros(self.batch, dtype=torch.bool))
 
     def _shift(self, previous: Plan) -> WarmStart:
-        (batch, _, dim), bounds = previous.mean.shape, (self.low, self.high)
-        if (batch, dim) != (self.batch, len(self.low)):
-            sizes = f"{self.batch} environments and actions of {len(self.low)}"
-            raise ValueError(f"the last plan is for {batch} environments and actions of {dim}, this search for {sizes}")
         return shift_plan(
             previous,
-            horizon=self.horizon,
+            rest=self.rest,
             tail=self.options.tail,
-            bounds=bounds,
-            policy_tail=lambda actions, is_tail: self.scorer.continue_by_policy(self.state, actions, is_tail, bounds),
+            fit=self.bounds.fit,
+            policy_tail=lambda actions, is_tail: self.scorer.continue_by_policy(
+                self.state, actions, is_tail, self.bounds
+            ),
         )
+
+    def _encode(self, start: WarmStart) -> WarmStart:
+        """Returns a start whose sequences are points of the search space."""
+        if self.space.is_plain:
+            return start
+        elites = None if start.elites is None else self.space.encode(start.elites)
+        return WarmStart(self.space.encode(start.mean), elites, start.is_warm)
 
     def _sampling_std(self, var: Tensor) -> Tensor:
         return torch.maximum(var.sqrt(), self.min_std)
 
-    def _constant(self, value: Tensor) -> Tensor:
-        return value.to(dtype=self.dtype, device=self.device)
+    def _check_previous(self) -> None:
+        if self.previous is None:
+            return
+        batch, _, dim = self.previous.mean.shape
+        if (batch, dim) != (self.batch, self.bounds.action_dim):
+            sizes = f"{self.batch} environments and actions of {self.bounds.action_dim}"
+            raise ValueError(f"the last plan is for {batch} environments and actions of {dim}, this search for {sizes}")
 
+    def _find_last_action(self) -> Callable[[], Tensor] | None:
+        """Returns the function that returns the action executed last, (batch, action); None if none can be known."""
+        given, previous = self.problem.last_action, self.previous
+        if given is not None:
+            if given.shape != (self.batch, self.bounds.action_dim):
+                shape = (self.batch, self.bounds.action_dim)
+                raise ValueError(f"last_action must have shape {shape}, got {tuple(given.shape)}")
+            last = given.to(dtype=self.dtype, device=self.device)
+            return lambda: last
+        if previous is None:
+            return None
+        return lambda: previous.last_action.to(dtype=self.dtype, device=self.device)
 
-def choose(
-    final: str, scorer: Scorer, state: State, progress: Progress, mean: Tensor, policy_mode: Tensor | None
-) -> Choice:
-    """Returns the sequence of a finished search that is executed, its expected return and its violation.
-
-    Args:
-        final: `mean`; `best`, the best candidate; or `better`, the mean or the policy's mode sequence by return.
-        scorer: Scores sequences.
-        state: Start of the plans, rows (batch,).
-        progress: End of the search.
-        mean: Mean of the final distribution, within the bounds, (batch, horizon, action).
-        policy_mode: The policy's mode sequence, (batch, horizon, action); None if the policy may not replace the plan,
-            so that `better` is `mean`.
-    """
-    assert progress.elites is not None
-    if progress.elites.scores.violations is not None:
-        return _choose_feasible(final, scorer, state, progress, mean)
-    if final == "better" and policy_mode is not None:
-        return _choose_better(scorer, state, progress, mean, policy_mode)
-    if final != "best":
-        return mean, progress.expected_return, None
-    best_return = progress.elites.scores.returns[:, 0]
-    is_best = torch.isfinite(best_return)
-    actions = torch.where(is_best[:, None, None], progress.elites.actions[:, 0], mean)
-    return actions, torch.where(is_best, best_return, progress.expected_return), None
-
-
-def _choose_better(scorer: Scorer, state: State, progress: Progress, mean: Tensor, policy_mode: Tensor) -> Choice:
-    """Returns the mean or the policy's mode, by predicted return; the mean where neither return is finite.
-
-    The mean of several good sequences is another sequence, and may have a lower return than the policy's mode.
-    """
-    is_finite = torch.isfinite(policy_mode).flatten(1).all(1)  # a model may give an action that is NaN a finite return
-    both = torch.stack([mean, torch.where(is_finite[:, None, None], policy_mode, mean)], dim=1)
-    better = select_elites(both, scorer.score(scorer.start_rows(state, 2), both), num_elites=1, temperature=None)
-    is_known = better.weights[:, 0] > 0
-    actions = torch.where(is_known[:, None, None], better.actions[:, 0], mean)
-    return actions, torch.where(is_known, better.scores.returns[:, 0], progress.expected_return), None
-
-
-def _choose_feasible(final: str, scorer: Scorer, state: State, progress: Progress, mean: Tensor) -> Choice:
-    """Returns the mean, or under constraints the best candidate where the mean violates them more."""
-    assert progress.elites is not None
-    best, scores = progress.elites.actions[:, 0], progress.elites.scores
-    mean_scores = scorer.score(scorer.start_rows(state, 1), mean[:, None])
-    assert mean_scores.violations is not None and scores.violations is not None
-    violation, best_violation = mean_scores.violations[:, 0], scores.violations[:, 0]
-    best_return = scores.returns[:, 0]
-    is_best = torch.isfinite(best_return)
-    if final != "best":  # the mean of feasible sequences may itself be infeasible
-        is_safer = best_violation < violation.nan_to_num(float("inf"))
-        is_best = is_best & is_safer if scores.is_ranked else torch.zeros_like(is_best)
-    return (
-        torch.where(is_best[:, None, None], best, mean),
-        torch.where(is_best, best_return, progress.expected_return),
-        torch.where(is_best, best_violation, violation),
-    )
+    def _per_step(self, value: Tensor, name: str) -> Tensor:
+        return fit_steps(value, name, self.batch, self.horizon).to(dtype=self.dtype, device=self.device)
 
 
 def _ignore_nan_actions(candidates: Tensor, scores: Scores) -> Scores:

@@ -14,7 +14,13 @@ from latentplan.config.planner import SearchOptions
 from latentplan.planning.model import Bound, State
 from latentplan.planning.objectives import Constraint, Term
 from latentplan.planning.plan import Plan
-from latentplan.planning.search.cem import CEMPlanner, icem_planner, mppi_planner
+from latentplan.planning.search.cem import (
+    OWN_OPTIONS,
+    CEMPlanner,
+    cem_gradient_planner,
+    icem_planner,
+    mppi_planner,
+)
 from latentplan.planning.search.sampling import Generators
 
 
@@ -85,6 +91,7 @@ class Planner(SupportsPlan, Protocol):
 
 PLANNERS: dict[str, Callable[..., Planner]] = {
     "cem": CEMPlanner,
+    "cem_gradient": cem_gradient_planner,
     "icem": icem_planner,
     "mppi": mppi_planner,
 }
@@ -95,7 +102,8 @@ PLANNERS: dict[str, Callable[..., Planner]] = {
 def make_planner(name: str, options: SearchOptions | None = None, **settings: Any) -> Planner:
     """Returns the planner that is registered under a name.
 
-    An option of `options` that has its default value is not passed on, so that `icem` and `mppi` take their own value.
+    An option of `options` that has its default value is not passed on if the planner has its own value for it, as
+    `icem` and `mppi` have for some options; a planner that is registered later chooses all defaults itself.
 
     Args:
         name: A name in `PLANNERS`.
@@ -111,6 +119,10 @@ def make_planner(name: str, options: SearchOptions | None = None, **settings: An
         raise_unknown("planner", name, PLANNERS)
     changed: dict[str, Any] = {}
     if options is not None:
-        fields = dataclasses.fields(SearchOptions)
-        changed = {f.name: getattr(options, f.name) for f in fields if getattr(options, f.name) != f.default}
+        names = {field.name for field in dataclasses.fields(SearchOptions)}
+        own = OWN_OPTIONS.get(PLANNERS[name], names)  # a planner of the user chooses all its defaults
+        for field in dataclasses.fields(options):  # an agent's settings have defaults of their own
+            value = getattr(options, field.name)
+            if field.name in names and (field.name not in own or value != field.default):
+                changed[field.name] = value
     return PLANNERS[name](**changed | settings)

@@ -8,6 +8,11 @@ from functools import lru_cache
 import torch
 from torch import Tensor
 
+# Chosen on the problems of `scripts/bench/problems.py`: smooth sequences find other ways, white ones improve each step.
+SMOOTH_SCALE, WHITE_SCALE = 1.25, 0.5
+
+MODEL_STREAM = 0x5DEECE66D  # makes the seed of a model's stream another than the seeds it is made of
+
 Generators = torch.Generator | Sequence[torch.Generator] | None
 
 
@@ -36,19 +41,43 @@ class Streams:
         self._policy_seeds = [second for _, second in seeds] * (batch if is_shared else 1)
         self._device = device
 
-    def noise(self, num: int, horizon: int, action_dim: int, noise_beta: float, dtype: torch.dtype) -> Tensor:
-        """Returns unit Gaussian noise, (1 or batch, num, horizon, action); a `noise_beta` above 0 correlates steps."""
+    def noise(
+        self, num: int, horizon: int, action_dim: int, noise_beta: float, white_share: float, dtype: torch.dtype
+    ) -> Tensor:
+        """Returns Gaussian noise, (1 or batch, num, horizon, action).
+
+        Args:
+            num: Number of sequences.
+            horizon: Steps of a sequence.
+            action_dim: Numbers in an action.
+            noise_beta: Exponent of coloured noise, which correlates the steps; 0 is white.
+            white_share: Share of the sequences that are white in spite of `noise_beta`. Above 0 the coloured sequences
+                explore further, by `SMOOTH_SCALE`, and the white ones stay closer to the mean, by `WHITE_SCALE`.
+            dtype: Precision of the noise.
+
+        Returns:
+            Noise of unit variance if all of it has one colour; otherwise coloured sequences first.
+        """
         size = (num, horizon, action_dim)
         drawn = [torch.randn(size, generator=source, device=self._device, dtype=dtype) for source in self._noise]
         white = drawn[0][None] if len(drawn) == 1 else torch.stack(drawn)
-        if noise_beta == 0.0 or horizon == 1:
+        num_white = round(white_share * num)
+        if noise_beta == 0.0 or horizon == 1 or num_white == num:
             return white
         factor = torch.tensor(_colour_factor(horizon, noise_beta), device=self._device, dtype=dtype)
-        return torch.einsum("th,bnha->bnta", factor, white)
+        if num_white == 0:
+            return torch.einsum("th,bnha->bnta", factor, white)
+        smooth = torch.einsum("th,bnha->bnta", SMOOTH_SCALE * factor, white[:, : num - num_white])
+        return torch.cat([smooth, WHITE_SCALE * white[:, num - num_white :]], dim=1)
 
     def policy_generators(self) -> list[torch.Generator]:
         """Returns a stream for each environment's policy samples."""
         return [torch.Generator(self._device).manual_seed(seed) for seed in self._policy_seeds]
+
+    def model_generator(self) -> torch.Generator:
+        """Returns the stream of a model that samples, which all environments of the call share."""
+        seed = sum(self._policy_seeds) % 2**62 ^ MODEL_STREAM
+        return torch.Generator(self._device).manual_seed(seed)
 
 
 def _draw_seeds(generator: torch.Generator | None) -> tuple[int, int]:

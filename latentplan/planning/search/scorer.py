@@ -13,8 +13,10 @@ from torch.utils._pytree import tree_map
 from latentplan.planning.model import (
     Model,
     State,
+    call_with,
     check_shape,
     count_rows,
+    has_policy,
     repeat_rows,
     require,
     split_rows,
@@ -23,6 +25,7 @@ from latentplan.planning.model import (
 )
 from latentplan.planning.objectives import Constraint, Objective, Rollout, Term, as_objective, predicted_return
 from latentplan.planning.search.elites import Scores
+from latentplan.planning.search.space import Bounds
 
 
 @dataclass(frozen=True)
@@ -36,6 +39,8 @@ class Scorer:
         discounts: Powers of the discount, (horizon + 1,), in the precision of the returns.
         use_continues: Whether the model's probability that the episode goes on discounts later rewards.
         penalty: Return subtracted per unit of violation; None ranks candidates by violation first.
+        generator: Random stream of a model that samples; None for other models.
+        find_last_action: Returns the action executed last, (batch, action); None where no plan came before.
     """
 
     model: Model
@@ -44,6 +49,8 @@ class Scorer:
     discounts: Tensor
     use_continues: bool
     penalty: float | None
+    generator: torch.Generator | None = None
+    find_last_action: Callable[[], Tensor] | None = None
 
     @classmethod
     def build(
@@ -56,6 +63,8 @@ class Scorer:
         terminal_value: bool | None,
         use_continues: bool,
         penalty: float | None,
+        generator: torch.Generator | None = None,
+        find_last_action: Callable[[], Tensor] | None = None,
     ) -> Scorer:
         """Returns the scorer of a search; without an objective it scores reward and, by `terminal_value`, value.
 
@@ -68,7 +77,8 @@ class Scorer:
         violations = tuple(as_objective(constraint) for constraint in constraints)
         for term in (maximised, *violations):
             term.check(model)
-        return cls(model, maximised, violations, discounts, use_continues, penalty)
+        streams = (generator, find_last_action)
+        return cls(model, maximised, violations, discounts, use_continues, penalty, *streams)
 
     @property
     def num_particles(self) -> int:
@@ -96,81 +106,108 @@ class Scorer:
             start: Result of `start_rows`.
             actions: Candidates, (batch, sample, horizon, action).
         """
+        return self.score_rollout(self.imagine(start, actions))
+
+    def imagine(self, start: State, actions: Tensor, *, with_states: bool = False) -> Rollout:
+        """Returns the rollouts of sequences.
+
+        Args:
+            start: Result of `start_rows`.
+            actions: Candidates, (batch, sample, horizon, action).
+            with_states: Whether the rollout has its states even if no term needs them.
+        """
         batch, particles = actions.shape[0], self.num_particles
         rows = rearrange(actions, "batch sample horizon action -> (batch sample) horizon action")
         if particles > 1:
             rows = repeat_rows(rows, particles)
-        return self._score_rollout(self._imagine(start, rows, batch, particles))
+        return self._imagine(start, rows, batch, particles, with_states or self._needs_states)
 
-    def propose(
-        self, state: State, num: int, generators: Sequence[torch.Generator], bounds: tuple[Tensor, Tensor]
-    ) -> Tensor:
+    def arrange_states(self, rollout: Rollout) -> State:
+        """Returns the states of a rollout, leaves (batch, sample, horizon, ...); with particles before the horizon."""
+        split = "batch sample particle" if rollout.num_particles > 1 else "batch sample"
+        sizes = {"batch": rollout.batch}
+        if rollout.num_particles > 1:
+            sizes["particle"] = rollout.num_particles
+        pattern = f"({split}) horizon ... -> {split} horizon ..."
+        return tree_map(lambda *steps: rearrange(torch.stack(steps, dim=1), pattern, **sizes), *rollout.states)
+
+    def propose(self, state: State, num: int, generators: Sequence[torch.Generator], bounds: Bounds) -> Tensor:
         """Returns imagined sequences of the model's policy, its mode first, (batch, num, horizon, action).
 
         Args:
             state: Start of the plans, rows (batch,).
             num: Number of sequences per environment; all but the first are sampled.
             generators: One stream per environment, so that samples do not depend on the other environments.
-            bounds: Lowest and highest action, each (action,).
+            bounds: Bounds of the actions.
 
         Returns:
             The sequences, within the bounds; not finite where the policy is not.
         """
-        require(self.model, "policy", "num_policy_samples above 0")
-        batch, horizon, (low, high) = len(generators), len(self.discounts) - 1, bounds
+        batch, horizon = len(generators), len(self.discounts) - 1
         if supports(self.model, "propose"):
-            rows = self.model.propose(state, num, horizon, generators)  # type: ignore[attr-defined]
-            check_shape("propose()", rows, (batch * num, horizon, len(low)))
-            rows = torch.clamp(rows.to(low.dtype), low, high)
-            return rearrange(rows, "(batch num) horizon action -> batch num horizon action", batch=batch)
+            return self._call_propose(state, num, horizon, generators, bounds)
+        require(self.model, "policy", "num_policy_samples above 0")
         chosen: list[Tensor] = []
 
-        def choose(_: int, rows: State) -> Tensor:
+        def choose(step: int, rows: State) -> Tensor:
             action = _policy_actions(self.model, split_rows(rows, batch), num, generators)
-            check_shape("policy()", action, (batch * num, len(low)))
-            chosen.append(torch.clamp(action.to(low.dtype), low, high))
+            check_shape("policy()", action, (batch * num, bounds.action_dim))
+            chosen.append(bounds.fit_step(action, step, num))
             return chosen[-1]
 
         self._step_through(repeat_rows(state, num), horizon, choose)
         rows = torch.stack(chosen, dim=1)
         return rearrange(rows, "(batch num) horizon action -> batch num horizon action", batch=batch)
 
-    def act(self, state: State, bounds: tuple[Tensor, Tensor]) -> Tensor:
-        """Returns the mode of the model's policy, within the bounds, (batch, action); NaN where the policy is NaN."""
-        require(self.model, "policy", "num_policy_samples above 0")
-        action = self.model.policy(state, None)  # type: ignore[attr-defined]
-        low, high = bounds
-        check_shape("policy()", action, (count_rows(state), len(low)))
-        return torch.clamp(action.to(low.dtype), low, high)
-
-    def continue_by_policy(
-        self, state: State, actions: Tensor, is_tail: Tensor, bounds: tuple[Tensor, Tensor]
+    def _call_propose(
+        self, state: State, num: int, horizon: int, generators: Sequence[torch.Generator], bounds: Bounds
     ) -> Tensor:
+        batch = len(generators)
+        rows = self.model.propose(state, num, horizon, generators)  # type: ignore[attr-defined]
+        check_shape("propose()", rows, (batch * num, horizon, bounds.action_dim))
+        rows = rows.to(bounds.low.dtype)
+        return bounds.fit(rearrange(rows, "(batch num) horizon action -> batch num horizon action", batch=batch))
+
+    def act(self, state: State, bounds: Bounds, step: int = 0) -> Tensor:
+        """Returns the policy's mode at a step, within the bounds, (batch, action); NaN where the policy is NaN."""
+        rows = count_rows(state)
+        if not supports(self.model, "policy") and supports(self.model, "propose"):
+            streams = [torch.Generator(bounds.low.device) for _ in range(rows)]  # the mode draws nothing from them
+            action = self.model.propose(state, 1, 1, streams)[:, 0]  # type: ignore[attr-defined]
+        else:
+            require(self.model, "policy", "num_policy_samples above 0")
+            action = self.model.policy(state, None)  # type: ignore[attr-defined]
+        check_shape("policy()", action, (rows, bounds.action_dim))
+        return bounds.fit_step(action, step)
+
+    def continue_by_policy(self, state: State, actions: Tensor, is_tail: Tensor, bounds: Bounds) -> Tensor:
         """Returns the sequences (batch, horizon, action) with the policy's mode where is_tail (batch, horizon, 1)."""
-        require(self.model, "policy", 'tail="policy"')
+        if not has_policy(self.model):
+            require(self.model, "policy", 'tail="policy"')
         filled: list[Tensor] = []
         for step in range(actions.shape[1]):
             action = actions[:, step]
             if bool(is_tail[:, step].any()):
-                mode = self.act(state, bounds)
+                mode = self.act(state, bounds, step)
                 action = torch.where(is_tail[:, step] & torch.isfinite(mode), mode, action)
             filled.append(action)
-            state, _ = take_step(self.model, state, action)
+            state, _ = take_step(self.model, state, action, self.generator)
         return torch.stack(filled, dim=1)
 
     @property
     def _needs_states(self) -> bool:
         return any(term.needs_states for term in (self.objective, *self.constraints))
 
-    def _imagine(self, start: State, actions: Tensor, batch: int, particles: int) -> Rollout:
-        if self._needs_states or self.use_continues or not supports(self.model, "rollout"):
+    def _imagine(self, start: State, actions: Tensor, batch: int, particles: int, with_states: bool) -> Rollout:
+        if with_states or self.use_continues or not supports(self.model, "rollout"):
             rewards, states, weights = self._step_through(start, actions.shape[1], lambda step, _: actions[:, step])
             last_state = states[-1]
         else:
-            rewards, last_state = self.model.rollout(start, actions)  # type: ignore[attr-defined]
+            rewards, last_state = call_with(self.model.rollout, self.generator, start, actions)  # type: ignore[attr-defined]
             check_shape("rollout()'s rewards", rewards, actions.shape[:2])
             rewards, states, weights = rewards.to(self.discounts.dtype), (), self.discounts
-        return Rollout(self.model, batch, particles, actions, rewards, weights, start, last_state, states)
+        parts = (actions, rewards, weights, start, last_state, states, self.find_last_action)
+        return Rollout(self.model, batch, particles, *parts)
 
     def _step_through(
         self, state: State, horizon: int, choose: Callable[[int, State], Tensor]
@@ -180,8 +217,8 @@ class Scorer:
         rewards, continues = [], []
         for step in range(horizon):
             action = choose(step, state)
-            state, reward = take_step(self.model, state, action)
-            check_shape("step()'s reward", reward, action.shape[:1])
+            state, reward = take_step(self.model, state, action, self.generator)
+            _check_reward(reward, len(action))
             states.append(state)
             rewards.append(reward)
             if self.use_continues:
@@ -193,7 +230,8 @@ class Scorer:
             weights = weights * torch.nn.functional.pad(survival, (1, 0), value=1.0)
         return torch.stack(rewards, dim=1).to(self.discounts.dtype), tuple(states), weights
 
-    def _score_rollout(self, rollout: Rollout) -> Scores:
+    def score_rollout(self, rollout: Rollout) -> Scores:
+        """Returns the scores of the candidates of a rollout, (batch, sample)."""
         returns = _per_candidate(self.objective(rollout), rollout, "mean", "the objective")
         if not self.constraints:
             return Scores(returns)
@@ -206,6 +244,16 @@ class Scorer:
         if self.penalty is None:
             return Scores(returns, violations)
         return Scores(returns - self.penalty * violations, violations, is_ranked=False)
+
+
+def _check_reward(reward: Tensor, rows: int) -> None:
+    if not isinstance(reward, Tensor):
+        raise TypeError(f"step()'s reward must be a tensor of shape ({rows},), got {type(reward).__name__}")
+    if reward.shape != (rows,):
+        raise ValueError(
+            f"step()'s reward must have shape ({rows},), got {tuple(reward.shape)}: one number per row; dim 0 of a "
+            "state is its rows (state[None] for one environment, state.flatten(0, 1) for two such dimensions)"
+        )
 
 
 def _per_candidate(values: Tensor, rollout: Rollout, over_particles: str, name: str) -> Tensor:

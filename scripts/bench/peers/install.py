@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 import subprocess
 import sys
 import sysconfig
@@ -22,11 +23,20 @@ class Peer(NamedTuple):
         package: Name of the library on PyPI.
         requirements: Further packages that pip installs without their dependencies, which come from the project's
             environment.
+        controllers: The module with the library's planners in closed loop.
+        minimum: Oldest version that the modules can use; empty for any.
     """
 
     module: str
     package: str
     requirements: tuple[str, ...]
+    controllers: str = ""
+    minimum: str = ""
+
+    @property
+    def all_requirements(self) -> tuple[str, ...]:
+        """What pip installs: the library, in a version that the modules can use, and the further packages."""
+        return (self.package + (f">={self.minimum}" if self.minimum else ""), *self.requirements)
 
 
 class PeerError(Exception):
@@ -39,15 +49,17 @@ PEERS = {
         "bench.peers.torchrl_cem",
         "torchrl",
         ("tensordict<0.15", "pyvers<0.3", "hoptorch", "cloudpickle", "importlib-metadata", "orjson"),
+        "bench.controllers.torch_rl",
     ),
     "mbrl": Peer(
         "bench.peers.mbrl_cem",
         "mbrl",
         ("hydra-core", "omegaconf", "antlr4-python3-runtime==4.9.*", "termcolor", "imageio"),
+        "bench.controllers.mbrl_lib",
     ),
-    "pytorch_mppi": Peer("bench.peers.mppi", "pytorch-mppi", _UTILITIES),
-    "stable_worldmodel": Peer("bench.peers.stable_cem", "stable-worldmodel", ("loguru",)),
-    "pytorch_icem": Peer("bench.peers.icem", "pytorch-icem", ("colorednoise", *_UTILITIES)),
+    "pytorch_mppi": Peer("bench.peers.mppi", "pytorch-mppi", _UTILITIES, "bench.controllers.mppi", "0.9.1"),
+    "stable_worldmodel": Peer("bench.peers.stable_cem", "stable-worldmodel", ("loguru",), "bench.controllers.stable"),
+    "pytorch_icem": Peer("bench.peers.icem", "pytorch-icem", ("colorednoise", *_UTILITIES), "bench.controllers.icem"),
 }
 
 
@@ -59,19 +71,22 @@ def install(name: str, folder: Path) -> Path:
         folder: Folder of the environment.
 
     Raises:
-        PeerError: The peer could not be installed.
+        PeerError: The peer could not be installed; the message says how to install it.
     """
-    peer, python = PEERS[name], folder / "bin" / "python"
-    requirements = (peer.package, *peer.requirements)
+    requirements, python = PEERS[name].all_requirements, folder / "bin" / "python"
     receipt, wanted = folder / f"{name}.installed", "\n".join(requirements)
     if receipt.is_file() and receipt.read_text() == wanted:
         return python
-    if not python.is_file():
-        print(f"making an environment for other planners in {folder}", flush=True)
-        _call([sys.executable, "-m", "venv", str(folder)])
-        _show_own_packages(folder)
-    print(f"installing {name} there: {' '.join(requirements)}", flush=True)
-    _call([str(python), "-m", "pip", "install", "--quiet", "--no-deps", "--disable-pip-version-check", *requirements])
+    command = [str(python), "-m", "pip", "install", "--no-deps", *requirements]
+    try:
+        if not python.is_file():
+            print(f"making an environment for other planners in {folder}", flush=True)
+            _call([sys.executable, "-m", "venv", str(folder)])
+            _show_own_packages(folder)
+        print(f"installing {name} there: {' '.join(requirements)}", flush=True)
+        _call([*command, "--quiet", "--disable-pip-version-check"])
+    except PeerError as error:
+        raise PeerError(f"{error}; to install it: {shlex.join(command)}") from None
     receipt.write_text(wanted)
     return python
 

@@ -30,7 +30,7 @@ def make_search(problem: Problem, model: WorldModel) -> Search:
     """A cold search from the problem's start."""
     import gymnasium
 
-    _load_solvers_alone()
+    load_solvers_alone()
     from stable_worldmodel.solver.cem import CEMSolver  # type: ignore[import-not-found]
 
     solver = CEMSolver(
@@ -54,7 +54,7 @@ def make_search(problem: Problem, model: WorldModel) -> Search:
     return search
 
 
-def _load_solvers_alone() -> None:
+def load_solvers_alone() -> None:
     """Makes the solvers importable without the datasets and environments, which need other versions of packages."""
     found = importlib.util.find_spec("stable_worldmodel")
     if found is None:

@@ -42,13 +42,13 @@ def test_previous_plan_is_clamped_into_narrower_bounds(point, states, make_plann
     assert plan.elites.max() <= 0.1 and plan.actions.max() <= 0.1
 
 
-def test_zero_tail_and_cold_start_are_clamped_into_the_bounds(make_planner, seeded):
+def test_zero_tail_and_cold_start_are_in_the_middle_of_the_bounds(make_planner, seeded):
     model = FunctionModel(lambda state, action: state, lambda state, action: 0 * action.sum(dim=1))
     planner = make_planner(action_low=0.5, action_high=1.5, init_std=0.0, num_elites=64, smoothing=1.0)
     cold = planner.plan(model, torch.zeros(1, 4), generator=seeded())
-    torch.testing.assert_close(cold.mean, torch.full_like(cold.mean, 0.5))
+    torch.testing.assert_close(cold.mean, torch.ones_like(cold.mean))
     warm = planner.plan(model, torch.zeros(1, 4), cold, generator=seeded())
-    torch.testing.assert_close(warm.mean, torch.full_like(cold.mean, 0.5))
+    torch.testing.assert_close(warm.mean, torch.ones_like(cold.mean))
 
 
 def test_init_std_is_in_action_units(make_planner, seeded):
@@ -110,7 +110,9 @@ def test_tail_of_the_last_plan_is_executed_when_no_return_is_finite(point, state
     plan = planner.plan(broken, states, last.forget(torch.tensor([1, 0, 0, 0, 0]).bool()), generator=seeded())
     assert plan.info["is_fallback"].all() and plan.expected_return.isnan().all()
     torch.testing.assert_close(plan.actions[1:, :-1], last.actions[1:, 1:])
-    assert (plan.actions[0] == 0).all() and (plan.actions[:, -1] == 0).all()
+    middle = torch.tensor(0.3)  # of the bounds -0.4 and 1
+    torch.testing.assert_close(plan.actions[0], middle.expand(6, 2))
+    torch.testing.assert_close(plan.actions[:, -1], middle.expand(5, 2))
 
 
 def test_proposals_are_no_elites_when_they_are_nan(states, make_planner, seeded):

@@ -1,4 +1,4 @@
-"""`final="better"` executes the mean or the policy's mode, by predicted return."""
+"""`final="better"` executes the mean or another sequence: the policy's mode, or the best candidate."""
 
 import math
 
@@ -21,6 +21,15 @@ def make_model(policy, reward=spiked_reward):
 
 def constant(number):
     return lambda state, generator: torch.full((len(state), 2), number)
+
+
+def returns_of(model, state, actions):
+    """The true return of sequences (batch, horizon, action), with a discount of 1 and without a value."""
+    total = torch.zeros(len(state))
+    for action in actions.unbind(dim=1):
+        total = total + model.reward(state, action)
+        state = model.dynamics(state, action)
+    return total
 
 
 def test_final_better_executes_mean_or_policy_mode_by_return(make_planner, seeded):
@@ -48,14 +57,46 @@ def test_final_better_ignores_a_nan_mode_and_clamps_one_out_of_bounds(make_plann
     torch.testing.assert_close(plan.actions, expected)
 
 
-def test_final_better_is_mean_when_the_policy_makes_no_valid_proposal(make_planner, seeded):
-    model, states = make_model(constant(0.625)), torch.tensor([[0.2], [-0.4]])
-    planner = make_planner(num_policy_samples=4, final="better")
-    for given in ({"objective": learned_return()}, {"constraints": [lambda rollout: rollout.rewards[:, 0] * 0.0]}):
-        plan = planner.plan(model, states, generator=seeded(), **given)
-        assert torch.equal(plan.actions, plan.mean)
-    alone = make_planner(final="better").plan(model, states, generator=seeded())
-    assert torch.equal(alone.actions, alone.mean)
+@pytest.mark.parametrize(
+    "given",
+    [
+        {},
+        {"objective": learned_return()},
+        {"constraints": [lambda rollout: rollout.rewards[:, 0] * 0.0]},
+        {"constraints": [lambda rollout: rollout.actions[:, 0, 0] + 0.5]},
+    ],
+)
+def test_final_better_executes_the_better_of_mean_and_best_candidate(point, states, make_planner, seeded, given):
+    """Without a policy that may replace the plan; the expected return is that of the sequence that is executed."""
+    model = FunctionModel(point.dynamics, point.reward)
+
+    def plan(final):
+        planner = make_planner(final=final, num_elites=16, num_iterations=2)
+        return planner.plan(model, states, generator=seeded(), **given)
+
+    mean, best, better = (plan(final) for final in ("mean", "best", "better"))
+    is_mean = (better.actions == better.mean).flatten(1).all(dim=1)
+    is_best = (better.actions == best.actions).flatten(1).all(dim=1)
+    assert (is_mean | is_best).all()
+    torch.testing.assert_close(better.expected_return, returns_of(model, states, better.actions), atol=1e-4, rtol=1e-5)
+    if "constraints" not in given:
+        others = [returns_of(model, states, other.actions) for other in (mean, best)]
+        assert (better.expected_return >= torch.maximum(*others) - 1e-4).all()
+    else:
+        assert (better.info["violation"] <= best.info["violation"] + 1e-6).all()
+
+
+def test_final_better_avoids_a_mean_that_runs_through_the_obstacle(make_planner, seeded):
+    """Both sides of the obstacle at 0 are good, and their mean is not."""
+    model = FunctionModel(lambda state, action: state, lambda state, action: -torch.exp(-50 * action[:, 0].square()))
+    sizes = {"num_iterations": 1, "num_elites": 32, "smoothing": 1.0, "horizon": 1}
+    through, around = (
+        make_planner(final=final, **sizes).plan(model, torch.zeros(20, 1), generator=seeded())
+        for final in ("mean", "better")
+    )
+    assert (through.action[:, 0].abs() < 0.15).all() and (around.action[:, 0].abs() > 0.3).all()
+    assert (through.expected_return > returns_of(model, torch.zeros(20, 1), through.actions) + 0.5).all()
+    torch.testing.assert_close(around.expected_return, returns_of(model, torch.zeros(20, 1), around.actions))
 
 
 def test_final_better_executes_the_last_plan_when_no_return_is_finite(point, states, make_planner, seeded):

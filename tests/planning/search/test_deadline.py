@@ -64,6 +64,7 @@ def state():
 def make(clock):
     def make(**options):
         defaults = {"num_samples": 32, "num_elites": 4, "num_iterations": 6, "num_policy_samples": 0, "clock": clock}
+        defaults |= {"final": "mean", "noise_beta": 0.0, "keep_elite_fraction": 0.0}  # no rollout but the iterations'
         return CEMPlanner(action_dim=2, horizon=HORIZON, **defaults | options)
 
     return make
@@ -113,7 +114,7 @@ def test_shifted_plan_is_returned_when_no_iteration_fits(warm, model, state, clo
 def test_cold_start_is_returned_and_stays_cold_without_time_and_plan(make, model, state):
     planner = make(action_low=0.25)
     plan = planner.plan(model, state, deadline_ms=0)
-    assert (plan.actions == 0.25).all() and plan.actions.shape == (2, HORIZON, 2)  # zero, clamped
+    assert (plan.actions == 0.625).all() and plan.actions.shape == (2, HORIZON, 2)  # the middle of [0.25, 1]
     assert not plan.is_warm.any()
     assert planner.plan(model, state, plan).info["iterations"].tolist() == [6, 6]
     assert model.num_rollouts == 6

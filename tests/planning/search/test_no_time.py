@@ -50,7 +50,8 @@ def state():
 @pytest.fixture
 def planner(model):
     sizes = {"horizon": HORIZON, "num_samples": 32, "num_elites": 4, "num_policy_samples": 1}
-    return CEMPlanner(action_dim=2, **sizes, clock=lambda: model.seconds)
+    plain = {"final": "mean", "noise_beta": 0.0, "keep_elite_fraction": 0.0}
+    return CEMPlanner(action_dim=2, **sizes, **plain, clock=lambda: model.seconds)
 
 
 @pytest.fixture

@@ -7,6 +7,7 @@ import torch
 
 from latentplan.config import PlannerConfig
 from latentplan.planning import (
+    PLANNERS,
     CEMPlanner,
     FunctionModel,
     SearchOptions,
@@ -43,14 +44,13 @@ def frozen(make_planner, **options):
 
 
 def test_planner_config_and_planner_share_options_defaults_and_checks():
-    for kind, own in (
-        (PlannerConfig, {"method", "surprise_limit"}),
-        (CEMPlanner, {"action_dim", "action_low", "action_high", "discount", "clock"}),
-    ):
+    evaluated = {"num_elites": 16, "final": "mean", "noise_beta": 0.0, "keep_elite_fraction": 0.0}
+    problem = {"action_dim", "action_low", "action_high", "action_choices", "init_mean", "discount", "clock"}
+    for kind, own, other in ((PlannerConfig, {"method", "surprise_limit"}, evaluated), (CEMPlanner, problem, {})):
         fields = {field.name: field.default for field in dataclasses.fields(kind)}
         shared = {field.name: field.default for field in dataclasses.fields(SearchOptions)}
         assert fields.keys() - own == shared.keys()
-        assert all(fields[name] == default for name, default in shared.items())
+        assert {name: fields[name] for name in shared} == shared | other
     for bad in ({"num_elites": 129}, {"smoothing": 0.0}, {"tail": "head"}, {"temperature": -1.0}):
         messages = []
         for make in (lambda bad=bad: PlannerConfig(**bad), lambda bad=bad: CEMPlanner(action_dim=1, **bad)):
@@ -166,7 +166,7 @@ def test_warm_and_cold_environments_have_their_own_iterations(point, states, mak
 @pytest.mark.parametrize("beta", [0.0, 1.0, 3.0])
 def test_coloured_noise_has_unit_variance_and_correlated_steps(beta):
     streams = Streams(torch.Generator().manual_seed(0), 1, torch.device("cpu"))
-    noise = streams.noise(20_000, 12, 1, beta, torch.float64)[0, :, :, 0]
+    noise = streams.noise(20_000, 12, 1, beta, 0.0, torch.float64)[0, :, :, 0]
     torch.testing.assert_close(noise.var(dim=0), torch.ones(12, dtype=torch.float64), atol=0.05, rtol=0)
     neighbours = (noise[:, 1:] * noise[:, :-1]).mean().item()
     opposite_ends = (noise[:, 0] * noise[:, -1]).mean().item()
@@ -175,12 +175,11 @@ def test_coloured_noise_has_unit_variance_and_correlated_steps(beta):
 
 
 def test_mppi_equals_its_formula(point, states, seeded):
-    planner = mppi_planner(
-        action_dim=2, horizon=4, num_samples=128, num_policy_samples=0, temperature=0.5, init_std=0.4
-    )
+    options = {"temperature": 0.5, "init_std": 0.4, "noise_beta": 0.0, "final": "mean"}
+    planner = mppi_planner(action_dim=2, horizon=4, num_samples=128, num_policy_samples=0, **options)
     plan = planner.plan(point, states[:1], generator=seeded())
     streams = Streams(seeded(), 1, torch.device("cpu"))
-    candidates = (0.4 * streams.noise(128, 4, 2, 0.0, torch.float32)[0]).clamp(-1, 1)
+    candidates = (0.4 * streams.noise(128, 4, 2, 0.0, 0.0, torch.float32)[0]).clamp(-1, 1)
     candidates[0] = 0.0
     returns = []
     for sequence in candidates:
@@ -189,14 +188,34 @@ def test_mppi_equals_its_formula(point, states, seeded):
             total = total + point.reward(state, action[None])
             state = point.dynamics(state, action[None])
         returns.append(total + point.value(state))
-    weights = torch.softmax(torch.cat(returns) / 0.5, dim=0)
+    returns = torch.cat(returns)
+    weights = torch.softmax(returns / (0.5 * returns.std(correction=0)), dim=0)
     torch.testing.assert_close(plan.mean[0], torch.einsum("s,sha->ha", weights, candidates), atol=1e-4, rtol=0)
     torch.testing.assert_close(plan.var, torch.full_like(plan.var, 0.16))
 
 
+def test_mppi_plans_the_same_when_returns_are_scaled_and_shifted(point, states, seeded):
+    scaled = FunctionModel(point.dynamics, lambda state, action: 1000 * point.reward(state, action) - 7)
+    bare = FunctionModel(point.dynamics, point.reward)
+    planner = mppi_planner(action_dim=2, horizon=4, num_samples=64, num_iterations=2)
+    plans = [planner.plan(model, states, generator=seeded()) for model in (bare, scaled)]
+    torch.testing.assert_close(plans[0].mean, plans[1].mean, atol=1e-4, rtol=1e-4)
+
+
+def test_mixed_noise_has_smooth_samples_that_explore_and_white_ones_that_stay_close():
+    streams = Streams(torch.Generator().manual_seed(0), 1, torch.device("cpu"))
+    noise = streams.noise(40_000, 10, 1, 2.0, 0.5, torch.float64)[0, :, :, 0]
+    smooth, white = noise.chunk(2)
+    assert smooth.std().item() == pytest.approx(1.25, abs=0.03) and white.std().item() == pytest.approx(0.5, abs=0.01)
+    correlation = [(part[:, 1:] * part[:, :-1]).mean().item() / part.var().item() for part in (smooth, white)]
+    assert correlation[0] > 0.6 and abs(correlation[1]) < 0.02
+
+
 def test_lower_temperature_raises_the_expected_return(point, states, seeded):
     values = [
-        mppi_planner(action_dim=2, horizon=4, temperature=temperature).plan(point, states, generator=seeded())
+        mppi_planner(action_dim=2, horizon=4, final="mean", temperature=temperature).plan(
+            point, states, generator=seeded()
+        )
         for temperature in (0.1, 1.0, 10.0)
     ]
     returns = torch.stack([plan.expected_return for plan in values])
@@ -211,7 +230,8 @@ def test_icem_beats_plain_cem_on_a_sluggish_system(seeded):
 
     model = FunctionModel(dynamics, lambda state, action: state[:, 0] - 0.0 * action[:, 0])
     settings = {"action_dim": 1, "horizon": 25, "num_samples": 48, "num_elites": 6, "num_iterations": 2}
-    plain = mppi_planner(**settings | {"temperature": None, "num_elites": 6, "adapt_std": True, "final": "best"})
+    white = {"noise_beta": 0.0, "keep_elite_fraction": 0.0, "final": "best", "smoothing": 1.0}
+    plain = CEMPlanner(**settings | white)
     better = 0
     for seed in range(5):
         start = torch.zeros(1, 2)
@@ -303,3 +323,63 @@ def test_planner_refuses_sizes_that_are_not_whole(name):
 def test_plan_refuses_a_state_without_rows(point, make_planner):
     with pytest.raises(ValueError, match="at least one row"):
         make_planner().plan(point, torch.zeros(0, 4))
+
+
+def counted(point, curvature=1.0):
+    """A model that counts its steps with a gradient; only 0.3 is good, as sharply as `curvature` says."""
+    calls = []
+
+    def reward(state, action):
+        if torch.is_grad_enabled():
+            calls.append(len(action))
+        return -curvature * (action - 0.3).square().sum(dim=1)
+
+    return FunctionModel(lambda state, action: state, reward), calls
+
+
+def test_gradient_pauses_where_it_does_not_help_and_tries_again(point, make_planner, seeded):
+    """A plateau has no gradient: the refinement pauses for 1, 3, 7 and 15 searches, then for 15 again."""
+    model, calls = counted(point, curvature=0.0)
+    planner = make_planner(gradient_steps=2, horizon=1, num_iterations=1)
+    plan, refined = None, []
+    for search in range(48):
+        calls.clear()
+        plan = planner.plan(model, torch.zeros(2, 1), plan, generator=seeded(search))
+        refined += [search] if calls else []
+    assert refined == [0, 2, 6, 14, 30, 46]
+
+
+def test_gradient_goes_on_where_it_helps_and_after_a_cold_start(point, make_planner, seeded):
+    model, calls = counted(point)
+    planner = make_planner(gradient_steps=2, num_iterations=1)
+    plan = None
+    for search in range(6):
+        calls.clear()
+        plan = planner.plan(model, torch.zeros(2, 1), plan, generator=seeded(search))
+        assert calls and plan.info["gradient_wait"].tolist() == [0, 0]
+    flat, calls = counted(point, curvature=0.0)
+    plan = planner.plan(flat, torch.zeros(2, 1), plan, generator=seeded())
+    assert plan.info["gradient_wait"].tolist() == [1, 1]
+    calls.clear()
+    planner.plan(flat, torch.zeros(2, 1), plan.forget(torch.tensor([True, False])), generator=seeded())
+    assert calls  # an environment that starts cold has no pause
+
+
+def test_gradient_step_is_a_twentieth_of_the_range_by_default(make_planner, seeded):
+    model = FunctionModel(lambda state, action: state, lambda state, action: action.sum(dim=1))
+    planner = make_planner(
+        gradient_steps=1, action_low=(-1.0, -20.0), action_high=(1.0, 20.0), init_std=0.0, num_iterations=1, horizon=1
+    )
+    plan = planner.plan(model, torch.zeros(1, 1), generator=seeded())
+    torch.testing.assert_close(plan.action, torch.tensor([[0.1 / 20, 2.0]]))
+
+
+def test_cem_gradient_is_a_registered_planner_that_halves_the_gap_on_a_smooth_problem(point, states, seeded):
+    cem, refined = (
+        PLANNERS[name](action_dim=2, horizon=6, num_samples=32, num_iterations=2).plan(
+            FunctionModel(point.dynamics, point.reward), states, generator=seeded()
+        )
+        for name in ("cem", "cem_gradient")
+    )
+    assert (refined.expected_return >= cem.expected_return - 1e-5).all()
+    assert (refined.expected_return > cem.expected_return + 0.005).any()

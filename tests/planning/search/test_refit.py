@@ -67,8 +67,8 @@ def test_refit_gives_variance_zero_for_one_elite():
     torch.testing.assert_close(var, torch.zeros_like(var))
 
 
-def test_refit_weighs_by_the_exponential_of_the_return_over_temperature():
-    weights = torch.softmax(RETURNS / 0.7, dim=0)[:, None, None]
+def test_refit_weighs_by_the_exponential_of_the_return_over_temperature_and_spread():
+    weights = torch.softmax(RETURNS / (0.7 * RETURNS.std(correction=0)), dim=0)[:, None, None]
     mean, _ = refit(CANDIDATES, RETURNS, MEAN, VAR, num_elites=4, smoothing=1.0, temperature=0.7)
     torch.testing.assert_close(mean, (weights * CANDIDATES).sum(dim=0))
 
@@ -98,10 +98,13 @@ def test_select_elites_ranks_and_weighs_feasible_candidates_first():
     order = select_elites(CANDIDATES[None], scores, num_elites=4, temperature=None)
     assert order.scores.returns.tolist() == [[3.2, 1.0, -0.5, 4.0]]
     weighted = select_elites(CANDIDATES[None], scores, num_elites=4, temperature=1.0)
-    torch.testing.assert_close(weighted.weights[0, :2], torch.softmax(RETURNS[:2], dim=0))
+    torch.testing.assert_close(
+        weighted.weights[0, :2], torch.softmax(RETURNS[:2] / RETURNS[:2].std(correction=0), dim=0)
+    )
     assert (weighted.weights[0, 2:] == 0).all()
     none = select_elites(CANDIDATES[None], Scores(RETURNS[None], violations + 1), num_elites=4, temperature=1.0)
-    torch.testing.assert_close(none.weights[0], torch.softmax(-torch.tensor([1.0, 1.0, 2.0, 3.0]).double(), dim=0))
+    least = -torch.tensor([1.0, 1.0, 2.0, 3.0]).double()
+    torch.testing.assert_close(none.weights[0], torch.softmax(least / least.std(correction=0), dim=0))
 
 
 def test_refit_accepts_integer_returns_and_mixed_precisions():

@@ -94,7 +94,7 @@ def test_agent_plans_with_a_preset(method):
     if method == "icem":
         assert (planner.noise_beta, planner.keep_elite_fraction, planner.final) == (2.0, 0.3, "best")
     else:
-        assert (planner.temperature, planner.smoothing, planner.adapt_std) == (1.0, 1.0, False)
+        assert (planner.temperature, planner.smoothing, planner.adapt_std) == (0.1, 1.0, False)
 
 
 def test_make_planner_takes_the_presets_value_where_an_option_has_its_default():
@@ -112,8 +112,8 @@ def test_make_planner_gives_arguments_precedence_over_options_and_presets():
     assert isinstance(make_planner("cem", PlannerConfig(), action_dim=1), CEMPlanner)
 
 
-def test_mppi_refits_a_warm_start_at_most_as_often_as_a_cold_one():
-    assert mppi_planner(action_dim=1, warm_start_iterations=3).num_warm_iterations == 1
+def test_mppi_refits_a_warm_start_as_often_as_a_cold_one():
+    assert [mppi_planner(action_dim=1, num_iterations=num).num_warm_iterations for num in (1, 4)] == [1, 4]
     assert mppi_planner(action_dim=1, warm_start_iterations=3, num_iterations=4).num_warm_iterations == 3
 
 
@@ -124,7 +124,9 @@ def test_presets_plan_longer_for_other_objectives_too(point, states, seeded):
         assert plan.actions.shape == (5, 4, 2)
 
 
-@pytest.mark.parametrize(("name", "hint"), [("icme", "did you mean 'icem'"), ("ilqr_", "available: cem, icem, mppi")])
+@pytest.mark.parametrize(
+    ("name", "hint"), [("icme", "did you mean 'icem'"), ("ilqr_", "available: cem, cem_gradient, icem, mppi")]
+)
 def test_make_planner_names_the_nearest_planner_when_the_name_is_unknown(name, hint):
     with pytest.raises(ValueError, match=hint):
         make_planner(name, action_dim=1)

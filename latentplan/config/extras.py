@@ -1,0 +1,69 @@
+"""Libraries that only an extra of the package installs, and the error that names this extra."""
+
+from __future__ import annotations
+
+from importlib import import_module, util
+from types import ModuleType
+
+from latentplan.config.checks import UserError
+
+EXTRAS = {
+    "train": (
+        *("cv2", "dm_control", "gymnasium", "jsonargparse", "lightning", "matplotlib", "mujoco", "rich", "scipy"),
+        *("shtab", "tensorboard", "yaml"),
+    ),
+    "jax": ("jax",),
+}
+"""By extra, the modules that it installs and the package without extras does not."""
+
+
+class MissingExtra(UserError, ImportError):
+    """A library is not installed; the message names the extra that installs it."""
+
+
+def extra_of(module: str | None) -> str | None:
+    """The extra that installs a module; None for a module that belongs to no extra.
+
+    Args:
+        module: A dotted name, such as the `name` of a `ModuleNotFoundError`.
+    """
+    top = (module or "").partition(".")[0]
+    return next((extra for extra, modules in EXTRAS.items() if top in modules), None)
+
+
+def require_extra(user: str, *modules: str) -> None:
+    """Requires modules to be installed, without importing them.
+
+    Args:
+        user: The part that needs the modules, for the error.
+        *modules: Names of `EXTRAS`.
+
+    Raises:
+        MissingExtra: A module is not installed.
+    """
+    for module in modules:
+        if util.find_spec(module) is None:
+            raise MissingExtra(describe_missing(module, user))
+
+
+def import_extra(module: str, user: str) -> ModuleType:
+    """The module of an extra.
+
+    Args:
+        module: A name of `EXTRAS`.
+        user: The part that needs the module, for the error.
+
+    Raises:
+        MissingExtra: The module is not installed.
+    """
+    try:
+        return import_module(module)
+    except ModuleNotFoundError as error:
+        if extra_of(error.name) is None:
+            raise
+        raise MissingExtra(describe_missing(module, user)) from None
+
+
+def describe_missing(module: str, user: str) -> str:
+    """One line that says which module a part lacks, and how to install it."""
+    return f"{user} needs {module}, which is not installed; run: pip install 'latentplan[{extra_of(module)}]'"

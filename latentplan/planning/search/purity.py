@@ -1,0 +1,65 @@
+"""Notices models that write into the tensors they are given, at the first search in a model."""
+
+from __future__ import annotations
+
+import contextlib
+import weakref
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.utils._pytree import tree_leaves, tree_map
+
+from latentplan.planning.model import State
+
+
+class FirstSearches:
+    """Remembers the models that a planner has searched in, without keeping them alive. A copy remembers none."""
+
+    def __init__(self) -> None:
+        self._seen: dict[int, Any] = {}
+
+    def add(self, model: object) -> bool:
+        """Remembers a model; returns whether this is its first search."""
+        key = id(model)
+        known = self._seen.get(key)
+        if known is not None and known() is model:
+            return False
+        with contextlib.suppress(TypeError):  # without weak references a model cannot be told from a later one
+            self._seen[key] = weakref.ref(model, lambda _: self._seen.pop(key, None))
+        return True
+
+    def __reduce__(self) -> tuple[type[FirstSearches], tuple[()]]:
+        return FirstSearches, ()
+
+
+class Watch:
+    """Copies of tensors that a model must not change.
+
+    Args:
+        start: States at the start of candidates.
+        actions: The candidates.
+    """
+
+    def __init__(self, start: State, actions: Tensor) -> None:
+        self._given = start, actions
+        self._copies = tree_map(torch.clone, self._given)
+
+    def check(self, model: object) -> None:
+        """Refuses a model that has changed the tensors.
+
+        Raises:
+            ValueError: A tensor differs from its copy.
+        """
+        for name, given, copy in zip(("state", "action"), self._given, self._copies, strict=True):
+            pairs = zip(tree_leaves(given), tree_leaves(copy), strict=True)
+            if not all(bool(((left == right) | ((left != left) & (right != right))).all()) for left, right in pairs):
+                raise ValueError(describe_writing(model, name))
+
+
+def describe_writing(model: object, name: str) -> str:
+    """Returns the message for a model that writes into its state or action."""
+    return (
+        f"{type(model).__name__} writes into the {name} it is given; step(), rollout() and what they call must return "
+        f"new tensors ({name} + change instead of {name} += change, or {name}.clone() first)"
+    )

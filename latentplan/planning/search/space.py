@@ -1,0 +1,194 @@
+"""The space that a search samples, and how a point of this space becomes a sequence of actions.
+
+Without a spline a point is a sequence of actions. With `action_spline` a point is the knots of a spline over the plan.
+Either way the actions keep the bounds and the rate limit, and discrete dimensions take one of their values, so models,
+constraints and controllers only see actions that can be executed.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+
+import torch
+from torch import Tensor
+
+from latentplan.planning.search.choices import Choices
+
+
+@dataclass(frozen=True)
+class Bounds:
+    """The lowest and the highest action of each environment and step, and the values of discrete dimensions.
+
+    Attributes:
+        low: Lowest action, (1 or batch, 1 or horizon, action).
+        high: Highest action, shaped like `low`.
+        choices: The discrete dimensions; None without any.
+    """
+
+    low: Tensor
+    high: Tensor
+    choices: Choices | None = None
+
+    @property
+    def action_dim(self) -> int:
+        """Numbers in an action."""
+        return self.low.shape[-1]
+
+    def fit(self, sequences: Tensor, *, in_place: bool = False) -> Tensor:
+        """Returns sequences (batch, horizon, action) or (batch, sample, horizon, action) of actions that are allowed.
+
+        Args:
+            sequences: The sequences.
+            in_place: Whether the given tensor may be changed.
+        """
+        low, high = self.low, self.high
+        if sequences.ndim == 4:
+            low, high = low[:, None], high[:, None]
+        if in_place:
+            fitted = torch.minimum(torch.maximum(sequences, low, out=sequences), high, out=sequences)
+        else:
+            fitted = torch.clamp(sequences, low, high)
+        return fitted if self.choices is None else self.choices.snap(fitted)
+
+    def fit_step(self, actions: Tensor, step: int, num: int = 1) -> Tensor:
+        """Returns actions (rows, action) of one step that are allowed, for `num` rows per environment, batch-major."""
+        low, high = self.at(step)
+        if num > 1 and len(low) > 1:
+            low, high = (bound.repeat_interleave(num, dim=0) for bound in (low, high))
+        fitted = torch.clamp(actions.to(low.dtype), low, high)
+        return fitted if self.choices is None else self.choices.snap(fitted)
+
+    def at(self, step: int) -> tuple[Tensor, Tensor]:
+        """Returns the lowest and the highest action of one step, each (1 or batch, action)."""
+        low, high = (bound[:, step if bound.shape[1] > 1 else 0] for bound in (self.low, self.high))
+        return low, high
+
+    def select(self, steps: Tensor) -> Bounds:
+        """Returns the bounds of the steps (chosen,) int."""
+        low, high = (bound if bound.shape[1] == 1 else bound[:, steps] for bound in (self.low, self.high))
+        return Bounds(low, high, self.choices)
+
+
+class Space:
+    """The space that a search samples.
+
+    Args:
+        bounds: Bounds of the actions.
+        horizon: Number of actions of a plan.
+        spline: `zero`, `linear` or `cubic`; None searches over the actions themselves.
+        num_knots: Number of knots of a spline.
+        max_change: Largest change of an action from one step to the next, (action,); None without a rate limit.
+        last_action: The action executed last, NaN where unknown, (batch, action); used with `max_change` only.
+
+    Attributes:
+        length: Number of steps of a point: of actions, or of knots.
+        point_bounds: Bounds of a point.
+    """
+
+    def __init__(
+        self,
+        bounds: Bounds,
+        horizon: int,
+        *,
+        spline: str | None = None,
+        num_knots: int = 0,
+        max_change: Tensor | None = None,
+        last_action: Tensor | None = None,
+    ) -> None:
+        self.bounds, self.horizon, self.choices = bounds, horizon, bounds.choices
+        self.max_change, self.last_action = max_change, last_action
+        self.length, self.point_bounds = horizon, bounds
+        self._steps: Tensor | None = None
+        self._matrix: Tensor | None = None
+        if spline is None:
+            return
+        self.length = num_knots
+        matrix = torch.tensor(_spline_matrix(spline, horizon, num_knots), dtype=torch.float64)
+        self._matrix, self._inverse = matrix.to(bounds.low), torch.linalg.pinv(matrix).to(bounds.low)
+        self._hold = torch.tensor(_spline_matrix("zero", horizon, num_knots)).to(bounds.low)
+        self._steps = torch.linspace(0, horizon - 1, num_knots).round().long().to(bounds.low.device)
+        self.point_bounds = bounds.select(self._steps)
+
+    @property
+    def is_plain(self) -> bool:
+        """Whether a point within the bounds is a sequence of actions that can be executed."""
+        return self._matrix is None and self.choices is None and self.max_change is None
+
+    def clean(self, points: Tensor, *, in_place: bool = False) -> Tensor:
+        """Returns points that satisfy all limits of actions; those of knots satisfy their bounds only.
+
+        Args:
+            points: (batch, length, action) or (batch, sample, length, action).
+            in_place: Whether the given tensor may be changed.
+        """
+        points = self.point_bounds.fit(points, in_place=in_place)
+        return self._limit_changes(points) if self._matrix is None else points
+
+    def decode(self, points: Tensor) -> Tensor:
+        """Returns the actions (..., horizon, action) of clean points (..., length, action)."""
+        if self._matrix is None:
+            return points
+        actions = torch.einsum("hk,...ka->...ha", self._matrix, points)
+        if self.choices is not None:
+            held = torch.einsum("hk,...ka->...ha", self._hold, points)
+            actions = self.choices.join(actions, self.choices.snap(held))
+        return self._limit_changes(self.bounds.fit(actions))
+
+    def decode_var(self, var: Tensor) -> Tensor:
+        """Returns the variance of the actions, (batch, horizon, action), from that of a point."""
+        return var if self._matrix is None else torch.einsum("hk,...ka->...ha", self._matrix.square(), var)
+
+    def encode(self, actions: Tensor) -> Tensor:
+        """Returns the clean points (..., length, action) whose actions come closest to the given ones."""
+        if self._matrix is None:
+            return actions if self.is_plain else self.clean(actions)
+        points = torch.einsum("kh,...ha->...ka", self._inverse, actions)
+        if self.choices is not None:  # a mean of choices is no choice
+            points = self.choices.join(points, actions[..., self._steps, :])
+        return self.clean(points)
+
+    def at_points(self, value: Tensor) -> Tensor:
+        """Returns a value per step, (1 or batch, 1 or horizon, action), at the steps of a point."""
+        return value if self._steps is None or value.shape[1] == 1 else value[:, self._steps]
+
+    def _limit_changes(self, actions: Tensor) -> Tensor:
+        """Returns the actions with each change limited to `max_change`; the bounds prevail over the limit."""
+        if self.max_change is None:
+            return actions
+        limited: list[Tensor] = []
+        previous = self.last_action
+        if previous is not None and actions.ndim == 4:
+            previous = previous[:, None]
+        for step, action in enumerate(actions.unbind(dim=-2)):
+            if previous is not None:
+                near = torch.clamp(action, previous - self.max_change, previous + self.max_change)
+                near = torch.where(torch.isnan(previous), action, near)
+                low, high = (bound[:, None] if actions.ndim == 4 else bound for bound in self.bounds.at(step))
+                action = torch.clamp(near, low, high)
+            limited.append(action)
+            previous = action
+        return torch.stack(limited, dim=-2)
+
+
+@lru_cache(maxsize=32)
+def _spline_matrix(spline: str, horizon: int, num_knots: int) -> list[list[float]]:
+    """Returns the weight of each knot in each action, (horizon, knot).
+
+    `zero` holds each knot for an equal share of the horizon. `linear` and `cubic` have knots at equal distances from
+    the first action to the last; the slopes of the cubic spline at its knots are those of Catmull and Rom.
+    """
+    if spline == "zero" or num_knots == 1:
+        knot = torch.arange(horizon) * num_knots // horizon
+        return torch.nn.functional.one_hot(knot, num_knots).double().tolist()  # type: ignore[no-any-return]
+    time = torch.linspace(0, num_knots - 1, horizon, dtype=torch.float64)
+    left = time.floor().clamp(max=num_knots - 2).long()
+    part = (time - left)[:, None]
+    eye = torch.eye(num_knots, dtype=torch.float64)
+    before, after = eye[left], eye[left + 1]
+    if spline == "linear":
+        return ((1 - part) * before + part * after).tolist()  # type: ignore[no-any-return]
+    slopes = torch.gradient(eye, dim=0)[0]
+    basis = (2 * part**3 - 3 * part**2 + 1, part**3 - 2 * part**2 + part, 3 * part**2 - 2 * part**3, part**3 - part**2)
+    parts = zip(basis, (before, slopes[left], after, slopes[left + 1]), strict=True)
+    return torch.stack([weight * value for weight, value in parts]).sum(dim=0).tolist()  # type: ignore[no-any-return]

@@ -1,0 +1,390 @@
+"""`benchmark.py search`: the cost that planners of this and other libraries reach in closed loop.
+
+Every planner plays the same starts in the true dynamics of a problem: first with the same number of evaluated sequences
+per decision, then with as many iterations as fit into the same milliseconds (of processor time with one thread, which
+is the default; of time on the clock with more). This library's planners run with their defaults. Of other planners, the
+settings with the lowest cost on starts that are not reported are taken for each problem.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from statistics import fmean, median, stdev
+from typing import TYPE_CHECKING, Any
+
+from bench.options import ComputeRequest
+from bench.peers.install import FOLDER, PEERS, PeerError, install, installed_version
+from bench.report import format_interval, format_number, format_table, write_json
+from latentplan import __version__
+from latentplan.config import UserError
+from latentplan.config.checks import above_zero, at_least
+from latentplan.config.parsing import option, raise_unknown
+
+if TYPE_CHECKING:
+    from bench.peers.client import JsonProcess
+
+OURS = "latentplan"
+PROBLEM_NAMES = ("pendulum", "navigation", "lq", "push", "humanoid", "latent")
+BUDGETS = ("evaluations", "milliseconds")
+FIRST_TUNING_SEED = 100  # reported are seeds from 0 on
+WARM_UP = 3  # decisions before the timed ones
+TOLERANCE = 1.1  # a decision may take this many times the budget, because times vary
+
+
+@dataclass(frozen=True, kw_only=True)
+class Request(ComputeRequest):
+    """Flags of `benchmark.py search`.
+
+    Attributes:
+        problems: Control problems; `pendulum`, `navigation`, `lq`, `push`, `humanoid` and `latent`.
+        planners: Planners of this library, by the name of `make_planner`; `all`, or `none`.
+        peers: Other libraries, or `none`; each is installed on first use, in a Python environment apart from this one.
+        seeds: Number of starts, of seeds 0, 1, 2 and so on; every planner plays all of them.
+        tuning_seeds: Number of starts, of seeds 100, 101 and so on, on which settings of other planners are chosen.
+        budgets: What is the same for every planner: `evaluations`, `milliseconds`, or both, one after the other.
+        samples: Candidates per iteration.
+        iterations: Iterations per decision at equal evaluations.
+        budget_ms: Milliseconds per decision at equal time; None takes those of this library's first planner at equal
+            evaluations.
+        timed: Decisions of each planner that are timed, in turns.
+        jobs: Libraries that play at once; decisions are always timed alone.
+        earlier: Results of earlier calls with other planners or libraries, whose rows join the tables and the result.
+        json: Result as JSON.
+    """
+
+    problems: tuple[str, ...] = option(PROBLEM_NAMES, separator=",")
+    planners: tuple[str, ...] = option(("all",), separator=",")
+    peers: tuple[str, ...] = option(tuple(PEERS), separator=",")
+    seeds: int = 10
+    tuning_seeds: int = 3
+    budgets: tuple[str, ...] = option(BUDGETS, separator=",")
+    samples: int = 100
+    iterations: int = 3
+    budget_ms: float | None = None
+    timed: int = 20
+    jobs: int = 1
+    earlier: tuple[Path, ...] = option((), metavar="FILE,FILE", separator=",")
+    json: Path | None = option(None, metavar="FILE", is_output=True)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        at_least(self, seeds=2, tuning_seeds=1, samples=2, iterations=1, timed=1, jobs=1)
+        above_zero(self, "budget_ms")
+        for name in self.problems:
+            if name not in PROBLEM_NAMES:
+                raise_unknown("problem", name, PROBLEM_NAMES)
+        for name in self.budgets:
+            if name not in BUDGETS:
+                raise_unknown("budget", name, BUDGETS)
+        for name in () if self.peers == ("none",) else self.peers:
+            if name not in PEERS:
+                raise_unknown("peer", name, [*PEERS, "none"])
+
+
+@dataclass
+class Arm:
+    """A planner on a problem.
+
+    Attributes:
+        library: Name of the library.
+        planner: Name of the planner within it.
+        problem: Name of the problem.
+        process: The process of the library.
+        choices: Settings to choose from.
+        settings: The chosen settings.
+        tuning_cost: Mean cost of the chosen settings on the tuning seeds.
+    """
+
+    library: str
+    planner: str
+    problem: str
+    process: JsonProcess
+    choices: list[dict[str, Any]]
+    settings: dict[str, Any] = field(default_factory=dict)
+    tuning_cost: float = math.inf
+
+    def ask(self, do: str, iterations: int, request: Request, **given: Any) -> dict[str, Any]:
+        """The answer of the library's process.
+
+        Raises:
+            PeerError: The planner failed.
+        """
+        facts = {"do": do, "planner": self.planner, "problem": self.problem, "settings": self.settings, **given}
+        answer = self.process.ask({**facts, "samples": request.samples, "iterations": iterations})
+        if "error" in answer:
+            raise PeerError(answer["error"])
+        return answer
+
+    def choose(self, request: Request) -> None:
+        """Takes the settings with the lowest cost on the tuning seeds."""
+        seeds = range(FIRST_TUNING_SEED, FIRST_TUNING_SEED + request.tuning_seeds)
+        costs = []
+        for settings in self.choices:
+            self.settings = settings
+            cost = fmean(self.ask("run", request.iterations, request, seeds=list(seeds))["costs"])
+            costs.append(cost if math.isfinite(cost) else math.inf)
+        self.tuning_cost = min(costs)
+        self.settings = self.choices[costs.index(self.tuning_cost)]
+
+
+def run(request: Request) -> int:
+    """Plays every problem with every planner; prints a table and writes the result after each problem."""
+    request.use_device(1)
+    import torch
+
+    from bench.machine import describe_machine
+
+    earlier = [row for path in request.earlier for row in read_rows(path, request)]
+    rows: list[dict[str, Any]] = []
+    best: list[dict[str, Any]] = []
+    left_out: dict[str, str] = {}
+    with ExitStack() as stack:
+        libraries = start_libraries(request, stack, left_out)
+        others = [name for name in libraries if name != OURS]
+        facts = {
+            "versions": {OURS: __version__, **{name: installed_version(name, FOLDER) for name in others}},
+            "settings": {"samples": request.samples, "seeds": request.seeds, "tuning_seeds": request.tuning_seeds},
+            "machine": describe_machine(torch.device("cpu")),
+        }
+        listed = {name: process.ask({"do": "list"})["planners"] for name, process in libraries.items()}
+        listed[OURS] = select_planners(request, listed[OURS])
+        for problem in request.problems:
+            arms = [
+                Arm(library, planner, problem, libraries[library], choices)
+                for library, planners in listed.items()
+                for planner, choices in planners.items()
+            ]
+            found = compare(arms, request, left_out) + [row for row in earlier if row["problem"] == problem]
+            rows += found
+            print(f"\n{problem}, {request.seeds} seeds\n{cost_table(found)}", flush=True)
+            best += compare_best(rows, problem)
+            write_json(request.json, {"rows": rows, "best": best, "left_out": left_out, **facts})
+    print("\n" + best_table(best))
+    return 0
+
+
+def start_libraries(request: Request, stack: ExitStack, left_out: dict[str, str]) -> dict[str, JsonProcess]:
+    """The process of each library that can take part; the reason is printed for each that cannot."""
+    from bench.peers.client import JsonProcess
+
+    FOLDER.parent.mkdir(parents=True, exist_ok=True)
+    threads = str(request.threads or 1)
+    own = ["-m", "bench.controllers.own", threads]
+    libraries = {OURS: JsonProcess(Path(sys.executable), own, FOLDER.parent / f"{OURS}.log")}
+    stack.callback(libraries[OURS].close)
+    for name in () if request.peers == ("none",) else request.peers:
+        with _left_out_on_error(name, left_out):
+            python = install(name, FOLDER)
+            process = JsonProcess(python, ["-m", PEERS[name].controllers, threads], FOLDER / f"{name}.search.log")
+            stack.callback(process.close)
+            process.ask({"do": "list"})
+            libraries[name] = process
+    return libraries
+
+
+def read_rows(path: Path, request: Request) -> list[dict[str, Any]]:
+    """The rows of an earlier result.
+
+    Raises:
+        UserError: The file holds no result with the same seeds.
+    """
+    try:
+        rows: list[dict[str, Any]] = json.loads(path.read_text())["rows"]
+        seeds = {len(row["costs"]) for row in rows}
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise UserError(f"--earlier {path}: no result of this benchmark: {error}") from None
+    if seeds - {request.seeds}:
+        raise UserError(f"--earlier {path} has {seeds.pop()} seeds, this call {request.seeds}")
+    return rows
+
+
+def select_planners(request: Request, known: dict[str, Any]) -> dict[str, Any]:
+    """This library's planners that take part.
+
+    Raises:
+        UserError: A planner is unknown.
+    """
+    if request.planners in (("all",), ("none",)):
+        return known if request.planners == ("all",) else {}
+    for name in request.planners:
+        if name not in known:
+            raise_unknown("planner", name, [*known, "all", "none"])
+    return {name: known[name] for name in request.planners}
+
+
+def compare(arms: Sequence[Arm], request: Request, left_out: dict[str, str]) -> list[dict[str, Any]]:
+    """The rows of one problem: each planner at equal evaluations, then at equal milliseconds."""
+
+    def each(task: Callable[[Arm], Any], among: Sequence[Arm]) -> dict[int, Any]:
+        """Results of a task by the arm's identity; libraries work at once, the arms of a library one by one."""
+        results: dict[int, Any] = {}
+
+        def do_library(library: str) -> None:
+            for arm in [arm for arm in among if arm.library == library]:
+                with _left_out_on_error(f"{arm.library} {arm.planner} on {arm.problem}", left_out):
+                    results[id(arm)] = task(arm)
+
+        with ThreadPoolExecutor(request.jobs) as pool:
+            list(pool.map(do_library, dict.fromkeys(arm.library for arm in among)))
+        return results
+
+    def play(counts: dict[int, int], among: Sequence[Arm]) -> dict[int, Any]:
+        seeds = list(range(request.seeds))
+        return each(lambda arm: arm.ask("run", counts[id(arm)], request, seeds=seeds), among)
+
+    each(lambda arm: arm.choose(request), arms)
+    base = {id(arm): request.iterations for arm in arms}
+    equal = play(base, arms)
+    arms = [arm for arm in arms if id(arm) in equal]
+    if not arms:
+        return []
+    times = take_turns(arms, base, request)
+    rows = [make_row("evaluations", arm, equal, base, times) for arm in arms]
+    if "milliseconds" not in request.budgets:
+        return rows
+    counts = fit_counts(arms, request.budget_ms or times[id(arms[0])], times, request)
+    timely = {**equal, **play(counts, [arm for arm in arms if counts[id(arm)] != request.iterations])}
+    arms = [arm for arm in arms if id(arm) in timely]
+    times = take_turns(arms, counts, request)
+    rows = rows if "evaluations" in request.budgets else []
+    return rows + [make_row("milliseconds", arm, timely, counts, times) for arm in arms]
+
+
+def fit_counts(arms: Sequence[Arm], budget_ms: float, times: dict[int, float], request: Request) -> dict[int, int]:
+    """The number of iterations of each arm that fits into a time; measured, and corrected once.
+
+    Args:
+        arms: The arms.
+        budget_ms: Milliseconds of a decision.
+        times: Milliseconds of a decision with `request.iterations`, by the arm's identity.
+        request: The flags.
+    """
+    single = take_turns(arms, {id(arm): 1 for arm in arms}, request)
+    counts = {id(arm): request.iterations for arm in arms}
+    for _ in range(2):
+        counts = {key: fit_iterations(budget_ms, single[key], times[key], count) for key, count in counts.items()}
+        times = take_turns(arms, counts, request)
+    return counts
+
+
+def fit_iterations(budget_ms: float, one_ms: float, all_ms: float, iterations: int) -> int:
+    """The largest number of iterations that fits into a time, up to `TOLERANCE`, at least 1.
+
+    Args:
+        budget_ms: The time.
+        one_ms: Milliseconds of a decision with one iteration.
+        all_ms: Milliseconds of a decision with `iterations`.
+        iterations: A number of iterations; with 1, time is taken as proportional.
+    """
+    each_ms = (all_ms - one_ms) / (iterations - 1) if iterations > 1 else one_ms
+    if each_ms <= 0.0:
+        return iterations
+    return max(1, int((TOLERANCE * budget_ms - one_ms) / each_ms + 1.0))
+
+
+def take_turns(arms: Sequence[Arm], counts: dict[int, int], request: Request) -> dict[int, float]:
+    """Median milliseconds of a decision of each arm, timed in turns so that a busy machine slows down all of them."""
+    laps: dict[int, list[float]] = {id(arm): [] for arm in arms}
+    for _ in range(WARM_UP + request.timed):
+        for arm in arms:
+            laps[id(arm)].append(arm.ask("time", counts[id(arm)], request)["ms"])
+    return {key: median(values[WARM_UP:]) for key, values in laps.items()}
+
+
+def make_row(
+    budget: str,
+    arm: Arm,
+    played: dict[int, Any],
+    counts: dict[int, int],
+    times: dict[int, float],
+) -> dict[str, Any]:
+    """One row of the result."""
+    costs = played[id(arm)]["costs"]
+    return {
+        "problem": arm.problem,
+        "planner": arm.planner,
+        "library": arm.library,
+        "budget": budget,
+        "cost_mean": fmean(costs),
+        "cost_sd": stdev(costs),
+        "evaluations": played[id(arm)]["evaluations"],
+        "ms_p50": times[id(arm)],
+        "iterations": counts[id(arm)],
+        "settings": arm.settings,
+        "tuning_cost": arm.tuning_cost,
+        "costs": costs,
+    }
+
+
+def compare_best(rows: Sequence[dict[str, Any]], problem: str) -> Iterator[dict[str, Any]]:
+    """Of each budget, the best planner of this and of other libraries, and the difference, paired over the seeds.
+
+    The best planners are those with the lowest cost on the tuning seeds at equal evaluations.
+    """
+    from latentplan.evaluation.statistics import confidence_interval
+
+    for budget in BUDGETS:
+        here = [row for row in rows if row["problem"] == problem and row["budget"] == budget]
+        own = [row for row in here if row["library"] == OURS]
+        peers = [row for row in here if row["library"] != OURS]
+        if own and peers:
+            ours, peer = (min(side, key=lambda row: row["tuning_cost"]) for side in (own, peers))
+            differences = [left - right for left, right in zip(ours["costs"], peer["costs"], strict=True)]
+            yield {
+                "problem": problem,
+                "budget": budget,
+                "ours": ours["planner"],
+                "ours_cost": ours["cost_mean"],
+                "peer": f"{peer['library']} {peer['planner']}",
+                "peer_cost": peer["cost_mean"],
+                "difference": fmean(differences),
+                "ci95": list(confidence_interval(differences)),
+            }
+
+
+def cost_table(rows: Sequence[dict[str, Any]]) -> str:
+    """The rows of one problem as a text table: a line for each planner, both budgets side by side."""
+    planners: dict[tuple[str, str], dict[str, Any]] = {}
+    for row in rows:
+        planners.setdefault((row["library"], row["planner"]), {})[row["budget"]] = row
+    lines = [
+        [" ".join(name), *(cell for budget in BUDGETS for cell in _cells(found.get(budget)))]
+        for name, found in planners.items()
+    ]
+    columns = ["cost", "sd", "sequences", "ms p50"]
+    return format_table(["planner", *columns, *(f"{name}, equal ms" for name in columns)], lines)
+
+
+def best_table(best: Sequence[dict[str, Any]]) -> str:
+    """The best planners of both sides as a text table; empty without other libraries."""
+    if not best:
+        return "no other library took part"
+    lines = [
+        [f"{row['problem']}, equal {row['budget']}", row["ours"], format_number(row["ours_cost"], 2), row["peer"]]
+        + [format_number(row["peer_cost"], 2), format_number(row["difference"], 2, sign=True)]
+        + [format_interval(row["ci95"], 2, sign=True)]
+        for row in best
+    ]
+    return format_table(["problem", "best of ours", "cost", "best other", "cost", "difference", "95 %"], lines)
+
+
+def _cells(row: dict[str, Any] | None) -> list[str]:
+    digits = {"cost_mean": 2, "cost_sd": 2, "evaluations": 0, "ms_p50": 1}
+    return [format_number(row[key] if row else None, number) for key, number in digits.items()]
+
+
+@contextmanager
+def _left_out_on_error(name: str, left_out: dict[str, str]) -> Iterator[None]:
+    """Records and prints the reason if a planner cannot take part; the caller goes on without it."""
+    try:
+        yield
+    except PeerError as error:
+        left_out[name] = str(error)
+        print(f"{name} left out: {error}", flush=True)
