@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 import hashlib
 import json
 from pathlib import Path
@@ -15,12 +14,15 @@ from safetensors.torch import load_file, save
 from latentplan.agents.base import Agent
 from latentplan.agents.modes import MODES, make_agent
 from latentplan.config import Config, PlannerConfig, UserError, from_dict, to_dict
+from latentplan.config.checks import nearest, shown
 from latentplan.config.planner import override_planner
+from latentplan.config.reading import parse_json, read_text
 from latentplan.models import WorldModel
 from latentplan.models.fast import accelerate
 
 WEIGHTS = "weights.safetensors"
 INFO = "info.json"
+LARGEST_INFO = 2**24  # bytes; a description with the metrics of a long run has some hundred thousand
 VALUE_TYPES = {
     "env_frames": int,
     "action_dim": int,
@@ -69,16 +71,13 @@ def read_info(path: str | Path) -> dict[str, Any]:
         UserError: There is no checkpoint at the path, or another program wrote it.
     """
     folder = resolve_checkpoint(path)
-    try:
-        info = json.loads((folder / INFO).read_text())
-    except (OSError, ValueError) as error:
-        raise UserError(f"{folder / INFO} cannot be read: {error}") from None
+    info = parse_json(read_text(folder / INFO, LARGEST_INFO), folder / INFO)
     missing = [key for key in REQUIRED_KEYS if not isinstance(info, dict) or key not in info]
     if missing:
         raise UserError(f"{folder} is not a latentplan checkpoint: {INFO} lacks {', '.join(missing)}")
     for key, kinds in VALUE_TYPES.items():
         if not isinstance(info.get(key), kinds):
-            raise UserError(f"{folder / INFO} cannot be used: {key} is {info.get(key)!r}")
+            raise UserError(f"{folder / INFO} cannot be used: {key} is {shown(info.get(key))}")
     return info
 
 
@@ -139,7 +138,7 @@ def load_agent(path: str | Path, mode: str = "planner", device: str = "cpu", **s
         UserError: The checkpoint, the mode or a setting cannot be used.
     """
     if mode not in MODES:
-        raise UserError(f"mode must be one of {', '.join(MODES)}, got {mode!r}")
+        raise UserError(f"mode must be one of {', '.join(MODES)}, got {shown(mode)}")
     entry = MODES[mode]
     options = {name: settings.pop(name) for name in entry.options if name in settings}
     if settings and not entry.plans:
@@ -193,7 +192,7 @@ def _find_checkpoint(root: Path) -> Path | None:
 
 def _suggestion(name: str, known: dict[str, str]) -> str:
     """The end of an error message about a name: the nearest known name, else all known names."""
-    nearest = difflib.get_close_matches(name, known, n=1)
-    if nearest:
-        return f"; did you mean {known[nearest[0]]}?"
+    similar = nearest(name, known, cutoff=0.6)
+    if similar:
+        return f"; did you mean {known[similar]}?"
     return f"; available: {', '.join(known.values())}" if known else ""

@@ -300,8 +300,11 @@ def read_saved(path: Path, device: torch.device | str = "cpu", keys: Sequence[st
         if keys and not (isinstance(saved, dict) and set(keys) <= set(saved)):
             raise ValueError(f"it does not hold {', '.join(keys)}")
         return saved
-    except (OSError, RuntimeError, EOFError, KeyError, ValueError, UnpicklingError) as error:
-        raise UserError(f"{path} is damaged: {str(error).splitlines()[0]}") from None
+    except UnpicklingError:  # torch would advise to load the file as a program, which runs what a stranger wrote
+        raise UserError(f"{path} is damaged: it does not hold numbers and texts alone") from None
+    except (OSError, RuntimeError, EOFError, KeyError, ValueError, IndexError) as error:
+        reason = (str(error).splitlines() or ["it ends too early"])[0]
+        raise UserError(f"{path} is damaged: {reason}") from None
 
 
 def count_replay_bytes(num_rows: int, action_dim: int, deter_dim: int, num_labels: int = 0) -> int:
