@@ -15,10 +15,12 @@ from latentplan.agents.base import Agent
 from latentplan.agents.modes import MODES, make_agent
 from latentplan.config import Config, PlannerConfig, UserError, from_dict, to_dict
 from latentplan.config.checks import nearest, shown
+from latentplan.config.estimates import check_parts, estimate_model, estimate_search
 from latentplan.config.planner import override_planner
 from latentplan.config.reading import parse_json, read_text
 from latentplan.models import WorldModel
 from latentplan.models.fast import accelerate
+from latentplan.replay.memory import free_memory
 
 WEIGHTS = "weights.safetensors"
 INFO = "info.json"
@@ -103,6 +105,7 @@ def load_model(path: str | Path, device: str = "cpu") -> tuple[WorldModel, Confi
         config = from_dict(info["config"])
     except (AttributeError, TypeError, ValueError) as error:
         raise UserError(f"the settings in {folder / INFO} cannot be used: {error}") from None
+    check_parts([estimate_model(config.model, action_dim=info["action_dim"])], free_memory())
     try:
         model = WorldModel(config.model, info["action_dim"], info.get("labels"), info.get("goal_dim") or 0)
         state = {name: value.float() for name, value in load_file(weights).items()}
@@ -151,6 +154,8 @@ def load_agent(path: str | Path, mode: str = "planner", device: str = "cpu", **s
             raise UserError(f"unknown planner setting {name!r}{_suggestion(name, {key: key for key in names})}")
     try:
         planner = PlannerConfig(**override_planner(known, settings))
+        if entry.plans:
+            check_parts([estimate_search(planner, config.model, device != "cpu")], free_memory())
         agent = make_agent(mode, model, config, info["discount"], planner=planner, **options)
     except (TypeError, ValueError) as error:
         raise UserError(f"planner settings: {error}") from None

@@ -13,7 +13,8 @@ from typing import Any
 
 from latentplan.config import MAX_THREADS, Config, Device, PlannerConfig, UserError, from_dict, to_dict
 from latentplan.config.checks import EnvironmentFault, cut, shown, within
-from latentplan.config.files import build_config
+from latentplan.config.estimates import check_parts, estimate_search
+from latentplan.config.files import build_config, has_cuda
 from latentplan.config.parsing import option
 from latentplan.config.planner import override_planner
 
@@ -21,7 +22,8 @@ from latentplan.config.planner import override_planner
 def run_guarded(command: Callable[[Sequence[str]], int], argv: Sequence[str]) -> int:
     """The exit code of a command: 2 after a mistake of the user, which becomes one line on stderr.
 
-    A failed environment gives one line and the environment's own traceback. An interrupt gives 130. A reader that closes the output early, as in `train.py --help | head`, gives 141.
+    A failed environment gives one line and the environment's own traceback. An interrupt gives 130. A reader that
+    closes the output early, as in `train.py --help | head`, gives 141.
     """
     try:
         try:
@@ -106,13 +108,22 @@ def saved_config(checkpoint: Path, info: Mapping[str, Any]) -> Config:
         raise UserError(f"{checkpoint} has settings of another version: {error}") from None
 
 
-def search_settings(saved: PlannerConfig, given: Mapping[str, Any]) -> PlannerConfig:
+def search_settings(saved: Config, given: Mapping[str, Any]) -> PlannerConfig:
     """The settings of a checkpoint's search with the given ones in their place.
 
+    Args:
+        saved: All settings of the checkpoint.
+        given: Settings of the search that were given, by name.
+
     Raises:
-        UserError: A given value is not allowed beside the saved ones.
+        UserError: A given value is not allowed beside the saved ones, or this machine cannot serve the search.
     """
-    return build_config({"planner": override_planner(to_dict(saved), given)}).planner
+    from latentplan.replay.memory import free_memory
+
+    settings = build_config({"planner": override_planner(to_dict(saved.planner), given)}).planner
+    if given:
+        check_parts([estimate_search(settings, saved.model, has_cuda())], free_memory())
+    return settings
 
 
 @dataclass(frozen=True, kw_only=True)

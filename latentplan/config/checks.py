@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 MAX_THREADS = 1024  # more threads would exhaust the machine
+MAX_EPISODES = 1_000_000
 SHOWN = 60  # characters of a wrong value that an error repeats
 LONGEST_WORD = 200  # characters without a space that an error repeats, such as a path
 LONGEST_LINE = 1000  # a longer message repeats input, and is cut to `LONGEST_WORD`
@@ -143,6 +144,14 @@ def within(config: Any, **bounds: tuple[float, float]) -> None:
     """Require fields to lie in a closed interval."""
     for name, (low, high) in bounds.items():
         _require(config, name, low <= getattr(config, name) <= high, f"in [{low}, {high}]")
+
+
+def between(config: Any, **bounds: tuple[float, float]) -> None:
+    """Require fields to be at least the first bound and at most the second."""
+    for name, (low, high) in bounds.items():
+        value = getattr(config, name)
+        _require(config, name, value >= low, f"at least {low}")
+        _require(config, name, value <= high, f"at most {high}")
 
 
 def one_of(config: Any, **choices: tuple[str, ...]) -> None:

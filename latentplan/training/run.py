@@ -26,6 +26,7 @@ from latentplan.training.callbacks import Collect, Record, Restore, Save, Stop, 
 from latentplan.training.collection.collector import Description, EnvFactory
 from latentplan.training.collection.process import Worker, make_worker
 from latentplan.training.console import Progress
+from latentplan.training.estimates import check_run
 from latentplan.training.learner.batches import ReplayBatches, ReplayData
 from latentplan.training.learner.curriculum import Curriculum
 from latentplan.training.learner.graphed import make_learner
@@ -130,6 +131,7 @@ def resume(
 
 
 def _start(config: Config, folder: Path, make_env: EnvFactory | None, *, resume: bool) -> Result:
+    check_run(config)
     with lock_folder(folder):
         run = _Run(config, folder, make_env, resume=resume)
         dump_config(config, folder / "config.yaml")
