@@ -94,8 +94,7 @@ class _Applied(torch.autograd.Function):
             name: torch.empty(len(flat), size, dtype=kernels.half) for name, size in zip(_HALVES, sizes, strict=True)
         }
         kept |= {
-            name: torch.empty(len(flat), size, dtype=kernels.real)
-            for name, size in zip(_REALS, sizes[1:], strict=True)
+            name: torch.empty(len(flat), size, dtype=kernels.real) for name, size in zip(_REALS, sizes[1:], strict=True)
         }
         results = torch.empty(len(flat), layers[2].outputs, dtype=kernels.real)
         ctx.network = network = _Network(*layers, len(flat))
