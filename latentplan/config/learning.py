@@ -114,6 +114,10 @@ class CollectionConfig:
         round_decisions: Decisions of a round; a round is collected, then learned from.
         updates_per_decision: Updates per collected decision (the replay ratio, in updates).
         overlap: Whether the next round is collected in another process, on the CPU, while this round is learned from.
+        max_restarts: Restarts of environments that fail (an exception, a crash, a hang, a frame or reward that is not
+            as declared) before the run saves and stops. Each fault cuts one episode short.
+        step_timeout_s: Seconds that a reset or a step may take of an environment in a process of its own: of several
+            environments, and of one that is not of `dm_control` while `overlap` holds.
     """
 
     behaviour: Behaviour = "both"
@@ -127,6 +131,8 @@ class CollectionConfig:
     round_decisions: int = 250
     updates_per_decision: float = 0.5
     overlap: bool = True
+    max_restarts: int = 10
+    step_timeout_s: float = 60.0
 
     def __post_init__(self) -> None:
         one_of(self, behaviour=BEHAVIOURS)
@@ -136,6 +142,8 @@ class CollectionConfig:
             raise ValueError("goal_share needs goals; name at least one expression in collection.goals")
         if self.goals and self.goal_share == 0.0:
             raise ValueError("goals need a goal_share above 0: the share of rounds in which they are pursued")
+        at_least(self, max_restarts=0)
+        within(self, step_timeout_s=(0.01, 86_400.0))
         above_zero(self, "updates_per_decision", "episode_decisions")
 
 

@@ -49,11 +49,13 @@ class Collect(lightning.Callback):
     Attributes:
         episode_returns: Returns of the episodes that ended since the last row of metrics.
         evaluated_weights: Weights that the latest evaluation measured.
+        env_restarts: Environments that were made anew after a fault, since the run was started or resumed.
     """
 
     def __init__(self, config: Config, replay: Replay, state: RunState, worker: Worker, videos: Path) -> None:
         self.config, self.replay, self.state, self.worker, self.videos = config, replay, state, worker, videos
         self.episode_returns: list[float] = []
+        self.env_restarts = 0
         self.evaluated_weights: dict[str, np.ndarray] = {}
         self._pending_evaluation: tuple[dict[str, Any], dict[str, np.ndarray]] | None = None  # its clocks and weights
         self._is_round_pending = False
@@ -142,6 +144,9 @@ class Collect(lightning.Callback):
         self.state.decisions += collected.decisions
         self.state.rounds += 1
         self.episode_returns.extend(collected.episode_returns)
+        self.env_restarts = collected.restarts
+        if collected.fault is not None:
+            raise collected.fault
 
 
 def copy_weights(model: WorldModel) -> dict[str, np.ndarray]:
@@ -259,6 +264,8 @@ class Record(lightning.Callback):
             self.collect.episode_returns.clear()
         for name in sorted(learner.metrics, key=lambda name: name.endswith("_grad_norm")):  # losses, then the norms
             row[name] = float(learner.metrics[name])
+        if self.collect.env_restarts:
+            row["env_restarts"] = self.collect.env_restarts
         self._append(trainer, row)
 
     def write_evaluations(self, trainer: lightning.Trainer) -> None:

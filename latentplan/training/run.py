@@ -16,7 +16,7 @@ import torch
 from lightning.pytorch.loggers import TensorBoardLogger
 
 from latentplan.agents.checkpoint import load_model
-from latentplan.config import USER_DOMAIN, Config, Device, UserError, derive_seed
+from latentplan.config import USER_DOMAIN, Config, Device, EnvironmentFault, UserError, derive_seed
 from latentplan.config.files import dump_config, read_config
 from latentplan.envs import default_task
 from latentplan.models import WorldModel
@@ -205,6 +205,9 @@ class _Run:
             self.console.start(self.learner.updates)
             try:
                 trainer.fit(self.learner, datamodule=ReplayData(batches))
+            except EnvironmentFault as fault:
+                save.save(trainer, self.learner)
+                raise EnvironmentFault(f"{fault}; the run is saved in {self.folder}", fault.origin) from None
             finally:
                 self.console.stop()
             if not self.state.interrupted:

@@ -14,7 +14,7 @@ from typing import Any
 import torch
 from gymnasium.vector.utils import CloudpickleWrapper
 
-from latentplan.config import Config, UserError
+from latentplan.config import Config, EnvironmentFault, UserError
 from latentplan.envs import single_threaded_children
 from latentplan.training.collection.collector import CLOSING_SECONDS, Collector, EnvFactory
 from latentplan.training.resources import choose_collector_threads
@@ -59,7 +59,7 @@ class RemoteWorker:
         context = multiprocessing.get_context("spawn")
         self._connection, child_end = context.Pipe()
         arguments = (child_end, make_user_env and CloudpickleWrapper(make_user_env), config, threads)
-        self._process = context.Process(target=_serve, args=arguments, daemon=config.env.num_envs == 1)
+        self._process = context.Process(target=_serve, args=arguments, daemon=False)
         with single_threaded_children():
             self._process.start()
         child_end.close()
@@ -85,7 +85,7 @@ class RemoteWorker:
             code = self._process.exitcode
             raise RuntimeError(f"the collection process ended unexpectedly (exit code {code})") from None
         if kind == "user_error":
-            raise UserError(value)
+            raise value
         if kind == "error":
             raise RuntimeError(f"collection failed:\n{value}")
         return value
@@ -133,6 +133,6 @@ def _serve(connection: Connection, make_user_env: EnvFactory | None, config: Con
                 collector = Collector(config, make_user_env, "cpu")
             connection.send(("ok", getattr(collector, method)(*arguments)))
         except UserError as error:
-            connection.send(("user_error", str(error)))
+            connection.send(("user_error", error if isinstance(error, EnvironmentFault) else UserError(str(error))))
         except Exception:
             connection.send(("error", traceback.format_exc()))
