@@ -22,6 +22,9 @@ COMMANDS = {
     "zero-shot": Command("bench.zero_shot", "goals that an agent was not trained for: planner, actor, random actions"),
     "realtime": Command("bench.realtime", "return and time by iterations, control rates, prediction and re-planning"),
     "soak": Command("bench.soak", "deadlines that agents and an idle loop miss on the wall clock"),
+    "hostile": Command(
+        "bench.hostile", "hostile command lines and files: refused in one line, and in how many seconds"
+    ),
     "learn": Command("bench.learn", "learning curves over tasks and seeds: frames and minutes to a return"),
 }
 

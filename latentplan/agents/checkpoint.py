@@ -196,8 +196,8 @@ def _find_checkpoint(root: Path) -> Path | None:
 
 
 def _suggestion(name: str, known: dict[str, str]) -> str:
-    """The end of an error message about a name: the nearest known name, else all known names."""
+    """The end of an error message about a name: the nearest known name, else the first twenty known names."""
     similar = nearest(name, known, cutoff=0.6)
     if similar:
         return f"; did you mean {known[similar]}?"
-    return f"; available: {', '.join(known.values())}" if known else ""
+    return f"; available: {', '.join(list(known.values())[:20])}" if known else ""

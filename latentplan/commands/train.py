@@ -45,9 +45,9 @@ class Request:
 def run(request: Request) -> int:
     """Train or resume, and return the exit code."""
     config = resolve(request)
-    from latentplan.training.estimates import check_run
+    from latentplan.training.checks import check_settings
 
-    check_run(config)
+    check_settings(config)
     from latentplan.training import resume, train
 
     if request.resume is None:

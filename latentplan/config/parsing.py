@@ -19,6 +19,7 @@ from pathlib import Path
 from typing import Any
 
 from latentplan.config.checks import UserError, nearest, shown
+from latentplan.config.reading import is_shallow
 
 _TYPE_WORDS = {
     int: "a whole number",
@@ -138,7 +139,8 @@ def raise_unknown(kind: str, name: str, known: Iterable[str]) -> typing.NoReturn
 
 def _is_text(setting: Setting, values: Mapping[str, Any]) -> bool:
     """Whether a value is text for a setting that takes any text, so that nothing has to be parsed."""
-    return setting.hint is str and isinstance(values.get(setting.key), str)
+    value = values.get(setting.key)
+    return setting.hint is str and isinstance(value, str) and "\0" not in value
 
 
 def _parse_values(given: Sequence[Setting], values: Mapping[str, Any], names: Mapping[str, str]) -> dict[str, Any]:
@@ -146,6 +148,10 @@ def _parse_values(given: Sequence[Setting], values: Mapping[str, Any], names: Ma
 
     from jsonargparse import ArgumentParser
 
+    for setting in given:
+        value = values[setting.key]
+        if isinstance(value, str) and ("\0" in value or not is_shallow(value)):
+            raise _wrong_type(setting, values, names)
     _register_numbers()
     parser = ArgumentParser(exit_on_error=False)
     for index, setting in enumerate(given):

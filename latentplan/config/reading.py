@@ -60,7 +60,8 @@ def read_yaml(path: Path) -> Any:
     text = read_text(path)
     loader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
     try:
-        _check_events(path, yaml.parse(text, Loader=loader))
+        if (reason := _find_excess(text)) is not None:
+            raise UserError(f"cannot read {path}: {reason}")
         return yaml.load(text, Loader=loader)  # a safe loader makes plain values only
     except yaml.YAMLError as error:
         mark = getattr(error, "problem_mark", None)
@@ -91,14 +92,28 @@ def parse_json(text: str, path: Path | str) -> Any:
         raise UserError(f"{path} cannot be read: {reason}") from None
 
 
-def _check_events(path: Path, events: Any) -> None:
-    """Refuses nesting and aliases, which make small files large or deep, before values are made."""
+def is_shallow(text: str) -> bool:
+    """Whether a text that may be YAML can be parsed without a deep stack."""
+    import yaml
+
+    try:
+        return _find_excess(text) is None
+    except (ValueError, yaml.YAMLError):
+        return True  # the parser stops at the same place, before the text is deep
+
+
+def _find_excess(text: str) -> str | None:
+    """Why a YAML text may not be parsed: nesting and aliases make small texts deep or large; None if it may.
+
+    Events are read one by one, without recursion. A parser that builds values recurses, in C without a limit.
+    """
     import yaml
 
     depth = 0
-    for event in events:
+    for event in yaml.parse(text, Loader=getattr(yaml, "CSafeLoader", yaml.SafeLoader)):
         if isinstance(event, yaml.AliasEvent):
-            raise UserError(f"{path} has an alias (*{event.anchor}); write the value out")
+            return f"it has an alias (*{event.anchor}); write the value out"
         depth += isinstance(event, yaml.CollectionStartEvent) - isinstance(event, yaml.CollectionEndEvent)
         if depth > DEEPEST:
-            raise UserError(f"cannot read {path}: it is nested more than {DEEPEST} levels deep")
+            return f"it is nested more than {DEEPEST} levels deep"
+    return None

@@ -23,10 +23,10 @@ from latentplan.models import WorldModel
 from latentplan.models.fast import accelerate
 from latentplan.replay.buffer import Replay
 from latentplan.training.callbacks import Collect, Record, Restore, Save, Stop, copy_weights
+from latentplan.training.checks import check_settings
 from latentplan.training.collection.collector import Description, EnvFactory
 from latentplan.training.collection.process import Worker, make_worker
 from latentplan.training.console import Progress
-from latentplan.training.estimates import check_run
 from latentplan.training.learner.batches import ReplayBatches, ReplayData
 from latentplan.training.learner.curriculum import Curriculum
 from latentplan.training.learner.graphed import make_learner
@@ -131,7 +131,7 @@ def resume(
 
 
 def _start(config: Config, folder: Path, make_env: EnvFactory | None, *, resume: bool) -> Result:
-    check_run(config)
+    check_settings(config)
     with lock_folder(folder):
         run = _Run(config, folder, make_env, resume=resume)
         dump_config(config, folder / "config.yaml")
