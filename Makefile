@@ -1,14 +1,16 @@
 # `make train` and `make test` set up everything they need; `make train ARGS="--domain cartpole --minutes 5"`.
 # `make docs` builds the documentation into build/docs.
-# `make soak` fuzzes for long; `make soak ARGS="--checkpoint DIR"` counts missed deadlines on the wall clock.
+# `make fuzz` draws thousands of examples for each property test; `make audit` asks for known vulnerabilities.
+# `make soak` fuzzes planners for long; `make soak ARGS="--checkpoint DIR"` counts missed deadlines on the wall clock.
 
 PYTHON ?= python3 python3.11 python3.12 python3.13
 ARGS ?=
 BIN := .venv/bin
+FUZZED := $(wildcard tests/*/test_*_properties.py)
 STAMP := .venv/.installed
 DOCS_STAMP := .venv/.docs-installed
 
-.PHONY: setup train test test-all check doctor bench soak docs clean
+.PHONY: setup train test test-all check audit fuzz doctor bench soak docs clean
 
 setup: $(STAMP)
 
@@ -25,6 +27,13 @@ check: test-all
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
+	@$(MAKE) --no-print-directory audit
+
+audit: $(STAMP)
+	@$(BIN)/python scripts/audit.py
+
+fuzz: $(STAMP)
+	$(BIN)/python -m pytest -n auto -m "" --hypothesis-profile=fuzz $(FUZZED) $(ARGS)
 
 doctor: $(STAMP)
 	@$(BIN)/python -m latentplan doctor
