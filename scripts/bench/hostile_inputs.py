@@ -10,6 +10,7 @@ import os
 import shutil
 import struct
 from pathlib import Path
+from typing import Any
 
 LONG = "a" * 100_000
 MARK = "executed"  # a file of this name in the folder shows that an input was executed
@@ -207,8 +208,8 @@ def list_cases() -> dict[str, tuple[str, ...]]:
             cases[f"eval {setting} {index}"] = (*AGENT, "{agent}", f"--planner.{setting}", value)
     for flag, values in FLAGS.items():
         for index, value in enumerate(values):
-            words = () if flag == "--resume" else TRAIN
-            cases[f"train {flag} {index}"] = (*(words or ("train",)), flag, value)
+            given = TRAIN[:1] if flag == "--resume" else TRAIN
+            cases[f"train {flag} {index}"] = (*given, flag, value)
     for flag, values in EVALUATION.items():
         for index, value in enumerate(values):
             needed = ("--control-hz", "50") if flag == "--latency" else ()
@@ -271,5 +272,5 @@ def _damage(copy: Path, agent: Path, info: str | bytes | None, weights: bytes | 
             os.mkfifo(path)
 
 
-def _changed(info: dict[str, dict[str, dict[str, object]]], section: str, **values: object) -> dict[str, object]:
-    return info["config"] | {section: info["config"][section] | values}
+def _changed(info: dict[str, Any], section: str, **values: Any) -> dict[str, Any]:
+    return {**info["config"], section: {**info["config"][section], **values}}

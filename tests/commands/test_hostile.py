@@ -56,3 +56,12 @@ def test_every_hostile_input_is_refused_in_one_line(inputs, folder, checkpoint, 
             wrong.append(f"{name}: exit code {code}, {len(err)} characters: {err[:300]}")
     assert not wrong, "\n".join(wrong)
     assert not (folder / inputs.MARK).exists() and not (folder / "run").exists()
+
+
+def test_benchmark_tries_an_input_in_a_program_of_its_own(inputs, folder, root, monkeypatch):
+    monkeypatch.syspath_prepend(str(root / "scripts"))
+    from bench.hostile import try_input
+
+    refused = try_input("text", ["train", "--config", str(folder / "text.yaml")], folder)
+    assert refused.problem == "" and "must hold sections" in refused.output and refused.processor_seconds > 0.0
+    assert try_input("help", ["--help"], folder).problem == "exit code 0"
