@@ -299,8 +299,8 @@ def read_saved(path: Path, device: torch.device | str = "cpu", keys: Sequence[st
         if keys and not (isinstance(saved, dict) and set(keys) <= set(saved)):
             raise ValueError(f"it does not hold {', '.join(keys)}")
         return saved
-    except UnpicklingError:  # torch would advise to load the file as a program, which runs what a stranger wrote
-        raise UserError(f"{path} is damaged: it does not hold numbers and texts alone") from None
-    except (OSError, RuntimeError, EOFError, KeyError, ValueError, IndexError) as error:
-        reason = (str(error).splitlines() or ["it ends too early"])[0]
+    except UnpicklingError:  # torch's message would advise to run what the file says
+        raise UserError(f"{path} is damaged: it holds more than tensors and plain values") from None
+    except (OSError, RuntimeError, EOFError, KeyError, IndexError, ValueError) as error:
+        reason = (str(error).splitlines() or ["it ends too early"])[0][:120]
         raise UserError(f"{path} is damaged: {reason}") from None

@@ -15,7 +15,7 @@ import numpy as np
 import torch
 
 from latentplan.agents.checkpoint import save_checkpoint
-from latentplan.config import CollectionConfig, Config
+from latentplan.config import CollectionConfig, Config, EnvironmentFault
 from latentplan.models import WorldModel
 from latentplan.replay.buffer import Replay
 from latentplan.training.collection.collector import Collected
@@ -102,8 +102,10 @@ class Collect(lightning.Callback):
 
     def _store_results(self) -> None:
         if self._is_round_pending:
-            self._store_round()
+            fault = self._store_round()
             self._is_round_pending = False
+            if fault is not None:
+                raise fault
         if self._pending_evaluation is not None:
             returns = self.worker.result()
             clocks, self.evaluated_weights = self._pending_evaluation
@@ -136,7 +138,8 @@ class Collect(lightning.Callback):
         film = self.videos / f"{state.env_frames:09d}.webm" if settings.video else None
         self.worker.submit("evaluate", settings.episodes, film)
 
-    def _store_round(self) -> None:
+    def _store_round(self) -> EnvironmentFault | None:
+        """Stores a round, and returns the fault that ended it early."""
         collected: Collected = self.worker.result()
         for lane, rows in enumerate(collected.rows):
             self.replay.add(lane, rows)
@@ -145,8 +148,7 @@ class Collect(lightning.Callback):
         self.state.rounds += 1
         self.episode_returns.extend(collected.episode_returns)
         self.env_restarts = collected.restarts
-        if collected.fault is not None:
-            raise collected.fault
+        return collected.fault
 
 
 def copy_weights(model: WorldModel) -> dict[str, np.ndarray]:

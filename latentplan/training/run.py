@@ -201,27 +201,33 @@ class _Run:
         batches = ReplayBatches(self.replay, config, self.curriculum, self.learner)
         if not self._saved_optimizers:
             save.save_run(trainer, self.learner)  # makes a run that ends before its first save resumable
-        if not stop.is_spent():
-            self.console.start(self.learner.updates)
-            try:
-                trainer.fit(self.learner, datamodule=ReplayData(batches))
-            except EnvironmentFault as fault:
-                save.save(trainer, self.learner)
-                raise EnvironmentFault(f"{fault}; the run is saved in {self.folder}", fault.origin) from None
-            finally:
-                self.console.stop()
+        try:
+            if not stop.is_spent():
+                self._learn(trainer, ReplayData(batches), collect, record, save)
             if not self.state.interrupted:
-                collect.store_results()
-                record.write_evaluations(trainer)
-                save.keep_best(self.learner)
+                return Result(self.folder, 0, self._finish(trainer, save, videos / "final.webm"))
+        except EnvironmentFault as fault:
             save.save(trainer, self.learner)
-        if self.state.interrupted:
-            command = f"python scripts/train.py --resume {self.folder}"
-            if config.env.domain == USER_DOMAIN:
-                command = f'latentplan.training.resume("{self.folder}", make_env=...)'
-            self.console.console.print(f"stopped; to resume: {command}", soft_wrap=True)
-            return Result(self.folder, INTERRUPTED, {})
-        return Result(self.folder, 0, self._finish(trainer, save, videos / "final.webm"))
+            raise EnvironmentFault(f"{fault}; the run is saved in {self.folder}", fault.origin) from None
+        command = f"python scripts/train.py --resume {self.folder}"
+        if config.env.domain == USER_DOMAIN:
+            command = f'latentplan.training.resume("{self.folder}", make_env=...)'
+        self.console.console.print(f"stopped; to resume: {command}", soft_wrap=True)
+        return Result(self.folder, INTERRUPTED, {})
+
+    def _learn(
+        self, trainer: lightning.Trainer, data: ReplayData, collect: Collect, record: Record, save: Save
+    ) -> None:
+        self.console.start(self.learner.updates)
+        try:
+            trainer.fit(self.learner, datamodule=data)
+        finally:
+            self.console.stop()
+        if not self.state.interrupted:
+            collect.store_results()
+            record.write_evaluations(trainer)
+            save.keep_best(self.learner)
+        save.save(trainer, self.learner)
 
     def _trainer(self, callbacks: list[lightning.Callback]) -> lightning.Trainer:
         logging.getLogger("lightning.pytorch").setLevel(logging.ERROR)

@@ -12,7 +12,9 @@ from latentplan.commands.shell import run_guarded
 from latentplan.config import EnvironmentFault
 from latentplan.training import resume, train
 from latentplan.training.collection.collector import Collector
+from latentplan.training.run import _Run
 from tests.envs.faulty import Faulty
+from tests.training.run_folder import read_state
 
 pytestmark = pytest.mark.filterwarnings("ignore:.*its episode is cut short:RuntimeWarning")
 
@@ -126,3 +128,14 @@ def test_run_warns_of_black_frames(tiny, tmp_path):
 
     with pytest.warns(RuntimeWarning, match="frames of an environment are black"):
         train(tiny(tmp_path / "run"), partial(Dark, "never", tmp_path, 0))
+
+
+def test_run_whose_final_evaluation_fails_too_often_is_saved(tiny, dot, tmp_path, monkeypatch):
+    def fail(self, *_):
+        (self.folder / "resume" / "state.pt").unlink()  # so that only a new save brings it back
+        raise EnvironmentFault("the last lamp is out", "Traceback\n")
+
+    monkeypatch.setattr(_Run, "_finish", fail)
+    with pytest.raises(EnvironmentFault, match="the last lamp is out; the run is saved in") as fault:
+        train(tiny(tmp_path / "run"), dot)
+    assert fault.value.origin == "Traceback\n" and read_state(tmp_path / "run")["run"]["env_frames"] == 90
