@@ -9,6 +9,7 @@ from __future__ import annotations
 import json
 import os
 import stat
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -31,16 +32,15 @@ def read_text(path: Path, largest: int = LARGEST_SETTINGS) -> str:
     """
     try:
         opened = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)  # a pipe without a writer would block
-        with os.fdopen(opened, "rb") as file:
-            facts = os.fstat(opened)
-            if not stat.S_ISREG(facts.st_mode):
-                kind = "a folder" if stat.S_ISDIR(facts.st_mode) else "not a regular file"
-                raise UserError(f"cannot read {path}: it is {kind}")
-            content = file.read(largest + 1)
+        try:
+            mode = os.fstat(opened).st_mode
+            content = b"".join(_read_parts(opened, largest + 1)) if stat.S_ISREG(mode) else None
+        finally:
+            os.close(opened)
     except (OSError, ValueError) as error:
-        if isinstance(error, UserError):
-            raise
         raise UserError(f"cannot read {path}: {getattr(error, 'strerror', None) or 'no such name'}") from None
+    if content is None:
+        raise UserError(f"cannot read {path}: it is {'a folder' if stat.S_ISDIR(mode) else 'not a regular file'}")
     if len(content) > largest:
         raise UserError(f"cannot read {path}: it has more than {largest:,} bytes")
     try:
@@ -90,6 +90,13 @@ def parse_json(text: str, path: Path | str) -> Any:
     except ValueError as error:
         reason = str(error) if isinstance(error, json.JSONDecodeError) else "it holds a number that is too long"
         raise UserError(f"{path} cannot be read: {reason}") from None
+
+
+def _read_parts(opened: int, size: int) -> Iterator[bytes]:
+    """The first bytes of an open file."""
+    while size > 0 and (part := os.read(opened, size)):
+        size -= len(part)
+        yield part
 
 
 def is_shallow(text: str) -> bool:
