@@ -1,16 +1,18 @@
 # `make train` and `make test` set up everything they need; `make train ARGS="--domain cartpole --minutes 5"`.
 # `make docs` builds the documentation into build/docs.
-# `make soak` fuzzes for long; `make soak ARGS="--checkpoint DIR"` counts missed deadlines on the wall clock.
+# `make soak` fuzzes planners for long; `make soak ARGS="--checkpoint DIR"` counts missed deadlines on the wall clock.
 # `make soak-faults` disturbs a run for an hour: kills, a full disk, damaged saves, NaN, failing environments.
+# `make fuzz` draws thousands of examples for each property test; `make audit` asks for known vulnerabilities.
 
 PYTHON ?= python3 python3.11 python3.12 python3.13
 ARGS ?=
 BIN := .venv/bin
+FUZZED := $(wildcard tests/*/test_*_properties.py)
 STAMP := .venv/.installed
 DOCS_STAMP := .venv/.docs-installed
 JAX_STAMP := .venv/.jax-installed
 
-.PHONY: setup train test test-all check doctor bench soak soak-faults docs clean
+.PHONY: setup train test test-all check audit fuzz doctor bench soak soak-faults docs clean
 
 setup: $(STAMP)
 
@@ -27,6 +29,13 @@ check: $(JAX_STAMP) test-all
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
+	@$(MAKE) --no-print-directory audit
+
+audit: $(STAMP)
+	@$(BIN)/python scripts/audit.py
+
+fuzz: $(STAMP)
+	$(BIN)/python -m pytest -n auto -m "" --hypothesis-profile=fuzz $(FUZZED) $(ARGS)
 
 doctor: $(STAMP)
 	@$(BIN)/python -m latentplan doctor

@@ -26,6 +26,9 @@ COMMANDS = {
     "faults": Command("bench.faults", "a run that is killed, filled, corrupted and poisoned once a minute"),
     "survive": Command("bench.survive", "kills, kills within a save and flipped bits: tries and survivals"),
     "saving": Command("bench.saving", "share of the time of a training run that saves and guards take"),
+    "hostile": Command(
+        "bench.hostile", "hostile command lines and files: refused in one line, and in how many seconds"
+    ),
     "learn": Command("bench.learn", "learning curves over tasks and seeds: frames and minutes to a return"),
 }
 

@@ -7,9 +7,16 @@ import sys
 from pathlib import Path
 
 import pytest
+from hypothesis import HealthCheck, settings
 
 # Models here are tiny: threads gain nothing and wait for each other on a busy machine. Torch reads this at import.
 os.environ.setdefault("OMP_NUM_THREADS", "1")
+
+# A fixed budget and a fixed order of examples in `make test`; `make fuzz` draws new ones for long.
+LIBERAL = {"deadline": None, "suppress_health_check": list(HealthCheck)}
+settings.register_profile("test", max_examples=40, derandomize=True, database=None, **LIBERAL)
+settings.register_profile("fuzz", max_examples=5000, print_blob=True, **LIBERAL)
+settings.load_profile("test")
 
 ROOT = Path(__file__).resolve().parent.parent
 

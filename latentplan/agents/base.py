@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Sequence
 from typing import Any, Protocol
 
@@ -53,6 +54,8 @@ class ModelAgent:
         last_source: Origin of the most recent action: "plan", "tail" (the rest of an older plan) or "actor"; a list
             where the environments of a batch can differ.
         steps_ahead: Model steps from the belief to the picture of the latest `imagine`.
+        num_replaced_actions: Actions that were not finite so far, in which the last finite action of the environment
+            (zeros where there is none) took their place.
 
     Args:
         model: The world model; the agent puts it into evaluation mode and does not change its weights.
@@ -64,6 +67,7 @@ class ModelAgent:
 
     last_source: str | list[str] = "actor"
     steps_ahead: int = 0
+    num_replaced_actions: int = 0
     _frame_functions: FrameFunctions  # with the weights of the present decision
     _without_gradients: type[torch.no_grad] | type[torch.inference_mode] = torch.no_grad
 
@@ -132,7 +136,8 @@ class ModelAgent:
             frame: uint8 (64, 64, 3), or (batch, 64, 64, 3) with one frame of each environment.
 
         Returns:
-            The action in [-1, 1], float32 (action,) or (batch, action).
+            The action in [-1, 1], float32 (action,) or (batch, action). It is always finite: where the weights
+            give NaN or infinity, the last finite action of the environment, or zeros, is returned with a warning.
 
         Raises:
             ValueError: The frame has another shape or dtype, or the batch changed without a reset.
@@ -146,8 +151,11 @@ class ModelAgent:
             if self.noise_std > 0.0:
                 noise = self.noise.draw(action, self.generator, self._is_reset)
                 action = (action + self.noise_std * noise).clamp(-1.0, 1.0)
-            self.state, self._action, self._is_reset = state, action, None
             result = action.float().cpu().numpy()
+            if not np.isfinite(result).all():
+                result = self._replace_actions(result)
+                action = torch.as_tensor(result, device=self.model.device)
+            self.state, self._action, self._is_reset = state, action, None
         return result[0] if single else result
 
     @torch.no_grad()
@@ -160,6 +168,22 @@ class ModelAgent:
     def imagine(self) -> np.ndarray | None:
         """The decoded last state of the first environment's plan, uint8 (32, 32, 3); None without a plan."""
         return None
+
+    def _replace_actions(self, actions: np.ndarray) -> np.ndarray:
+        """The actions (batch, action), in which rows that are not finite hold the row's last action, or zeros."""
+        is_broken = ~np.isfinite(actions).all(axis=1)
+        last = np.zeros_like(actions) if self._action is None else self._action.float().cpu().numpy()
+        if self._is_reset is not None:
+            last = np.where(self._is_reset.cpu().numpy()[:, None], 0.0, last)
+        if self.num_replaced_actions == 0:
+            warnings.warn(
+                "the agent's action is not finite: its last finite action, or zeros, is executed instead; its weights "
+                "or its belief hold NaN or infinity",
+                RuntimeWarning,
+                stacklevel=3,
+            )
+        self.num_replaced_actions += int(is_broken.sum())
+        return np.where(is_broken[:, None], last, actions).astype(np.float32)
 
     def _choose(self, state: State) -> Tensor:
         """The action for a belief, in [-1, 1], (batch, action)."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 import hashlib
 import json
 from collections.abc import Callable
@@ -17,13 +16,18 @@ from latentplan.agents.base import Agent
 from latentplan.agents.files import is_checkpoint, read_files, seal, write_files
 from latentplan.agents.modes import MODES, make_agent
 from latentplan.config import Config, PlannerConfig, UserError, from_dict, to_dict
+from latentplan.config.checks import nearest, shown
 from latentplan.config.commit import MANIFEST
+from latentplan.config.estimates import check_parts, estimate_model, estimate_search
 from latentplan.config.planner import override_planner
+from latentplan.config.reading import parse_json
 from latentplan.models import WorldModel
 from latentplan.models.fast import accelerate
+from latentplan.replay.memory import free_memory
 
 WEIGHTS = "weights.safetensors"
 INFO = "info.json"
+LARGEST_INFO = 2**24  # bytes; a description with the metrics of a long run has some hundred thousand
 LARGEST_COUNT = 10**15  # of frames, updates and minutes; larger numbers are damage
 LARGEST_SIZE = 4096  # of actions, labels and goals
 
@@ -122,20 +126,19 @@ def read_info(path: str | Path) -> dict[str, Any]:
 
 def _parse_info(folder: Path, content: bytes) -> dict[str, Any]:
     """The description of a checkpoint, checked."""
-    try:
-        info = json.loads(content)
-    except (ValueError, RecursionError) as error:
-        raise UserError(f"{folder / INFO} cannot be read: {str(error)[:120]}") from None
+    if len(content) > LARGEST_INFO:
+        raise UserError(f"cannot read {folder / INFO}: it has more than {LARGEST_INFO:,} bytes")
+    info = parse_json(content.decode(errors="replace"), folder / INFO)
     missing = [key for key in REQUIRED_KEYS if not isinstance(info, dict) or key not in info]
     if missing:
         raise UserError(f"{folder} is not a latentplan checkpoint: {INFO} lacks {', '.join(missing)}")
     for key in info:
         if key not in ALLOWED:
             known = {name: name for name in ALLOWED}
-            raise UserError(f"{folder / INFO} holds the unknown key {key[:60]!r}{_suggestion(key, known)}")
+            raise UserError(f"{folder / INFO} holds the unknown key {shown(key)}{_suggestion(key, known)}")
     for key, (allows, allowed) in ALLOWED.items():
         if key in info and not allows(info[key]):
-            raise UserError(f"{folder / INFO} cannot be used: {key} must be {allowed}, got {str(info[key])[:60]!r}")
+            raise UserError(f"{folder / INFO} cannot be used: {key} must be {allowed}, got {shown(info[key])}")
     return info
 
 
@@ -159,6 +162,7 @@ def load_model(path: str | Path, device: str = "cpu") -> tuple[WorldModel, Confi
     except (AttributeError, TypeError, ValueError) as error:
         raise UserError(f"the settings in {folder / INFO} cannot be used: {error}") from None
     sizes = info["action_dim"], info.get("labels"), info.get("goal_dim") or 0
+    check_parts([estimate_model(config.model, action_dim=info["action_dim"])], free_memory())
     try:
         state = {name: value.float() for name, value in load(content).items()}
         with torch.device("meta"):  # compares shapes before a model is allocated whose size the file names
@@ -196,7 +200,7 @@ def load_agent(path: str | Path, mode: str = "planner", device: str = "cpu", **s
         UserError: The checkpoint, the mode or a setting cannot be used.
     """
     if mode not in MODES:
-        raise UserError(f"mode must be one of {', '.join(MODES)}, got {mode!r}")
+        raise UserError(f"mode must be one of {', '.join(MODES)}, got {shown(mode)}")
     entry = MODES[mode]
     options = {name: settings.pop(name) for name in entry.options if name in settings}
     if settings and not entry.plans:
@@ -209,6 +213,8 @@ def load_agent(path: str | Path, mode: str = "planner", device: str = "cpu", **s
             raise UserError(f"unknown planner setting {name!r}{_suggestion(name, {key: key for key in names})}")
     try:
         planner = PlannerConfig(**override_planner(known, settings))
+        if entry.plans:
+            check_parts([estimate_search(planner, config.model, device != "cpu")], free_memory())
         agent = make_agent(mode, model, config, info["discount"], planner=planner, **options)
     except (TypeError, ValueError) as error:
         raise UserError(f"planner settings: {error}") from None
@@ -249,8 +255,8 @@ def _find_checkpoint(root: Path) -> Path | None:
 
 
 def _suggestion(name: str, known: dict[str, str]) -> str:
-    """The end of an error message about a name: the nearest known name, else all known names."""
-    nearest = difflib.get_close_matches(name, known, n=1)
-    if nearest:
-        return f"; did you mean {known[nearest[0]]}?"
-    return f"; available: {', '.join(known.values())}" if known else ""
+    """The end of an error message about a name: the nearest known name, else the first twenty known names."""
+    similar = nearest(name, known, cutoff=0.6)
+    if similar:
+        return f"; did you mean {known[similar]}?"
+    return f"; available: {', '.join(list(known.values())[:20])}" if known else ""

@@ -61,6 +61,8 @@ class _Decision(nn.Module):
         state = one_frame.see(weights, begun, turned(frame, turns))
         modes, _ = one_frame.act(weights, state)
         mean = modes.reshape(rows, turns, size).mean(1)
+        executed = torch.where(is_first[:, None] | ~action.isfinite(), 0.0, action)
+        mean = torch.where(mean.isfinite().all(1, keepdim=True), mean, executed)  # as `ModelAgent.act`
         deters, stochs = (part.reshape(rows, part.shape[1] * turns) for part in state)
         return mean, deters, stochs
 

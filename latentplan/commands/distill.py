@@ -59,4 +59,4 @@ def run(request: Request) -> int:
 def _search_settings(request: Request, checkpoint: Path) -> PlannerConfig:
     from latentplan.agents.checkpoint import read_info
 
-    return search_settings(saved_config(checkpoint, read_info(checkpoint)).planner, request.planner)
+    return search_settings(saved_config(checkpoint, read_info(checkpoint)), request.planner)

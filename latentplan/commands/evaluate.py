@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 from latentplan.commands.flags import overrides
 from latentplan.commands.shell import ComputeRequest, saved_config, search_settings
 from latentplan.config import EnvConfig, PlannerConfig, UserError, to_dict
-from latentplan.config.checks import above_zero, at_least, one_of, within
+from latentplan.config.checks import MAX_EPISODES, above_zero, at_least, between, one_of, within
 from latentplan.config.parsing import option
 
 if TYPE_CHECKING:
@@ -63,7 +63,8 @@ class Request(ComputeRequest):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        at_least(self, episodes=1, seed=0)
+        at_least(self, seed=0)
+        between(self, episodes=(1, MAX_EPISODES))
         one_of(self, mode=list_modes())
         above_zero(self, "control_hz")
         if self.planner and self.mode not in planning_modes():
@@ -101,7 +102,7 @@ def resolve(request: Request) -> dict[str, Any]:
     from latentplan.agents.checkpoint import read_info
 
     saved = saved_config(request.checkpoint, read_info(request.checkpoint))
-    return {**vars(request), "planner": search_settings(saved.planner, request.planner)}
+    return {**vars(request), "planner": search_settings(saved, request.planner)}
 
 
 def run(request: Request) -> int:
@@ -120,7 +121,7 @@ def run(request: Request) -> int:
 
     info = read_info(request.checkpoint)
     config = saved_config(request.checkpoint, info)
-    planner = search_settings(config.planner, request.planner)
+    planner = search_settings(config, request.planner)
     changes = {name: getattr(planner, name) for name in request.planner}
     if request.planning_budget is not None:
         changes["planning_budget"] = request.planning_budget

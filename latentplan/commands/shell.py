@@ -15,9 +15,10 @@ from pathlib import Path
 from typing import Any
 
 from latentplan.config import MAX_THREADS, Config, Device, PlannerConfig, UserError, from_dict, to_dict
-from latentplan.config.checks import within
+from latentplan.config.checks import EnvironmentFault, cut, shown, within
+from latentplan.config.estimates import check_parts, estimate_search
 from latentplan.config.extras import describe_missing, extra_of
-from latentplan.config.files import build_config
+from latentplan.config.files import build_config, has_cuda
 from latentplan.config.parsing import option
 from latentplan.config.planner import override_planner
 
@@ -25,8 +26,8 @@ from latentplan.config.planner import override_planner
 def run_guarded(command: Callable[[Sequence[str]], int], argv: Sequence[str]) -> int:
     """The exit code of a command: 2 after a mistake of the user, which becomes one line on stderr.
 
-    Ctrl-C gives 130, SIGTERM 143 and SIGHUP 129. A reader that closes the output early, as in `train.py --help | head`,
-    gives 141.
+    A failed environment gives one line and the environment's own traceback. Ctrl-C gives 130, SIGTERM 143 and SIGHUP
+    129. A reader that closes the output early, as in `train.py --help | head`, gives 141.
     """
     try:
         try:
@@ -34,21 +35,34 @@ def run_guarded(command: Callable[[Sequence[str]], int], argv: Sequence[str]) ->
                 return command(argv)
         finally:
             sys.stdout.flush()
+    except EnvironmentFault as error:
+        code = _refuse(str(error))
+        print(error.origin, file=sys.stderr, end="")
+        return code
     except (UserError, FloatingPointError) as error:
         return _refuse(str(error))
     except ModuleNotFoundError as error:
         if extra_of(error.name) is None:
             raise
         return _refuse(describe_missing(str(error.name), "this command"))
+    except MemoryError:
+        return _refuse("not enough memory: lower the sizes that were asked for, or end other programs")
+    except RuntimeError as error:
+        if not _is_out_of_memory(error):
+            raise
+        return _refuse("not enough memory on the device: lower the sizes that were asked for, or end other programs")
     except KeyboardInterrupt:
         return 130
     except BrokenPipeError:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 141
     except OSError as error:
-        if error.errno != errno.ENAMETOOLONG:
+        if error.strerror is None:
             raise
-        return _refuse(f"a file name is too long: {str(error.filename)[:80]}...")
+        if error.errno == errno.ENAMETOOLONG:
+            return _refuse(f"a file name is too long: {str(error.filename)[:80]}...")
+        name = "" if error.filename is None else f": {shown(str(error.filename))}"
+        return _refuse(f"the system refused a file or a process{name}: {error.strerror}")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -103,13 +117,22 @@ def saved_config(checkpoint: Path, info: Mapping[str, Any]) -> Config:
         raise UserError(f"{checkpoint} has settings of another version: {error}") from None
 
 
-def search_settings(saved: PlannerConfig, given: Mapping[str, Any]) -> PlannerConfig:
+def search_settings(saved: Config, given: Mapping[str, Any]) -> PlannerConfig:
     """The settings of a checkpoint's search with the given ones in their place.
 
+    Args:
+        saved: All settings of the checkpoint.
+        given: Settings of the search that were given, by name.
+
     Raises:
-        UserError: A given value is not allowed beside the saved ones.
+        UserError: A given value is not allowed beside the saved ones, or this machine cannot serve the search.
     """
-    return build_config({"planner": override_planner(to_dict(saved), given)}).planner
+    from latentplan.replay.memory import free_memory
+
+    settings = build_config({"planner": override_planner(to_dict(saved.planner), given)}).planner
+    if given:
+        check_parts([estimate_search(settings, saved.model, has_cuda())], free_memory())
+    return settings
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -157,7 +180,13 @@ def _ending_by_signals() -> Iterator[None]:
             signal.signal(number, handler)
 
 
+def _is_out_of_memory(error: RuntimeError) -> bool:
+    """Whether torch could not allocate memory; on a CPU its error has no class of its own."""
+    text = str(error)
+    return "can't allocate memory" in text or "out of memory" in text or "Storage size calculation overflowed" in text
+
+
 def _refuse(message: str) -> int:
-    line = " ".join(message.split()).encode(sys.stderr.encoding or "utf-8", "backslashreplace")
+    line = cut(" ".join(message.split())).encode(sys.stderr.encoding or "utf-8", "backslashreplace")
     print(f"error: {line.decode(sys.stderr.encoding or 'utf-8')}", file=sys.stderr)
     return 2

@@ -46,6 +46,9 @@ class Request:
 def run(request: Request) -> int:
     """Train or resume, and return the exit code."""
     config = resolve(request)
+    from latentplan.training.checks import check_settings
+
+    check_settings(config)
     from latentplan.training import resume, train
 
     if request.resume is None:

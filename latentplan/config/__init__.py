@@ -1,6 +1,6 @@
 """Every setting of latentplan: one frozen dataclass per component, built on the standard library alone."""
 
-from latentplan.config.checks import MAX_THREADS, UserError, derive_seed, make_folder, output_file
+from latentplan.config.checks import MAX_THREADS, EnvironmentFault, UserError, derive_seed, make_folder, output_file
 from latentplan.config.learning import CollectionConfig, DistillConfig, GoalsConfig, LearningConfig
 from latentplan.config.planner import PlannerConfig, SearchOptions
 from latentplan.config.settings import (
@@ -32,6 +32,7 @@ __all__ = [
     "Device",
     "DistillConfig",
     "EnvConfig",
+    "EnvironmentFault",
     "EvaluationConfig",
     "GoalsConfig",
     "LearningConfig",

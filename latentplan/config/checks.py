@@ -2,16 +2,79 @@
 
 from __future__ import annotations
 
+import difflib
 import hashlib
 import os
+import re
+import reprlib
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
 MAX_THREADS = 1024  # more threads would exhaust the machine
+MAX_EPISODES = 1_000_000
+SHOWN = 60  # characters of a wrong value that an error repeats
+LONGEST_WORD = 200  # characters without a space that an error repeats, such as a path
+LONGEST_LINE = 1000  # a longer message repeats input, and is cut to `LONGEST_WORD`
 
 
 class UserError(ValueError):
-    """A mistake of the user; the message is one line that says what to give instead."""
+    """A mistake of the user; the message is one line that says what to give instead.
+
+    A message repeats at most 200 characters of each path or value; see `cut`.
+    """
+
+    def __init__(self, message: object = "") -> None:
+        super().__init__(cut(str(message)))
+
+
+class EnvironmentFault(UserError):
+    """An environment that failed; the traceback of the environment's own code is in `__notes__`.
+
+    Attributes:
+        origin: Traceback of the environment's process as text, empty where there is none.
+    """
+
+    def __init__(self, message: object = "", origin: str = "") -> None:
+        super().__init__(message)
+        self.origin = origin
+        if origin:
+            self.add_note(origin)
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Keeps the origin when the fault is sent to another process."""
+        return type(self), (str(self), self.origin)
+
+
+def cut(message: str) -> str:
+    """A message without the middle of its long words; a message that is long all the same keeps 200 characters."""
+    if len(message) <= LONGEST_WORD:
+        return message
+    if len(message) <= LONGEST_LINE**2:  # the search for words takes longer in longer texts
+        message = re.sub(rf"\S{{{LONGEST_WORD + 1},}}", lambda word: _without_middle(word[0]), message)
+    return message if len(message) <= LONGEST_LINE else _without_middle(message)
+
+
+def _without_middle(text: str) -> str:
+    part = (LONGEST_WORD - 3) // 2
+    return f"{text[:part]}...{text[-part:]}"
+
+
+def shown(value: Any) -> str:
+    """A value as an error repeats it: quoted, on one line, at most 63 characters, found in a short time."""
+    if isinstance(value, str | bytes):
+        value = value[: SHOWN + 1]  # the repr of a long text takes long
+    try:
+        text = repr(value) if isinstance(value, str | bytes | Path) else _BRIEF.repr(value)
+    except ValueError:  # Python refuses to write whole numbers of more than 4,300 digits
+        text = f"a number of {value.bit_length() * 0.30103:.0f} digits" if isinstance(value, int) else "long numbers"
+    return text if len(text) <= SHOWN else f"{text[:SHOWN]}..."
+
+
+def nearest(name: object, known: Iterable[str], cutoff: float = 0.5) -> str | None:
+    """The known name that is most similar to a name; None where none is similar."""
+    found = difflib.get_close_matches(str(name)[:SHOWN], list(known), n=1, cutoff=cutoff)
+    return found[0] if found else None
 
 
 def derive_seed(seed: int, name: str, counter: int = 0) -> int:
@@ -83,6 +146,14 @@ def within(config: Any, **bounds: tuple[float, float]) -> None:
         _require(config, name, low <= getattr(config, name) <= high, f"in [{low}, {high}]")
 
 
+def between(config: Any, **bounds: tuple[float, float]) -> None:
+    """Require fields to be at least the first bound and at most the second."""
+    for name, (low, high) in bounds.items():
+        value = getattr(config, name)
+        _require(config, name, value >= low, f"at least {low}")
+        _require(config, name, value <= high, f"at most {high}")
+
+
 def one_of(config: Any, **choices: tuple[str | None, ...]) -> None:
     """Require fields to be one of the values allowed."""
     for name, allowed in choices.items():
@@ -91,4 +162,8 @@ def one_of(config: Any, **choices: tuple[str | None, ...]) -> None:
 
 def _require(config: Any, name: str, holds: bool, allowed: str) -> None:
     if not holds:
-        raise ValueError(f"{name} must be {allowed}, got {getattr(config, name)!r}")
+        raise ValueError(f"{name} must be {allowed}, got {shown(getattr(config, name))}")
+
+
+_BRIEF = reprlib.Repr()
+_BRIEF.maxlevel, _BRIEF.maxstring, _BRIEF.maxother, _BRIEF.maxlong = 3, SHOWN, SHOWN + 1, SHOWN + 1

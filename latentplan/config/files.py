@@ -14,11 +14,12 @@ import os
 from pathlib import Path
 from typing import Any, Literal
 
-from latentplan.config.checks import UserError
+from latentplan.config.checks import UserError, shown
 from latentplan.config.parsing import Setting, list_settings, raise_unknown, read_values
+from latentplan.config.reading import read_yaml
 from latentplan.config.removed import drop_removed
 from latentplan.config.settings import Config
-from latentplan.config.suites import DEFAULT_SUITE, SUITES, find_suite
+from latentplan.config.suites import DEFAULT_SUITE, SUITES, check_task, find_suite
 
 Layer = dict[str, dict[str, Any]]
 
@@ -41,6 +42,7 @@ def compose(config_file: Layer, flags: Layer, preset: str = "auto") -> Config:
         raise_unknown("domain", domain, domains)
     domain_layer = _read_optional(domain)
     task = chosen["env"].get("task") or domain_layer.get("env", {}).get("task")
+    check_task(chosen["env"].get("suite", DEFAULT_SUITE), domain, task)
     if preset == "auto":
         preset = "gpu" if chosen.get("run", {}).get("device") != "cpu" and has_cuda() else "cpu"
     preset_layer = read_layer(config_folder() / f"{preset}.yaml")
@@ -101,24 +103,15 @@ def read_layer(path: Path) -> Layer:
     Raises:
         UserError: The file is missing or malformed, or names an unknown section or setting.
     """
-    import yaml
-
-    try:
-        layer = yaml.safe_load(path.read_text()) or {}
-    except (OSError, ValueError, RecursionError) as error:
-        raise UserError(f"cannot read {path}: {getattr(error, 'strerror', None) or 'not a text file'}") from None
-    except yaml.YAMLError as error:
-        mark = getattr(error, "problem_mark", None)
-        where = f"line {mark.line + 1}: " if mark else ""
-        raise UserError(f"{path} is not valid YAML: {where}{getattr(error, 'problem', None) or error}") from None
+    layer = read_yaml(path) or {}
     if not isinstance(layer, dict):
-        raise UserError(f"{path} must hold sections ({', '.join(SECTIONS)}), got {layer!r}")
+        raise UserError(f"{path} must hold sections ({', '.join(SECTIONS)}), got {shown(layer)}")
     kept = {}
     for section, fields in layer.items():
         if section not in SECTIONS:
             raise_unknown(f"section in {path}:", section, SECTIONS)
         if not isinstance(fields, dict):
-            raise UserError(f"{path}: section {section} must hold settings, got {fields!r}")
+            raise UserError(f"{path}: section {section} must hold settings, got {shown(fields)}")
         kept[section] = drop_removed(section, fields)
         for name in kept[section]:
             if name not in field_names(section):

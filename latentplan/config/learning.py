@@ -5,11 +5,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal, get_args
 
-from latentplan.config.checks import above_zero, at_least, one_of, within
+from latentplan.config.checks import MAX_EPISODES, above_zero, at_least, between, one_of, within
 from latentplan.config.parsing import option
 
 Behaviour = Literal["planner", "actor", "both"]
 BEHAVIOURS = get_args(Behaviour)
+MAX_UPDATES = 10**9
+MAX_ROWS = 1_000_000  # of a batch, or of decisions that are kept in memory
 
 
 @dataclass(frozen=True)
@@ -82,7 +84,8 @@ class LearningConfig:
         )
         at_least(self, reconstruction_scale=0.0, dynamics_scale=0.0, representation_scale=0.0, free_nats=0.0)
         at_least(self, overshooting_scale=0.0, reward_scale=0.0, replay_value_scale=0.0, entropy_scale=0.0)
-        at_least(self, random_shift=0, curriculum_frames=0)
+        at_least(self, curriculum_frames=0)
+        between(self, random_shift=(0, 64))
         above_zero(
             self, "model_learning_rate", "behaviour_learning_rate", "max_grad_norm", "target_rate", "average_rate"
         )
@@ -111,6 +114,10 @@ class CollectionConfig:
         round_decisions: Decisions of a round; a round is collected, then learned from.
         updates_per_decision: Updates per collected decision (the replay ratio, in updates).
         overlap: Whether the next round is collected in another process, on the CPU, while this round is learned from.
+        max_restarts: Restarts of environments that fail (an exception, a crash, a hang, a frame or reward that is not
+            as declared) before the run saves and stops. Each fault cuts one episode short.
+        step_timeout_s: Seconds that a reset or a step may take of an environment in a process of its own: of several
+            environments, and of one that is not of `dm_control` while `overlap` holds.
     """
 
     behaviour: Behaviour = "both"
@@ -124,6 +131,8 @@ class CollectionConfig:
     round_decisions: int = 250
     updates_per_decision: float = 0.5
     overlap: bool = True
+    max_restarts: int = 10
+    step_timeout_s: float = 60.0
 
     def __post_init__(self) -> None:
         one_of(self, behaviour=BEHAVIOURS)
@@ -133,6 +142,8 @@ class CollectionConfig:
             raise ValueError("goal_share needs goals; name at least one expression in collection.goals")
         if self.goals and self.goal_share == 0.0:
             raise ValueError("goals need a goal_share above 0: the share of rounds in which they are pursued")
+        at_least(self, max_restarts=0)
+        within(self, step_timeout_s=(0.01, 86_400.0))
         above_zero(self, "updates_per_decision", "episode_decisions")
 
 
@@ -168,8 +179,9 @@ class DistillConfig:
     seed: int = 0
 
     def __post_init__(self) -> None:
-        at_least(self, rounds=1, episodes=1, planner_rounds=0, updates=1, batch_size=1, plan_batch=1)
-        at_least(self, evaluation_episodes=2, seed=0)
+        at_least(self, planner_rounds=0, seed=0)
+        between(self, rounds=(1, MAX_EPISODES), episodes=(1, MAX_EPISODES), evaluation_episodes=(2, MAX_EPISODES))
+        between(self, updates=(1, MAX_UPDATES), batch_size=(1, MAX_ROWS), plan_batch=(1, MAX_ROWS))
         above_zero(self, "minutes", "learning_rate")
         within(self, relabel_share=(0.0, 1.0))
 
@@ -201,5 +213,7 @@ class GoalsConfig:
     seed: int = 0
 
     def __post_init__(self) -> None:
-        at_least(self, updates=1, starts=1, horizon=1, hidden_dim=1, play_decisions=1, seed=0, entropy_scale=0.0)
+        at_least(self, seed=0, entropy_scale=0.0)
+        between(self, updates=(1, MAX_UPDATES), starts=(1, MAX_ROWS), play_decisions=(1, MAX_ROWS))
+        between(self, horizon=(1, 10_000), hidden_dim=(1, 16_384))
         above_zero(self, "minutes", "learning_rate")

@@ -7,7 +7,6 @@ jsonargparse is imported when the first value is read, because `--help` does not
 from __future__ import annotations
 
 import dataclasses
-import difflib
 import functools
 import inspect
 import math
@@ -19,7 +18,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from latentplan.config.checks import UserError
+from latentplan.config.checks import UserError, nearest, shown
+from latentplan.config.reading import is_shallow
 
 _TYPE_WORDS = {
     int: "a whole number",
@@ -30,7 +30,6 @@ _TYPE_WORDS = {
     type(None): "null",
 }
 _LARGEST = 10**18  # larger whole numbers are typing errors, and need more than the 64 bits of numpy and torch
-_SHOWN = 60  # characters of a wrong value that an error repeats
 
 
 @dataclass(frozen=True)
@@ -133,14 +132,15 @@ def raise_unknown(kind: str, name: str, known: Iterable[str]) -> typing.NoReturn
         known: The names that are allowed.
     """
     known = list(known)
-    nearest = difflib.get_close_matches(str(name), known, n=1, cutoff=0.5)
+    similar = nearest(name, known)
     few = f"; available: {', '.join(known)}" if len(known) <= 20 else "; --help-all lists all"
-    raise UserError(f"unknown {kind} {_shown(name)}" + (f"; did you mean {nearest[0]!r}?" if nearest else few))
+    raise UserError(f"unknown {kind} {shown(name)}" + (f"; did you mean {similar!r}?" if similar else few))
 
 
 def _is_text(setting: Setting, values: Mapping[str, Any]) -> bool:
     """Whether a value is text for a setting that takes any text, so that nothing has to be parsed."""
-    return setting.hint is str and isinstance(values.get(setting.key), str)
+    value = values.get(setting.key)
+    return setting.hint is str and isinstance(value, str) and "\0" not in value
 
 
 def _parse_values(given: Sequence[Setting], values: Mapping[str, Any], names: Mapping[str, str]) -> dict[str, Any]:
@@ -148,6 +148,10 @@ def _parse_values(given: Sequence[Setting], values: Mapping[str, Any], names: Ma
 
     from jsonargparse import ArgumentParser
 
+    for setting in given:
+        value = values[setting.key]
+        if isinstance(value, str) and ("\0" in value or not is_shallow(value)):
+            raise _wrong_type(setting, values, names)
     _register_numbers()
     parser = ArgumentParser(exit_on_error=False)
     for index, setting in enumerate(given):
@@ -160,6 +164,14 @@ def _parse_values(given: Sequence[Setting], values: Mapping[str, Any], names: Ma
         if found is None:
             raise UserError(str(error)) from None
         raise _wrong_type(given[int(found[1])], values, names) from None
+    except (
+        RecursionError,
+        OverflowError,
+        ValueError,
+    ):  # thousands of brackets or digits
+        if len(given) == 1:
+            raise _wrong_type(given[0], values, names) from None
+        return {key: value for setting in given for key, value in _parse_values([setting], values, names).items()}
     for index, setting in enumerate(given):
         if parsed[f"value{index}"] is None and type(None) not in alternatives(setting.hint):
             raise _wrong_type(setting, values, names)
@@ -238,19 +250,13 @@ def _wrong_type(setting: Setting, values: Mapping[str, Any], names: Mapping[str,
     name, value = names.get(setting.key, setting.key), values[setting.key]
     words = setting.choices
     if words:
-        nearest = difflib.get_close_matches(str(value), words, n=1, cutoff=0.5)
-        hint = f"; did you mean {nearest[0]!r}?" if nearest else ""
-        return UserError(f"{name} must be one of {', '.join(words)}, got {_shown(value)}{hint}")
+        similar = nearest(value, words)
+        hint = f"; did you mean {similar!r}?" if similar else ""
+        return UserError(f"{name} must be one of {', '.join(words)}, got {shown(value)}{hint}")
     separator = setting.options.get("separator")
     if separator:
         item = _TYPE_WORDS[typing.get_args(setting.hint)[0]].partition(" ")[2]
-        return UserError(f"{name} must be {item}s, separated by {separator!r}, got {_shown(separator.join(value))}")
+        return UserError(f"{name} must be {item}s, separated by {separator!r}, got {shown(separator.join(value))}")
     example = '["speed -> 1.0"]' if str in typing.get_args(setting.hint) else "[16, 32]"
     wanted = " or ".join(_TYPE_WORDS.get(kind, f"a list such as {example}") for kind in alternatives(setting.hint))
-    return UserError(f"{name} must be {wanted}, got {_shown(value)}")
-
-
-def _shown(value: Any) -> str:
-    """A value as an error repeats it: quoted, on one line, cut where it is long."""
-    text = repr(value)
-    return text if len(text) <= _SHOWN else f"{text[:_SHOWN]}..."
+    return UserError(f"{name} must be {wanted}, got {shown(value)}")

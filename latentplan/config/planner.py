@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from numbers import Integral, Real
 from typing import Any
 
-from latentplan.config.checks import above_zero, one_of, within
+from latentplan.config.checks import above_zero, one_of, shown, within
 
 WIDEST_STD = 1e15  # the square of this std, and sums of such squares, are finite in float32
 STEEPEST_NOISE = 100.0  # far below this exponent all steps share one cosine; from 150 on powers overflow
@@ -208,4 +208,4 @@ def check_whole(options: Any, least: int, *names: str) -> None:
     for name in names:
         value = getattr(options, name)
         if value is not None and (isinstance(value, bool) or not isinstance(value, Integral) or value < least):
-            raise ValueError(f"{name} must be a whole number, at least {least}, got {value!r}")
+            raise ValueError(f"{name} must be a whole number, at least {least}, got {shown(value)}")

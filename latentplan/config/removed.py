@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
-from latentplan.config.checks import UserError
+from latentplan.config.checks import UserError, shown
 
 
 class Removed(NamedTuple):
@@ -49,5 +49,5 @@ def drop_removed(section: str, fields: Mapping[Any, Any]) -> dict[Any, Any]:
         if removed is None:
             kept[name] = value
         elif value != removed.accepted:
-            raise UserError(f"{section}.{name} no longer exists, got {value!r}: {removed.advice}")
+            raise UserError(f"{section}.{name} no longer exists, got {shown(value)}: {removed.advice}")
     return kept

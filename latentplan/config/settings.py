@@ -9,7 +9,7 @@ import dataclasses
 from dataclasses import dataclass, field
 from typing import Any, Literal, get_args
 
-from latentplan.config.checks import MAX_THREADS, UserError, above_zero, at_least, one_of, within
+from latentplan.config.checks import MAX_EPISODES, MAX_THREADS, UserError, above_zero, at_least, between, one_of, within
 from latentplan.config.learning import CollectionConfig, LearningConfig
 from latentplan.config.planner import PlannerConfig
 from latentplan.config.removed import drop_removed
@@ -21,6 +21,9 @@ Device = Literal["auto", "cpu", "cuda"]
 RENDER_QUALITIES = get_args(RenderQuality)
 FLOORS = get_args(Floor)
 DEVICES = get_args(Device)
+MAX_REPEAT = 10_000  # ten of the longest episodes of dm_control
+MAX_ENVS = 1024
+MAX_CAMERA = 1000
 USER_DOMAIN = "user"  # `EnvConfig.domain` of runs in an environment that the user wrote
 
 
@@ -54,7 +57,7 @@ class EnvConfig:
     suite: str = "dm_control"
 
     def __post_init__(self) -> None:
-        at_least(self, action_repeat=1, num_envs=1, camera=-1)
+        between(self, action_repeat=(1, MAX_REPEAT), num_envs=(1, MAX_ENVS), camera=(-1, MAX_CAMERA))
         one_of(self, render_quality=RENDER_QUALITIES, floor=FLOORS)
 
 
@@ -124,7 +127,8 @@ class EvaluationConfig:
     video: bool = True
 
     def __post_init__(self) -> None:
-        at_least(self, every_frames=1, episodes=1, final_episodes=1)
+        at_least(self, every_frames=1)
+        between(self, episodes=(1, MAX_EPISODES), final_episodes=(1, MAX_EPISODES))
 
 
 @dataclass(frozen=True)

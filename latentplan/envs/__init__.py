@@ -9,8 +9,9 @@ require_extra("latentplan.envs", "gymnasium", "mujoco", "cv2")
 from latentplan.envs.gl import choose_backend, render_info  # noqa: E402
 from latentplan.envs.registry import default_task, make_env  # noqa: E402
 from latentplan.envs.suite import SuiteEnv  # noqa: E402
+from latentplan.envs.threads import single_threaded_children  # noqa: E402
 from latentplan.envs.user import PixelEnv, make_from, wrap_user_env  # noqa: E402
-from latentplan.envs.vector import make_vector_env, single_threaded_children  # noqa: E402
+from latentplan.envs.vector import make_vector_env  # noqa: E402
 
 __all__ = [
     "PixelEnv",

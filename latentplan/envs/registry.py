@@ -22,12 +22,12 @@ optional; each of them enables one feature:
 
 from __future__ import annotations
 
-import difflib
 import importlib
 from collections.abc import Iterable
 from typing import Any
 
 from latentplan.config import USER_DOMAIN, EnvConfig, UserError
+from latentplan.config.checks import nearest, shown
 from latentplan.config.suites import DEFAULT_SUITE, find_suite
 
 
@@ -65,5 +65,5 @@ def default_task(domain: str, suite: str = DEFAULT_SUITE) -> str:
 def describe_unknown_name(kind: str, name: str, available: Iterable[str]) -> str:
     """An error message for an unknown name, with all available names and the nearest name."""
     choices = sorted(available)
-    nearest = difflib.get_close_matches(name, choices, n=1, cutoff=0.0)[0]
-    return f"unknown {kind} {name!r}; available: {', '.join(choices)}. Did you mean {nearest!r}?"
+    similar = nearest(name, choices, cutoff=0.0)
+    return f"unknown {kind} {shown(name)}; available: {', '.join(choices)}. Did you mean {similar!r}?"

@@ -11,6 +11,7 @@ import numpy as np
 from gymnasium.error import ResetNeeded
 
 from latentplan.config import EnvConfig, UserError
+from latentplan.envs.faults import check_picture, check_reward
 from latentplan.envs.suite import FRAME_SIZE
 
 if TYPE_CHECKING:
@@ -122,6 +123,7 @@ class PixelEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         Raises:
             ResetNeeded: The episode is over.
             ValueError: The action has another shape or is not finite.
+            EnvironmentFault: A frame or a reward of the inner environment is not as its spaces declare.
         """
         if self._needs_reset:
             raise ResetNeeded("the episode is over; call reset() first")
@@ -133,7 +135,7 @@ class PixelEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         total, env_frames, terminated, truncated = 0.0, 0, False, False
         while env_frames < self.action_repeat and not (terminated or truncated):
             picture, reward, terminated, truncated, info = self._env.step(scaled)
-            total += float(reward)
+            total += check_reward(reward)
             env_frames += 1
         self._decisions += 1
         truncated = truncated or (self.decisions_per_episode is None and self._decisions == MAX_DECISIONS)
@@ -154,7 +156,7 @@ class PixelEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         self._env.close()
 
     def _to_frame(self, picture: np.ndarray) -> np.ndarray:
-        self._picture = np.array(picture, dtype=np.uint8)
+        self._picture = check_picture(picture, self._env.observation_space.shape or ())
         return _resize(self._picture, FRAME_SIZE)
 
 

@@ -3,25 +3,29 @@
 from __future__ import annotations
 
 import multiprocessing
-import os
 import signal
-from contextlib import contextmanager
+import time
+import warnings
 from dataclasses import dataclass
+from functools import cached_property, partial
 from typing import TYPE_CHECKING, Any
 
 import gymnasium
 import numpy as np
-from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv, VectorEnv
+from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.wrappers import TimeLimit
 
-from latentplan.config import EnvConfig
+from latentplan.config import EnvConfig, derive_seed
+from latentplan.config.checks import EnvironmentFault
+from latentplan.envs.faults import check_picture, check_reward
+from latentplan.envs.process import CLOSING_SECONDS, Lane, LocalLane, ProcessLane
 from latentplan.envs.registry import make_env
 from latentplan.envs.user import make_from
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
+    from collections.abc import Callable, Sequence
 
-_THREAD_SETTINGS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
+STEP_TIMEOUT_S = 60.0
 
 
 def make_vector_env(
@@ -30,7 +34,10 @@ def make_vector_env(
     seed: int | None,
     make_env: Callable[[], gymnasium.Env[Any, Any]] | None = None,
     episode_decisions: int | None = None,
-) -> VectorEnv[np.ndarray, np.ndarray, Any]:
+    restarts: Restarts | None = None,
+    isolate: bool = False,
+    step_timeout_s: float = STEP_TIMEOUT_S,
+) -> GuardedVectorEnv:
     """Several environments behind one `step`; two or more environments run in separate processes.
 
     Finished episodes do not restart by themselves, so `step` always returns the result of its own action. Restart
@@ -45,6 +52,9 @@ def make_vector_env(
             the system.
         make_env: A user's factory, called in each process instead of the suite's; it must be picklable.
         episode_decisions: Decisions after which an episode is truncated; None leaves the length to the task.
+        restarts: Counts the restarts of environments that fail; None allows none.
+        isolate: Whether a single environment runs in a process of its own too, so that its crash or hang is survived.
+        step_timeout_s: Seconds that a reset or a step of an environment in a process of its own may take.
 
     Returns:
         A gymnasium vector environment: observations uint8 (env, 64, 64, 3); rewards, terminated and truncated (env,).
@@ -52,17 +62,248 @@ def make_vector_env(
     Raises:
         UserError: The environment cannot be built.
     """
-    factories = [
-        _EnvFactory(config, _derive_env_seed(seed, index), make_env, episode_decisions) for index in range(num_envs)
-    ]
-    if num_envs == 1:
-        return SyncVectorEnv(factories, autoreset_mode=AutoresetMode.DISABLED)
-    with single_threaded_children():
-        return AsyncVectorEnv(factories, shared_memory=True, context="spawn", autoreset_mode=AutoresetMode.DISABLED)
+    lanes: list[Lane] = []
+    for index in range(num_envs):
+        factory = EnvFactory(config, _derive_env_seed(seed, index), make_env, episode_decisions)
+        lanes.append(ProcessLane(factory, step_timeout_s) if isolate or num_envs > 1 else LocalLane(factory))
+    return GuardedVectorEnv(lanes, restarts or Restarts(0))
+
+
+def make_guarded_env(
+    config: EnvConfig,
+    restarts: Restarts,
+    make_env: Callable[[], gymnasium.Env[Any, Any]] | None = None,
+    isolate: bool = False,
+    step_timeout_s: float = STEP_TIMEOUT_S,
+) -> GuardedEnv:
+    """One environment that can be made anew after a fault, for evaluations.
+
+    Args:
+        config: Settings of the environment.
+        restarts: Counts the restarts.
+        make_env: See `make_vector_env`.
+        isolate: See `make_vector_env`.
+        step_timeout_s: See `make_vector_env`.
+    """
+    factory = EnvFactory(config, 0, make_env, None)
+    return GuardedEnv(ProcessLane(factory, step_timeout_s) if isolate else LocalLane(factory), restarts)
+
+
+class Restarts:
+    """Counts how often environments were made anew, within a budget.
+
+    Attributes:
+        count: Restarts so far.
+
+    Args:
+        budget: Restarts that are allowed.
+    """
+
+    def __init__(self, budget: int) -> None:
+        self.budget, self.count = budget, 0
+
+    def spend(self, fault: EnvironmentFault) -> None:
+        """Allow one restart because of a fault.
+
+        Raises:
+            EnvironmentFault: The budget is spent; the fault has the origin of the one given.
+        """
+        if self.count >= self.budget:
+            often = f"after {self.count} restarts (collection.max_restarts {self.budget})"
+            raise EnvironmentFault(f"{fault} {often}", fault.origin)
+        self.count += 1
+
+
+class GuardedVectorEnv(VectorEnv[np.ndarray, np.ndarray, Any]):
+    """Several environments behind one `step`, each of which is made anew when it fails.
+
+    A fault is an exception, a crash, no answer within a time, or a frame or reward that is not as declared. The step
+    that failed truncates the episode: `info["failed"]`, bool (env,), marks the environments, whose frames are those
+    before the step and whose rewards are 0. A reset that fails is repeated.
+
+    Attributes:
+        restarts: Counts how often environments were made anew.
+        facts: Attributes of the first environment; see `Lane.facts`.
+
+    Args:
+        lanes: The environments.
+        restarts: Counts the restarts of all environments.
+
+    Raises:
+        UserError: An environment cannot be made with these settings.
+    """
+
+    metadata = {"autoreset_mode": AutoresetMode.DISABLED}
+
+    def __init__(self, lanes: list[Lane], restarts: Restarts) -> None:
+        self.lanes, self.restarts, self.num_envs = lanes, restarts, len(lanes)
+        try:
+            self.facts = [lane.facts for lane in lanes][0]
+        except BaseException:
+            self.close_extras(timeout=0.0)
+            raise
+        self.single_observation_space = self.facts["observation_space"]
+        self.single_action_space = self.facts["action_space"]
+        self.observation_space = gymnasium.vector.utils.batch_space(self.single_observation_space, self.num_envs)
+        self.action_space = gymnasium.vector.utils.batch_space(self.single_action_space, self.num_envs)
+        shape = self.single_observation_space.shape or ()
+        self._frames = np.zeros((self.num_envs, *shape), np.uint8)
+        self._labels: list[Any] = [None] * self.num_envs
+        self._is_renewed = [False] * self.num_envs  # an environment that was made anew would repeat its first episode
+
+    def reset(
+        self, *, seed: int | Sequence[int | None] | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[np.ndarray, dict[str, Any]]:
+        """Begins episodes in the environments where `options["reset_mask"]`, bool (env,), is true; without it in all.
+
+        Args:
+            seed: Seeds of the environments, or the seed of the first one, from which the others count on; None
+                continues their random streams.
+            options: See above.
+
+        Returns:
+            Frames of all environments, uint8 (env, height, width, 3), and their infos.
+
+        Raises:
+            EnvironmentFault: An environment failed more often than the budget of restarts allows.
+        """
+        seeds = [seed + index for index in range(self.num_envs)] if isinstance(seed, int) else seed
+        mask = (options or {}).get("reset_mask", np.ones(self.num_envs, dtype=bool))
+        begun = np.flatnonzero(mask).tolist()
+        for index in begun:
+            self._ask_for_reset(index, seeds)
+        for index in begun:
+            while True:
+                try:
+                    frame, info = self.lanes[index].answer()
+                    self._keep(index, frame, info)
+                    break
+                except EnvironmentFault as fault:
+                    self._restart(index, fault)
+                    self._ask_for_reset(index, seeds)
+        return self._frames.copy(), self._info(np.zeros(self.num_envs, np.int64), np.zeros(self.num_envs, bool))
+
+    def step(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
+        """One step of all environments with actions (env, action); see the class for steps that fail.
+
+        Raises:
+            EnvironmentFault: An environment failed more often than the budget of restarts allows.
+        """
+        rewards, env_frames = np.zeros(self.num_envs), np.zeros(self.num_envs, np.int64)
+        terminated, truncated, failed = (np.zeros(self.num_envs, dtype=bool) for _ in range(3))
+        for lane, action in zip(self.lanes, actions, strict=True):
+            lane.ask("step", action)
+        given_up: EnvironmentFault | None = None
+        for index, lane in enumerate(self.lanes):  # every answer is taken, also after a fault of another environment
+            try:
+                frame, reward, terminated[index], truncated[index], info = lane.answer()
+                rewards[index] = check_reward(reward)
+                self._keep(index, frame, info)
+                env_frames[index] = info["env_frames"]
+            except EnvironmentFault as fault:
+                terminated[index], truncated[index], failed[index], rewards[index] = False, True, True, 0.0
+                try:
+                    self._restart(index, fault)
+                except EnvironmentFault as last:
+                    given_up = last
+        if given_up is not None:
+            raise given_up
+        return self._frames.copy(), rewards, terminated, truncated, self._info(env_frames, failed)
+
+    def close_extras(self, timeout: float | None = None, **_: Any) -> None:
+        """Ends the environments, those that hang after `timeout` seconds; `close` calls this method once."""
+        end = time.monotonic() + (CLOSING_SECONDS if timeout is None else timeout)
+        for lane in self.lanes:
+            lane.ask_to_close()
+        for lane in self.lanes:
+            lane.close(max(0.0, end - time.monotonic()))
+
+    def _ask_for_reset(self, index: int, seeds: Sequence[int | None] | None) -> None:
+        seed = None if seeds is None else seeds[index]
+        if seed is None and self._is_renewed[index]:
+            seed = derive_seed(self.restarts.count, "restart", index)
+        self._is_renewed[index] = False
+        self.lanes[index].ask("reset", seed=seed)
+
+    def _restart(self, index: int, fault: EnvironmentFault) -> None:
+        self.restarts.spend(fault)
+        _warn_of_restart(fault, self.restarts)
+        self._is_renewed[index] = True
+        self.lanes[index].restart()
+
+    def _keep(self, index: int, frame: Any, info: dict[str, Any]) -> None:
+        self._frames[index] = check_picture(frame, self._frames.shape[1:])
+        self._labels[index] = info.get("labels")
+
+    def _info(self, env_frames: np.ndarray, failed: np.ndarray) -> dict[str, Any]:
+        info: dict[str, Any] = {"env_frames": env_frames, "failed": failed}
+        if all(labels is not None for labels in self._labels):
+            info["labels"] = np.stack(self._labels)
+        return info
+
+
+class GuardedEnv(gymnasium.Env[np.ndarray, np.ndarray]):
+    """One environment whose faults are raised as `EnvironmentFault`, and that is then made anew.
+
+    Spaces and metadata are known once `facts` was read.
+
+    Args:
+        lane: The environment.
+        restarts: Counts the restarts.
+    """
+
+    def __init__(self, lane: Lane, restarts: Restarts) -> None:
+        self._lane, self._restarts = lane, restarts
+
+    @cached_property
+    def facts(self) -> dict[str, Any]:
+        """Attributes of the environment; see `Lane.facts`. The first look waits for the environment's process."""
+        facts = self._lane.facts
+        self.metadata = facts["metadata"]
+        self.observation_space, self.action_space = facts["observation_space"], facts["action_space"]
+        if facts["can_render_large"]:
+            self.render_large = partial(self._call, "render_large")
+        return facts
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        """See the environment's own `reset`."""
+        frame, info = self._call("reset", seed=seed, options=options)
+        return self._checked(frame), info
+
+    def step(self, action: np.ndarray) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        """See the environment's own `step`."""
+        frame, reward, terminated, truncated, info = self._call("step", action)
+        return self._checked(frame), self._guarded(check_reward, reward), terminated, truncated, info
+
+    def render(self) -> Any:
+        """See the environment's own `render`."""
+        return self._call("render")
+
+    def close(self) -> None:
+        """Ends the environment."""
+        self._lane.ask_to_close()
+        self._lane.close()
+
+    def _checked(self, frame: Any) -> np.ndarray:
+        return self._guarded(partial(check_picture, shape=self.observation_space.shape or ()), frame)
+
+    def _call(self, method: str, *arguments: Any, **named: Any) -> Any:
+        self._lane.ask(method, *arguments, **named)
+        return self._guarded(lambda _: self._lane.answer(), None)
+
+    def _guarded(self, check: Callable[[Any], Any], value: Any) -> Any:
+        """The result of a check; after a fault the environment is made anew before the fault is raised."""
+        try:
+            return check(value)
+        except EnvironmentFault as fault:
+            self._restarts.spend(fault)
+            _warn_of_restart(fault, self._restarts)
+            self._lane.restart()
+            raise
 
 
 @dataclass(frozen=True)
-class _EnvFactory:
+class EnvFactory:
     """Builds one environment in the process that calls it; picklable where the user's factory is."""
 
     config: EnvConfig
@@ -71,6 +312,7 @@ class _EnvFactory:
     episode_decisions: int | None
 
     def __call__(self) -> gymnasium.Env[np.ndarray, np.ndarray]:
+        """The environment, which ignores Ctrl-C where it is in a process of its own."""
         if multiprocessing.parent_process() is not None:
             signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches all processes; the parent handles it
         build = make_env if self.factory is None else make_from(self.factory)
@@ -95,16 +337,9 @@ def _derive_env_seed(seed: int | None, index: int) -> int | None:
     return None if seed is None else int(np.random.SeedSequence([seed, index]).generate_state(1)[0])
 
 
-@contextmanager
-def single_threaded_children() -> Iterator[None]:
-    """Limits processes that start inside the `with` block to one thread, by environment variables."""
-    before = {name: os.environ.get(name) for name in _THREAD_SETTINGS}
-    os.environ.update(dict.fromkeys(_THREAD_SETTINGS, "1"))
-    try:
-        yield
-    finally:
-        for name, value in before.items():
-            if value is None:
-                del os.environ[name]
-            else:
-                os.environ[name] = value
+def _warn_of_restart(fault: EnvironmentFault, restarts: Restarts) -> None:
+    warnings.warn(
+        f"{fault}: its episode is cut short, and it is made anew ({restarts.count} of {restarts.budget} restarts)",
+        RuntimeWarning,
+        stacklevel=4,
+    )

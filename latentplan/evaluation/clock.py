@@ -15,6 +15,8 @@ from numpy.typing import NDArray
 
 from latentplan.agents.base import Agent
 from latentplan.config import UserError, derive_seed
+from latentplan.config.checks import shown
+from latentplan.config.reading import LARGEST_DATA, read_text
 from latentplan.planning.model import State, state_device
 from latentplan.planning.objectives import Constraint, Term
 from latentplan.planning.plan import Plan
@@ -195,15 +197,19 @@ def read_latency(text: str) -> Latency:
     if text == MEASURED:
         return Latency()
     try:
-        content = _parse(Path(text).read_text())
-    except OSError as error:
-        raise UserError(f"--latency {text}: {error.strerror}; give {MEASURED!r} or a file of milliseconds") from None
+        written = read_text(Path(text), LARGEST_DATA)
+    except UserError as error:
+        raise UserError(f"--latency: {error}; give {MEASURED!r} or a file of milliseconds") from None
+    try:
+        content = _parse(written)
     except (ValueError, RecursionError):
         raise UserError(f"--latency {text}: not a file of milliseconds; write {_FORMATS}") from None
     durations = content if isinstance(content, dict) else {"decision_ms": content}
     unknown = [name for name in durations if name not in ("decision_ms", "plan_ms")]
     if unknown or "decision_ms" not in durations:
-        raise UserError(f"--latency {text}: the keys are decision_ms and, if plans differ, plan_ms; got {unknown}")
+        raise UserError(
+            f"--latency {text}: the keys are decision_ms and, if plans differ, plan_ms; got {shown(unknown)}"
+        )
     decision_ms = _check_durations(text, "decision_ms", durations["decision_ms"])
     plan_ms = _check_durations(text, "plan_ms", durations["plan_ms"]) if "plan_ms" in durations else decision_ms
     return Latency(text, decision_ms, plan_ms)
@@ -231,5 +237,5 @@ def _check_durations(text: str, name: str, values: Any) -> Milliseconds:
     for value in values:
         is_number = isinstance(value, int | float) and not isinstance(value, bool)
         if not is_number or not 0 <= value <= _MAX_MS:  # NaN is in no interval
-            raise UserError(f"--latency {text}: {name} must lie in 0 to {_MAX_MS:g}, got {value!r}")
+            raise UserError(f"--latency {text}: {name} must lie in 0 to {_MAX_MS:g}, got {shown(value)}")
     return np.asarray(values, dtype=np.float64)

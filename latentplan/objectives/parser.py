@@ -15,13 +15,13 @@ and would take longer to import than a text takes to parse.
 
 from __future__ import annotations
 
-import difflib
 import math
 import re
 from collections.abc import Mapping
 from typing import NamedTuple, NoReturn
 
 from latentplan.config import UserError
+from latentplan.config.checks import nearest, shown
 from latentplan.config.quantities import TASK_PREFIX
 from latentplan.objectives.expression import (
     Absolute,
@@ -48,7 +48,8 @@ _TOKEN = re.compile(
 _RELATIONS = ("<", ">", "->")
 _MAX_TOKENS = 200
 _MAX_DEPTH = 50
-_MAX_SHOWN = 100  # characters of a text in an error message
+_MAX_SHOWN = 60  # characters of a text in an error message
+_MAX_LENGTH = 10_000  # characters of a text; far more than 200 tokens need
 _SWITCH = re.compile(r"\s*(?P<start>[0-9]{1,15})\s*:(?P<text>.*)", re.DOTALL)
 
 
@@ -62,14 +63,17 @@ def parse_schedule(text: str, scales: Mapping[str, float]) -> tuple[Phase, ...]:
     Raises:
         UserError: The text is no schedule; the message names the position and the nearest name.
     """
+    _check_length(text)
     phases: list[Phase] = []
     for part in split_outside_quotes(text, ";"):
         match = _SWITCH.fullmatch(part)
         if phases and match is None:
-            raise UserError(f"{part.strip()!r} needs the env frame from which it holds, as in '; 500: speed -> 1.0'")
+            raise UserError(
+                f"{shown(part.strip())} needs the env frame from which it holds, as in '; 500: speed -> 1.0'"
+            )
         start = 0 if match is None else int(match["start"])
         if start <= phases[-1].start if phases else start > 0:
-            raise UserError(f"env frames of {text!r} must begin with 0 (which may be left out) and increase")
+            raise UserError(f"env frames of {shown(text)} must begin with 0 (which may be left out) and increase")
         phases.append(Phase(start, parse_objective(part if match is None else match["text"], scales)))
     return tuple(phases)
 
@@ -80,6 +84,7 @@ def parse_objective(text: str, scales: Mapping[str, float]) -> Expression:
     Raises:
         UserError: The text is no objective; the message names the position and the nearest name.
     """
+    _check_length(text)
     parser = _Parser(text, scales)
     return Expression(parser.text, tuple(parser.split_sum(parser.parse(), 1.0)))
 
@@ -92,7 +97,7 @@ def parse_reward(text: str, scales: Mapping[str, float], setting: str) -> Expres
     """
     expression = parse_objective(text, scales)
     if any(isinstance(term, LearnedReturn | GoalImage) for _, term in expression.terms):
-        raise UserError(f"{setting} {text!r} must consist of named quantities and tasks only")
+        raise UserError(f"{setting} {shown(text)} must consist of named quantities and tasks only")
     return expression
 
 
@@ -102,6 +107,7 @@ def parse_constraints(text: str, scales: Mapping[str, float]) -> tuple[Clause, .
     Raises:
         UserError: The text is no constraint; the message names the position and the nearest name.
     """
+    _check_length(text)
     return tuple(clause for part in text.split(";") for clause in _Parser(part, scales).read_inequalities())
 
 
@@ -287,9 +293,9 @@ class _Parser:
             self._fail(token, f"unknown function {name!r}; available: abs(QUANTITY), task(NAME)")
         if not self.scales:
             self._fail(token, f"unknown quantity {name!r}: this body has no named quantities")
-        nearest = difflib.get_close_matches(name, self.scales, n=1, cutoff=0.0)[0]
+        similar = nearest(name, self.scales, cutoff=0.0)
         available = ", ".join(self.scales)
-        self._fail(token, f"unknown quantity {name!r}; available: {available}. Did you mean {nearest!r}?")
+        self._fail(token, f"unknown quantity {shown(name)}; available: {available}. Did you mean {similar!r}?")
 
     def _combine(self, sign: _Token, left: Node, right: Node) -> Node:
         node = combine(sign.text, left, right)
@@ -355,6 +361,11 @@ def _is_degree(node: Node) -> bool:
     """Whether the value of a node is a degree in [0, 1]: a clause, clauses joined by `and`, or the reward of a task."""
     is_reward = isinstance(node, Name) and node.name.startswith(TASK_PREFIX)
     return is_reward or isinstance(node, Clause | And)
+
+
+def _check_length(text: str) -> None:
+    if len(text) > _MAX_LENGTH:
+        raise UserError(f"an expression has at most {_MAX_LENGTH:,} characters, got {len(text):,}")
 
 
 def _shorten(text: str) -> str:

@@ -172,7 +172,9 @@ class Plan:
     def warn_of_failures(self) -> None:
         """Warns if no candidate of some environment had a finite return, so that the caller's policy acts there."""
         if bool((self.failures() & (self.info["num_nonfinite"] > 0).cpu()).any()):
-            warnings.warn("a search found nothing finite; the policy acts", RuntimeWarning, stacklevel=2)
+            warnings.warn(
+                "a search found nothing finite; the last plan or the policy acts", RuntimeWarning, stacklevel=2
+            )
 
     def forget(self, mask: Tensor) -> Plan:
         """Returns this plan, except that the environments in mask (batch,) bool start their next search cold."""

@@ -18,10 +18,9 @@ import torch
 from torch import Tensor
 
 from latentplan.config import UserError
-from latentplan.replay.memory import check_memory
+from latentplan.replay.memory import check_memory, count_replay_bytes
 
 FRAME_SHAPE = (64, 64, 3)
-FRAME_BYTES = 64 * 64 * 3
 SAMPLING_ROUNDS = 1000
 COLUMNS = ("deter", "actions", "rewards", "continues", "labels")
 
@@ -244,8 +243,3 @@ def read_saved(path: Path, device: torch.device | str = "cpu", keys: Sequence[st
     except (OSError, RuntimeError, EOFError, KeyError, IndexError, ValueError) as error:
         reason = (str(error).splitlines() or ["it ends too early"])[0][:120]
         raise UserError(f"{path} is damaged: {reason}") from None
-
-
-def count_replay_bytes(num_rows: int, action_dim: int, deter_dim: int, num_labels: int = 0) -> int:
-    """Memory that a replay of `num_rows` rows takes, in bytes."""
-    return num_rows * (FRAME_BYTES + 2 * deter_dim + 4 * (action_dim + num_labels) + 4 + 4 + 8 + 1)

@@ -1,4 +1,4 @@
-"""Free memory for a replay."""
+"""Memory that a replay takes, and memory that is free."""
 
 from __future__ import annotations
 
@@ -12,9 +12,15 @@ from latentplan.config import UserError
 if TYPE_CHECKING:
     import torch
 
+FRAME_BYTES = 64 * 64 * 3
 MEMORY_SHARE = 0.9
 MEMORY_FACTS = Path("/proc/meminfo")
 LIMIT_FACTS = Path("/sys/fs/cgroup")
+
+
+def count_replay_bytes(num_rows: int, action_dim: int, deter_dim: int, num_labels: int = 0) -> int:
+    """Memory that a replay of `num_rows` rows takes, in bytes."""
+    return num_rows * (FRAME_BYTES + 2 * deter_dim + 4 * (action_dim + num_labels) + 4 + 4 + 8 + 1)
 
 
 def check_memory(num_bytes: int, device: torch.device) -> None:

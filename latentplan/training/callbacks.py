@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import lightning
 import numpy as np
 
-from latentplan.config import CollectionConfig, Config
+from latentplan.config import CollectionConfig, Config, EnvironmentFault
 from latentplan.models import WorldModel
 from latentplan.replay.buffer import Replay
 from latentplan.training.collection.collector import Collected
@@ -54,6 +54,7 @@ class Collect(lightning.Callback):
         memory: State of the collector after the last round that was stored.
         is_epoch_over: Whether the epoch that ended last was complete.
         evaluated_weights: Weights that the latest evaluation measured.
+        env_restarts: Environments that were made anew after a fault, since the run was started or resumed.
     """
 
     def __init__(
@@ -70,6 +71,7 @@ class Collect(lightning.Callback):
         self.requests: dict[str, Any] = requests or {"collect": None, "evaluate": None, "weights": None}
         self.memory = memory
         self.is_epoch_over = False
+        self.env_restarts = 0
         self.evaluated_weights: dict[str, np.ndarray] = {}
         self._is_continued = requests is not None
 
@@ -172,8 +174,10 @@ class Collect(lightning.Callback):
 
     def _store_results(self) -> None:
         if self.requests["collect"] is not None:
-            self._store_round(self.worker.result())
+            fault = self._store_round(self.worker.result())
             self.requests["collect"] = None
+            if fault is not None:
+                raise fault
         if self.requests["evaluate"] is not None:
             returns = self.worker.result()
             clocks, self.evaluated_weights = self.requests["evaluate"], self.requests["weights"]
@@ -240,14 +244,16 @@ class Collect(lightning.Callback):
         film = self.videos / f"{frames:09d}.webm" if settings.video else None
         self.worker.submit("evaluate", settings.episodes, film, self.requests["weights"])
 
-    def _store_round(self, collected: Collected) -> None:
+    def _store_round(self, collected: Collected) -> EnvironmentFault | None:
+        """Stores a round, and returns the fault that ended it early."""
         for lane, rows in enumerate(collected.rows):
             self.replay.add(lane, rows)
         self.state.env_frames += collected.env_frames
         self.state.decisions += collected.decisions
         self.state.rounds += 1
         self.state.episode_returns.extend(collected.episode_returns)
-        self.memory = collected.memory
+        self.memory, self.env_restarts = collected.memory, collected.restarts
+        return collected.fault
 
 
 def copy_weights(model: WorldModel) -> dict[str, np.ndarray]:
@@ -363,6 +369,8 @@ class Record(lightning.Callback):
             row["skipped_steps"] = skipped
         if state.worker_restarts:
             row["worker_restarts"] = state.worker_restarts
+        if self.collect.env_restarts:
+            row["env_restarts"] = self.collect.env_restarts
         self._append(trainer, row)
 
     def write_evaluations(self, trainer: lightning.Trainer) -> None:

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import os
-
 import torch
 
 from latentplan.config import Config, RunConfig, UserError
+from latentplan.config.estimates import count_cores
+from latentplan.training.estimates import count_replay_rows
 
-UNKNOWN_LENGTH_CAPACITY = 200_000
 COLLECTOR_THREADS = 4  # an upper limit, because runs often share a machine
 
 
@@ -30,12 +29,12 @@ def choose_threads(overlap: bool) -> int:
 
     No two busy threads share a core. With `overlap` one core is left to the collection process.
     """
-    return max(1, (_count_cores() - overlap) // 2)
+    return max(1, (count_cores() - overlap) // 2)
 
 
 def choose_collector_threads(device: torch.device) -> int:
     """CPU threads of the collection process: one if the learner uses the CPU, up to 4 if the learner uses a GPU."""
-    return 1 if device.type == "cpu" else min(max(1, _count_cores() // 4), COLLECTOR_THREADS)
+    return 1 if device.type == "cpu" else min(max(1, count_cores() // 4), COLLECTOR_THREADS)
 
 
 def set_up_torch(threads: int, device: torch.device) -> None:
@@ -53,17 +52,4 @@ def choose_replay_capacity(config: Config, saved: tuple[int, int]) -> int:
         saved: Environments of the saved replay, and the largest number of rows that one of them holds. Without
             `replay.capacity` all saved rows fit.
     """
-    if config.replay.capacity is not None:
-        return config.replay.capacity
-    num_saved = saved[0] * saved[1]
-    if config.run.frames is None:
-        return max(UNKNOWN_LENGTH_CAPACITY, num_saved)
-    # Up to two rounds exceed the budget, and every episode ends with one frame without an action.
-    decisions = config.run.frames / config.env.action_repeat
-    per_episode = min(config.collection.episode_decisions or 20, 20)
-    collected = 2 * config.collection.round_decisions + config.collection.prefill_decisions
-    return max(int((1.0 + 1.0 / per_episode) * decisions) + collected, num_saved)
-
-
-def _count_cores() -> int:
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    return count_replay_rows(config, saved[0] * saved[1])

@@ -19,7 +19,7 @@ from lightning.pytorch.loggers import TensorBoardLogger
 from lightning.pytorch.utilities.exceptions import SIGTERMException
 
 from latentplan.agents.checkpoint import load_model
-from latentplan.config import USER_DOMAIN, Config, Device, UserError, derive_seed
+from latentplan.config import USER_DOMAIN, Config, Device, EnvironmentFault, UserError, derive_seed
 from latentplan.config.commit import Save
 from latentplan.config.files import dump_config, read_config
 from latentplan.config.run_folder import RUN_FILE, SAVES_FOLDER, read_run_config, run_saves
@@ -29,6 +29,7 @@ from latentplan.models.fast import accelerate
 from latentplan.replay.buffer import Replay
 from latentplan.replay.disk import ReplayFiles, count_saved
 from latentplan.training.callbacks import Collect, Record, copy_weights
+from latentplan.training.checks import check_settings
 from latentplan.training.collection.collector import Description, EnvFactory
 from latentplan.training.collection.episodes import Stopped, to_arrays
 from latentplan.training.collection.process import Worker, WorkerEnded, make_worker
@@ -155,6 +156,7 @@ def resume(
 
 def _start(config: Config, folder: Path, make_env: EnvFactory | None, *, resume: bool) -> Result:
     """Runs until the end, an interruption or an error; goes back to the last save after too many skipped steps."""
+    check_settings(config)
     failed_at = -1
     with lock_folder(folder), Signals() as signals:
         while True:
@@ -262,18 +264,22 @@ class _Run:
         if copy is None or read_config(copy) != config:
             save.save_run(trainer, self.learner)  # so that a run that ends before its next save can be resumed
             dump_config(config, self.folder / RUN_FILE)
-        if is_unfinished := not stop.is_spent():
-            self._fit(trainer)
-        if is_unfinished or collect.has_requests():
+        try:
+            if is_unfinished := not stop.is_spent():
+                self._fit(trainer)
+            if is_unfinished or collect.has_requests():
+                with contextlib.suppress(Stopped):
+                    if not state.interrupted:
+                        collect.complete()
+                record.write_evaluations(trainer)
+                save.keep_best(self.learner)
+                save.save(trainer, self.learner)
             with contextlib.suppress(Stopped):
                 if not state.interrupted:
-                    collect.complete()
-            record.write_evaluations(trainer)
-            save.keep_best(self.learner)
+                    return Result(self.folder, 0, self._finish(trainer, save, videos / "final.webm"))
+        except EnvironmentFault as fault:
             save.save(trainer, self.learner)
-        with contextlib.suppress(Stopped):
-            if not state.interrupted:
-                return Result(self.folder, 0, self._finish(trainer, save, videos / "final.webm"))
+            raise EnvironmentFault(f"{fault}; the run is saved in {self.folder}", fault.origin) from None
         command = f"python scripts/train.py --resume {self.folder}"
         if config.env.domain == USER_DOMAIN:
             command = f'latentplan.training.resume("{self.folder}", make_env=...)'

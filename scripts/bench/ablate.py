@@ -51,7 +51,8 @@ class Request(ComputeRequest):
 def run(request: Request) -> int:
     """Plays every arm from the same starts and compares the arms with the full planner."""
     episodes, seed, workers, checkpoint = request.episodes, request.seed, request.workers, str(request.checkpoint)
-    info, planner = check_checkpoint(request.checkpoint)
+    info, config = check_checkpoint(request.checkpoint)
+    planner = config.planner
     arms = parse_arms(request.arms, planner)
     device = request.use_device()
     from latentplan.evaluation.episodes import episode_seed

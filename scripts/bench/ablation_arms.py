@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from latentplan.config import PlannerConfig, UserError, to_dict
+from latentplan.config import Config, PlannerConfig, UserError, to_dict
 from latentplan.config.files import build_config, field_names
 from latentplan.config.parsing import raise_unknown
 from latentplan.config.planner import override_planner
@@ -121,8 +121,8 @@ def play_arm(arm: Arm, checkpoint: str, seeds: Sequence[int], device: str) -> Ou
     )
 
 
-def check_checkpoint(path: Path) -> tuple[dict[str, Any], PlannerConfig]:
-    """The description of a checkpoint, and its settings of the search.
+def check_checkpoint(path: Path) -> tuple[dict[str, Any], Config]:
+    """The description of a checkpoint, and the settings of its run.
 
     Raises:
         UserError: The checkpoint is missing or damaged.
@@ -130,7 +130,7 @@ def check_checkpoint(path: Path) -> tuple[dict[str, Any], PlannerConfig]:
     from latentplan.agents.checkpoint import load_model
 
     _, config, info = load_model(path)
-    return info, config.planner
+    return info, config
 
 
 def _split_arms(text: str) -> list[tuple[str, list[str]]]:

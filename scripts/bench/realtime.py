@@ -70,7 +70,8 @@ def run(request: Request) -> int:
     from latentplan.envs import make_env
     from latentplan.evaluation.episodes import episode_seed
 
-    info, planner = check_checkpoint(request.checkpoint)
+    info, config = check_checkpoint(request.checkpoint)
+    planner = config.planner
     about = {
         "checkpoint": checkpoint,
         "domain": info["domain"],

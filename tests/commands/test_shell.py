@@ -12,6 +12,10 @@ import torch
 from latentplan.commands.shell import ComputeRequest, run_guarded
 from latentplan.config import UserError
 
+REFUSED = "error: the system refused a file or a process"
+ALLOCATOR = "error: not enough memory on the device"
+LOWER = "lower the sizes that were asked for, or end other programs"
+
 
 @pytest.mark.parametrize(
     ("error", "code", "line"),
@@ -23,6 +27,9 @@ from latentplan.config import UserError
             "error: the gradient is not finite at update 1\n",
         ),
         (OSError(errno.ENAMETOOLONG, "too long", "a" * 300), 2, f"error: a file name is too long: {'a' * 80}...\n"),
+        (OSError(errno.ENOSPC, "No space left", "runs/a"), 2, f"{REFUSED}: 'runs/a': No space left\n"),
+        (MemoryError(), 2, f"error: not enough memory: {LOWER}\n"),
+        (RuntimeError("[enforce fail] DefaultCPUAllocator: can't allocate memory"), 2, f"{ALLOCATOR}: {LOWER}\n"),
         (UserError("unicode \ud800 é"), 2, "error: unicode \\ud800 é\n"),
         (KeyboardInterrupt(), 130, ""),
     ],
@@ -35,7 +42,7 @@ def test_run_guarded_turns_errors_into_one_line_and_an_exit_code(error, code, li
     assert capsys.readouterr() == ("", line)
 
 
-@pytest.mark.parametrize("error", [ValueError("a bug"), OSError(errno.EIO, "disk")])
+@pytest.mark.parametrize("error", [ValueError("a bug"), RuntimeError("a bug"), OSError("without a number")])
 def test_run_guarded_lets_bugs_through(error):
     def fail(argv):
         raise error

@@ -1,5 +1,6 @@
 """YAML files and flags laid over one another into one Config."""
 
+import ast
 import dataclasses
 
 import pytest
@@ -16,6 +17,7 @@ from latentplan.config.files import (
     read_config,
     read_layer,
 )
+from latentplan.config.suites import DEFAULT_SUITE, SUITES
 
 CONFIG_FILES = sorted(path.stem for path in config_folder().glob("*.yaml"))
 TASKS = {
@@ -191,6 +193,15 @@ def test_field_names_are_those_of_the_dataclasses():
     for section, kind in SECTIONS.items():
         assert field_names(section) == [field.name for field in dataclasses.fields(kind)]
     assert list(to_dict(Config())) == list(SECTIONS)
+
+
+def test_tasks_are_those_of_the_suite(run_python):
+    code = "from dm_control import suite; print(suite.TASKS_BY_DOMAIN)"
+    result = run_python("-c", f"import os; os.environ['MUJOCO_GL'] = 'disable'; {code}")
+    known = ast.literal_eval(result.stdout)
+    assert {domain: sorted(tasks) for domain, tasks in known.items()} == {
+        domain: sorted(tasks) for domain, tasks in SUITES[DEFAULT_SUITE].names.items()
+    }
 
 
 def test_domains_are_those_of_the_suite(run_python):

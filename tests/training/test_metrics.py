@@ -44,7 +44,7 @@ def test_metrics_file_keeps_figures_of_earlier_columns_when_losses_come_and_go(f
 def test_record_writes_each_metric_of_the_learner_to_csv_and_tensorboard(tmp_path):
     """The header orders losses as the learner does, and gradient norms after them."""
     state = RunState(env_frames=30, decisions=15, earlier_minutes=2.0, episode_returns=[4.0, 6.0])
-    collect = SimpleNamespace(is_epoch_over=True)
+    collect = SimpleNamespace(is_epoch_over=True, env_restarts=2)
     record = Record(tmp_path / "metrics.csv", state, collect, SimpleNamespace(episode_return=None))
     names = ("reconstruction", "model_grad_norm", "surprise", "behaviour_grad_norm")
     metrics = {name: torch.tensor(float(place)) for place, name in enumerate(names)}
@@ -53,7 +53,8 @@ def test_record_writes_each_metric_of_the_learner_to_csv_and_tensorboard(tmp_pat
     record.on_train_epoch_end(SimpleNamespace(logger=logger), learner)
     logger.finalize("success")
     ((row,), header) = read_table(tmp_path / "metrics.csv")
-    assert header == (*COLUMNS, "reconstruction", "surprise", "model_grad_norm", "behaviour_grad_norm")
+    losses = ("reconstruction", "surprise", "model_grad_norm", "behaviour_grad_norm")
+    assert header == (*COLUMNS, *losses, "env_restarts") and row["env_restarts"] == "2"
     assert (row["env_frames"], row["updates"], row["episode_return"]) == ("30", "7", "5.0")
     assert [float(row[name]) for name in names] == [0.0, 1.0, 2.0, 3.0]
     events = EventAccumulator(str(tmp_path / "tensorboard")).Reload()

@@ -10,18 +10,21 @@ from __future__ import annotations
 import ctypes
 import functools
 import hashlib
+import logging
+import multiprocessing
 import os
 import platform
 import shutil
 import subprocess
-import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 
 import torch
 from torch import Tensor
 
+from latentplan.config.checks import cut
 from latentplan.models.fast import pointwise
+from latentplan.models.fast.cache import load_cached
 
 FOLDER = Path(__file__).parent
 HEADERS = ("rows.h", "vectors.h", "products.h", "wide.h", "layers.h", "convolutions.h")
@@ -34,6 +37,8 @@ WIDE = "-mprefer-vector-width=512"  # only x86 compilers accept it
 LONGEST_ROW = 4096  # as in kernels.c
 COMPILE_SECONDS = 60
 DTYPES = {torch.bfloat16: "bfloat16", torch.float32: "float32"}
+
+LOGGER = logging.getLogger("latentplan")
 
 Norm = tuple[Tensor, Tensor]  # scale and shift
 
@@ -108,8 +113,9 @@ def load(*, is_exact: bool = False) -> ctypes.CDLL | None:
     if os.environ.get("LATENTPLAN_KERNELS") == "0":
         return None
     try:
-        library = ctypes.CDLL(str(_compile(LEARNED, ["-DEXACT"]) if is_exact else _compile(PLANNED + LEARNED, [])))
-    except (OSError, RuntimeError, subprocess.SubprocessError):
+        library = _compile(LEARNED, ["-DEXACT"]) if is_exact else _compile(PLANNED + LEARNED, [])
+    except (OSError, RuntimeError, subprocess.SubprocessError) as error:
+        _say_slower("the C compiler failed" if isinstance(error, subprocess.SubprocessError) else cut(str(error)))
         return None
     place, count, threads, number = ctypes.c_void_p, ctypes.c_long, ctypes.c_int, ctypes.c_double
     library.unroll.argtypes = library.apply_network.argtypes = [place, threads]
@@ -130,11 +136,18 @@ def load(*, is_exact: bool = False) -> ctypes.CDLL | None:
     return library
 
 
-def _compile(names: Sequence[str], options: Sequence[str]) -> Path:
-    """The path of the library compiled from some sources, which is built if it is not in the cache.
+@functools.cache
+def _say_slower(reason: str) -> None:
+    """Says in one line, once, that torch computes instead; processes that the program starts stay silent."""
+    if multiprocessing.parent_process() is None:
+        LOGGER.warning("latentplan: no compiled kernels (%s); torch computes instead, slower", reason)
+
+
+def _compile(names: Sequence[str], options: Sequence[str]) -> ctypes.CDLL:
+    """The library compiled from some sources, which is built if the cache does not hold it; see `load_cached`.
 
     Raises:
-        OSError: There is no compiler, or the cache cannot be written.
+        OSError: There is no compiler, or nothing can be written.
         RuntimeError: The user's home directory is unknown.
         subprocess.SubprocessError: The compiler failed.
     """
@@ -146,15 +159,11 @@ def _compile(names: Sequence[str], options: Sequence[str]) -> Path:
     command = [*compiler.split(), *FLAGS, *wide, *options, *map(str, sources), "-lm"]
     texts = [source.read_text() for source in (*(FOLDER / name for name in HEADERS), *sources)]
     key = hashlib.sha256("\n".join([*command, _describe_processor(), *texts]).encode()).hexdigest()[:16]
-    home = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "latentplan"
-    library = home / f"kernels-{key}.so"
-    if not library.exists():
-        home.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryDirectory(dir=home) as folder:  # another process may build at once
-            fresh = Path(folder) / library.name
-            subprocess.run([*command, "-o", str(fresh)], check=True, capture_output=True, timeout=COMPILE_SECONDS)
-            os.replace(fresh, library)
-    return library
+
+    def build(path: Path) -> None:
+        subprocess.run([*command, "-o", str(path)], check=True, capture_output=True, timeout=COMPILE_SECONDS)
+
+    return load_cached(f"kernels-{key}.so", build)
 
 
 def _describe_processor() -> str:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import time
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -19,9 +19,13 @@ from latentplan.agents.base import ModelAgent
 from latentplan.agents.modes import make_agent
 from latentplan.agents.planning import PlanningAgent
 from latentplan.agents.random import RandomAgent
-from latentplan.config import Config, UserError, derive_seed
-from latentplan.envs import make_env, make_from, make_vector_env, render_info
-from latentplan.evaluation.episodes import episode_seed, run_episodes
+from latentplan.config import Config, EnvironmentFault, UserError, derive_seed
+from latentplan.config.suites import DEFAULT_SUITE
+from latentplan.envs import make_vector_env, render_info
+from latentplan.envs.faults import FrameCheck
+from latentplan.envs.vector import Restarts, make_guarded_env
+from latentplan.evaluation.episodes import OnStep, episode_seed, run_episodes
+from latentplan.evaluation.statistics import Episode
 from latentplan.models import WorldModel
 from latentplan.models.fast import accelerate
 from latentplan.models.heads import LARGEST_SCALAR
@@ -47,13 +51,17 @@ class Collected:
         decisions: Actions chosen in this round, over all environments.
         episode_returns: Returns of the episodes that ended in this round.
         memory: State of the collector after this round, from which `Collector.restore` continues.
+        restarts: Environments that were made anew after a fault so far, over all rounds and evaluations.
+        fault: The fault after which no restart was left, and which ended the round early; None in a whole round.
     """
 
     rows: list[Rows]
     env_frames: int
     decisions: int
     episode_returns: list[float]
-    memory: dict[str, Any]
+    memory: dict[str, Any] | None
+    restarts: int = 0
+    fault: EnvironmentFault | None = None
 
 
 @dataclass(frozen=True)
@@ -90,15 +98,31 @@ class Collector:
     def __init__(self, config: Config, make_user_env: EnvFactory | None, device: str) -> None:
         self.config = config
         self._make_user_env = make_user_env
-        self.envs = make_vector_env(
-            config.env, config.env.num_envs, config.run.seed, make_user_env, config.collection.episode_decisions
-        )
-        build = make_env if make_user_env is None else make_from(make_user_env)
-        self._eval_env = build(config.env, 0)
+        self.restarts = Restarts(config.collection.max_restarts)
+        is_foreign = make_user_env is not None or config.env.suite != DEFAULT_SUITE
+        guards: dict[str, Any] = {
+            "isolate": config.collection.overlap and is_foreign,
+            "step_timeout_s": config.collection.step_timeout_s,
+        }
+        self._eval_env = make_guarded_env(config.env, self.restarts, make_user_env, **guards)
+        try:
+            self.envs = make_vector_env(
+                config.env,
+                config.env.num_envs,
+                config.run.seed,
+                make_user_env,
+                config.collection.episode_decisions,
+                self.restarts,
+                **guards,
+            )
+            facts = self._eval_env.facts
+        except BaseException:
+            self._eval_env.close()
+            raise
         action_dim = int(np.prod(self.envs.single_action_space.shape or ()))
-        self._decisions: int | None = getattr(self._eval_env.unwrapped, "decisions_per_episode", None)
+        self._decisions: int | None = facts["decisions_per_episode"]
         self.discount = discount = config.learning.discount or _choose_discount(self._decisions)
-        self.labels: dict[str, float] = getattr(self._eval_env.unwrapped, "labels", {})
+        self.labels: dict[str, float] = facts["labels"] or {}
         self.model = accelerate(WorldModel(config.model, action_dim, self.labels).to(device))
         noise, correlation = config.collection.noise_std, config.collection.noise_correlation
         planner, goal_planner = (
@@ -119,6 +143,7 @@ class Collector:
         self._has_ended = np.ones(config.env.num_envs, dtype=bool)
         self._returns = np.zeros(config.env.num_envs)
         self._check_rewards = RewardCheck(config.env.num_envs, discount)
+        self._check_frames = FrameCheck(config.env.num_envs)
         self._current_agent: ModelAgent | RandomAgent | None = None
         self.should_stop: Callable[[], bool] = lambda: False
 
@@ -150,8 +175,8 @@ class Collector:
             counter: Number of the round, from which its random streams derive.
             goal: Expression that the planner pursues instead of the reward; None pursues the reward.
 
-        Raises:
-            UserError: The environment returned a reward that is not finite.
+        Returns:
+            The round; where the environments fail too often, its beginning and the fault.
         """
         agent = self._random if weights is None else self._agents[behaviour if goal is None else "goal"]
         if weights is not None:
@@ -164,13 +189,18 @@ class Collector:
         agent.seed(derive_seed(self.config.run.seed, "collect", counter))
         steps = -(-decisions // len(self._has_ended))
         log = _Log(len(self._has_ended), self.model.action_dim, self.config.model.deter_dim)
-        for _ in range(steps):
-            if self.should_stop():
-                raise Stopped
-            self._restart_ended(agent)
-            self._step(agent, log)
-        decisions = steps * len(self._has_ended)
-        return Collected(log.rows(), log.env_frames, decisions, log.returns, self._copy_memory())
+        taken, fault = 0, None
+        try:
+            for _ in range(steps):
+                if self.should_stop():
+                    raise Stopped
+                self._restart_ended(agent)
+                self._step(agent, log)
+                taken += 1
+        except EnvironmentFault as error:
+            fault = error
+        decisions, memory = taken * len(self._has_ended), self._copy_memory()
+        return Collected(log.rows(), log.env_frames, decisions, log.returns, memory, self.restarts.count, fault)
 
     def restore(self, memory: dict[str, Any]) -> None:
         """Continues after a round of another collector: plays its running episodes again, action by action.
@@ -193,9 +223,10 @@ class Collector:
             agent.set_memory(memory["belief"])
         self._current_agent = agent
 
-    def _copy_memory(self) -> dict[str, Any]:
-        """What `restore` needs, as NumPy arrays and plain values, which pass between processes."""
-        assert self._frames is not None
+    def _copy_memory(self) -> dict[str, Any] | None:
+        """What `restore` needs, as NumPy arrays and plain values, which pass between processes; None before a start."""
+        if self._frames is None:
+            return None
         agent = self._current_agent
         names = {id(own): name for name, own in self._agents.items()}
         memory = {
@@ -236,15 +267,31 @@ class Collector:
             if film is not None:
                 every = -(-(self._decisions or 0) // FILMED_FRAMES) or 1
                 on_step = stack.enter_context(filming_if_possible(film, self._eval_env, planner, every=every))
-            played = {"planner": run_episodes(self._eval_env, planner, seeds, on_step=on_step)}
+            played = {"planner": self._play(planner, seeds, on_step)}
         if actor:
-            played["actor"] = run_episodes(self._eval_env, self._evaluation_agents["actor"], seeds)
+            played["actor"] = self._play(self._evaluation_agents["actor"], seeds)
         return {mode: [episode.total_return for episode in rollouts] for mode, rollouts in played.items()}
 
     def close(self) -> None:
         """Ends simulators and their processes."""
         self.envs.close(timeout=CLOSING_SECONDS)  # without a timeout, close waits forever for a step that failed
         self._eval_env.close()
+
+    def _play(self, agent: Any, seeds: Sequence[int], on_step: OnStep | None = None) -> list[Episode]:
+        """Whole episodes of an agent; an episode in which the environment failed is played again.
+
+        Raises:
+            EnvironmentFault: The environment failed more often than the budget of restarts allows.
+        """
+        played: list[Episode] = []
+        while len(played) < len(seeds):
+            before = self.restarts.count
+            try:
+                played += run_episodes(self._eval_env, agent, [seeds[len(played)]], on_step=None if played else on_step)
+            except EnvironmentFault:
+                if self.restarts.count == before:
+                    raise
+        return played
 
     def _load_weights(self, weights: dict[str, np.ndarray]) -> None:
         self.model.load_state_dict({name: torch.from_numpy(value) for name, value in weights.items()})
@@ -268,12 +315,14 @@ class Collector:
         deter = None if state is None else first_turn(state).deter.float().cpu().numpy()
         self._frames, rewards, terminated, truncated, info = self._episodes.step(actions)
         self._check_rewards(rewards, first)
+        self._check_frames(frames)
         self._has_ended = terminated | truncated
         self._returns += rewards
         if self.labels:
             self._labels = np.array(info["labels"], np.float32)
-        log.append(frames, deter, actions, rewards, ~terminated, first, labels, np.asarray(info["env_frames"]))
-        for lane in np.flatnonzero(self._has_ended):
+        failed = info["failed"]
+        log.append(frames, deter, actions, rewards, ~terminated, first, labels, np.asarray(info["env_frames"]), failed)
+        for lane in np.flatnonzero(self._has_ended & ~failed):
             last_frame, last_labels = self._frames[lane].copy(), self._labels[lane].copy()  # a restart overwrites both
             log.finish(int(lane), last_frame, last_labels, float(self._returns[lane]))
 
@@ -303,8 +352,12 @@ class _Log:
         first: np.ndarray,
         labels: np.ndarray,
         env_frames: np.ndarray,
+        failed: np.ndarray,
     ) -> None:
         beliefs = self._no_deter if deter is None else deter
+        actions = np.where(
+            failed[:, None], self._no_action, actions
+        )  # of a step that failed, the next frame is unknown
         for lane, entries in enumerate(self._lanes):
             row = (frames, beliefs, actions, rewards, continues.astype(np.float32), first, labels)
             entries.append(tuple(part[lane] for part in row))

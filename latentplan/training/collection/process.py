@@ -18,7 +18,7 @@ from typing import Any
 import torch
 from gymnasium.vector.utils import CloudpickleWrapper
 
-from latentplan.config import Config, UserError
+from latentplan.config import Config, EnvironmentFault, UserError
 from latentplan.envs import single_threaded_children
 from latentplan.training.collection.collector import CLOSING_SECONDS, Collector, EnvFactory
 from latentplan.training.collection.episodes import Stopped
@@ -87,7 +87,7 @@ class RemoteWorker:
         should_stop: Callable[[], bool] = lambda: False,
     ) -> None:
         self._arguments = (make_user_env and CloudpickleWrapper(make_user_env), config, threads)
-        self._should_stop, self._is_daemon = should_stop, config.env.num_envs == 1
+        self._should_stop = should_stop
         self._start()
 
     def restart(self) -> None:
@@ -98,7 +98,7 @@ class RemoteWorker:
     def _start(self) -> None:
         context = multiprocessing.get_context("spawn")
         self._connection, child_end = context.Pipe()
-        self._process = context.Process(target=_serve, args=(child_end, *self._arguments), daemon=self._is_daemon)
+        self._process = context.Process(target=_serve, args=(child_end, *self._arguments), daemon=False)
         with single_threaded_children():
             self._process.start()
         child_end.close()
@@ -133,7 +133,7 @@ class RemoteWorker:
             code = self._process.exitcode
             raise WorkerEnded(f"the collection process ended unexpectedly (exit code {code})") from None
         if kind == "user_error":
-            raise UserError(value)
+            raise value
         if kind == "error":
             raise RuntimeError(f"collection failed:\n{value}")
         return value
@@ -186,7 +186,7 @@ def _serve(connection: Connection, make_user_env: EnvFactory | None, config: Con
                 collector = Collector(config, make_user_env, "cpu")
             answer = "ok", getattr(collector, method)(*arguments)
         except UserError as error:
-            answer = "user_error", str(error)
+            answer = "user_error", error if isinstance(error, EnvironmentFault) else UserError(str(error))
         except Exception:
             answer = "error", traceback.format_exc()
         try:

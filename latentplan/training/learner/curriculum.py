@@ -13,12 +13,11 @@ import lightning
 import torch
 from torch import Tensor
 
-from latentplan.config import Config, UserError
-from latentplan.config.quantities import TASK_PREFIX
+from latentplan.config import Config
 from latentplan.objectives.box import scoring_degree
-from latentplan.objectives.expression import Name, Node, evaluate
-from latentplan.objectives.parser import parse_reward
+from latentplan.objectives.expression import Node, evaluate
 from latentplan.replay.buffer import Batch
+from latentplan.training.checks import parse_curriculum_task
 from latentplan.training.state import RunState
 
 if TYPE_CHECKING:
@@ -51,7 +50,7 @@ class Curriculum(lightning.Callback):
         task = config.learning.curriculum_task
         own = config.env.task if config.env.objective is None else config.env.objective
         if self._frames > 0 and task not in (None, own):
-            self._terms = _parse_task(task, labels)
+            self._terms = parse_curriculum_task(task, labels)
             self.note = f"; first {task}, for {self._frames:,} frames"
 
     def __call__(self, batch: Batch) -> Batch:
@@ -71,20 +70,6 @@ class Curriculum(lightning.Callback):
 
     def _is_over(self) -> bool:
         return self.state.env_frames >= self._frames
-
-
-def _parse_task(text: str, labels: Mapping[str, float]) -> tuple[tuple[float, Node], ...]:
-    """Weighted terms of the reward, from a task's name or from an expression over quantities."""
-    if TASK_PREFIX + text in labels:
-        return ((1.0, Name(TASK_PREFIX + text)),)
-    try:
-        return parse_reward(text, labels, "learning.curriculum_task").terms
-    except UserError as error:
-        tasks = [name.removeprefix(TASK_PREFIX) for name in labels if name.startswith(TASK_PREFIX)]
-        raise UserError(
-            f"learning.curriculum_task {text!r} is unknown; tasks with known rewards in this domain: "
-            f"{', '.join(tasks) or 'none'}; as an expression: {error}"
-        ) from None
 
 
 def sum_rewards(values: Tensor, action_repeat: int) -> Tensor:

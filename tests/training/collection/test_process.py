@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from latentplan.config import UserError
+from latentplan.config import EnvironmentFault, UserError
 from latentplan.training.collection.process import LocalWorker, RemoteWorker
 
 
@@ -46,9 +46,11 @@ def test_remote_worker_raises_user_errors_and_failures_of_the_collector(tiny, do
     worker.submit("describe")
     with pytest.raises(UserError, match=r"must return a gymnasium\.Env, got dict"):
         worker.result()
-    worker.submit("collect", None, "random", 3, 0)
-    with pytest.raises(RuntimeError, match="the dot is lost"):
+    worker.submit("evaluate", 1)
+    with pytest.raises(EnvironmentFault, match=r"raised ZeroDivisionError: the dot is lost after 10 restarts") as fault:
         worker.result()
+    assert fault.value.origin.rstrip().endswith("ZeroDivisionError: the dot is lost")
+    assert "latentplan" not in fault.value.origin and 'raise ZeroDivisionError("the dot is lost")' in fault.value.origin
     worker.close()
 
 

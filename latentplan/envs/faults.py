@@ -1,0 +1,118 @@
+"""What an environment may return, and how its failures are reported."""
+
+from __future__ import annotations
+
+import traceback
+import warnings
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import numpy as np
+
+from latentplan.config import UserError
+from latentplan.config.checks import EnvironmentFault, cut, shown
+
+UNCHANGED_FRAMES = 100  # equal frames in a row after which a picture counts as constant
+PLAIN_FRAMES = 10  # frames of one colour in a row after which a picture counts as blank
+_OWN_FOLDERS = (str(Path(__file__).parents[1]), str(Path(gymnasium.__file__).parent))
+
+
+def check_picture(picture: Any, shape: tuple[int, ...]) -> np.ndarray:
+    """An observation as an array of its own, uint8 of the shape that its space declares.
+
+    Whole numbers of another type are accepted within 0 to 255.
+
+    Raises:
+        EnvironmentFault: The observation is none of this; the message says what it is.
+    """
+    wanted = f"the environment must return frames uint8 {shape}"
+    try:
+        given = np.asarray(picture)
+    except (TypeError, ValueError):
+        raise EnvironmentFault(f"{wanted}, got {type(picture).__name__}") from None
+    if given.dtype == np.uint8 and given.shape == shape:
+        return np.array(given)
+    if given.dtype == object or given.shape == ():
+        raise EnvironmentFault(f"{wanted}, got {shown(picture)}")
+    if given.shape != shape:
+        raise EnvironmentFault(f"{wanted}, got shape {given.shape}")
+    if not np.issubdtype(given.dtype, np.integer):
+        raise EnvironmentFault(f"{wanted}, got {given.dtype} {_describe_range(given)}")
+    if given.min() < 0 or given.max() > 255:
+        raise EnvironmentFault(f"{wanted}, got values {given.min()} to {given.max()}")
+    return given.astype(np.uint8)
+
+
+def check_reward(reward: Any) -> float:
+    """A reward as a number that is finite in float32, in which replay stores it.
+
+    Raises:
+        EnvironmentFault: The reward is no number, or is not finite.
+    """
+    try:
+        value = float(reward)
+    except (TypeError, ValueError, OverflowError):
+        raise EnvironmentFault(f"the environment must return rewards that are numbers, got {shown(reward)}") from None
+    with np.errstate(over="ignore"):
+        if not np.isfinite(np.float32(value)):
+            raise EnvironmentFault(f"the environment returned a reward that is not finite: {value}")
+    return value
+
+
+def describe_failure(error: BaseException) -> EnvironmentFault:
+    """The fault that an exception of an environment stands for, with the traceback of the environment's own code.
+
+    Raises:
+        UserError: The exception is a mistake of the user, such as a missing renderer, which no restart mends.
+    """
+    if isinstance(error, EnvironmentFault):
+        return error
+    if isinstance(error, UserError):
+        raise UserError(str(error))
+    own = error.__traceback__
+    while own is not None and own.tb_next is not None and own.tb_frame.f_code.co_filename.startswith(_OWN_FOLDERS):
+        own = own.tb_next
+    origin = "".join(traceback.format_exception(type(error), error, own))
+    return EnvironmentFault(f"the environment raised {type(error).__name__}: {cut(str(error))}", origin)
+
+
+class FrameCheck:
+    """Warns once of frames that show nothing: of one colour, or the same for a long time.
+
+    Args:
+        num_envs: Number of environments.
+    """
+
+    def __init__(self, num_envs: int) -> None:
+        self._last: np.ndarray | None = None
+        self._num_unchanged = np.zeros(num_envs, np.int64)
+        self._num_plain = np.zeros(num_envs, np.int64)
+        self._has_warned: set[str] = set()
+
+    def __call__(self, frames: np.ndarray) -> None:
+        """Look at the present frames, uint8 (env, height, width, 3)."""
+        if self._last is not None and self._last.shape == frames.shape:
+            is_same = np.array([np.array_equal(*pair) for pair in zip(frames, self._last, strict=True)])
+            self._num_unchanged = np.where(is_same, self._num_unchanged + 1, 0)
+        self._last = frames.copy()
+        is_plain = np.array([frame.min() == frame.max() for frame in frames])
+        self._num_plain = np.where(is_plain, self._num_plain + 1, 0)
+        if self._num_plain.max() >= PLAIN_FRAMES:
+            colour = "black" if frames[int(self._num_plain.argmax())].max() == 0 else "of one colour"
+            self._warn("plain", f"the last {PLAIN_FRAMES} frames of an environment are {colour}")
+        elif self._num_unchanged.max() >= UNCHANGED_FRAMES:
+            self._warn("unchanged", f"the frames of an environment have not changed for {UNCHANGED_FRAMES} decisions")
+
+    def _warn(self, kind: str, what: str) -> None:
+        if kind not in self._has_warned:
+            self._has_warned.add(kind)
+            warnings.warn(f"{what}: nothing can be learned from them; look at its camera", RuntimeWarning, stacklevel=3)
+
+
+def _describe_range(values: np.ndarray) -> str:
+    if np.issubdtype(values.dtype, np.floating):
+        if not np.isfinite(values).all():
+            return "with values that are not finite"
+        return f"with values {values.min():g} to {values.max():g}"
+    return "values"

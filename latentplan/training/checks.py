@@ -1,0 +1,60 @@
+"""Checks of a run's settings that need no torch: names, expressions, memory and time."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from latentplan.config import USER_DOMAIN, Config, PlannerConfig, UserError
+from latentplan.config.checks import shown
+from latentplan.config.parsing import raise_unknown
+from latentplan.config.quantities import TASK_PREFIX, scales
+from latentplan.config.suites import DEFAULT_SUITE, check_task
+from latentplan.objectives.expression import Name, Node
+from latentplan.objectives.parser import parse_objective, parse_reward
+from latentplan.training.estimates import check_run
+
+
+def check_settings(config: Config) -> None:
+    """Refuses a run that cannot work, before its first process starts.
+
+    Raises:
+        UserError: A task, a planner or an expression does not exist, or the machine cannot serve the run.
+    """
+    check_run(config)
+    env, learning = config.env, config.learning
+    if env.suite == DEFAULT_SUITE and env.domain != USER_DOMAIN:
+        check_task(env.suite, env.domain, env.task)
+        known = scales(env.domain)
+        if env.objective is not None:
+            parse_reward(env.objective, known, "env.objective")
+        for goal in config.collection.goals:
+            parse_objective(goal, known)
+        if learning.curriculum_task not in (None, env.task) and learning.curriculum_frames > 0:
+            parse_curriculum_task(str(learning.curriculum_task), known)
+    if config.planner.method != PlannerConfig.method:
+        from latentplan.planning.search.registry import PLANNERS
+
+        if config.planner.method not in PLANNERS:
+            raise_unknown("planner", config.planner.method, PLANNERS)
+
+
+def parse_curriculum_task(text: str, labels: Mapping[str, float]) -> tuple[tuple[float, Node], ...]:
+    """Weighted terms of the curriculum's reward, from a task's name or from an expression over quantities.
+
+    Args:
+        text: `learning.curriculum_task`.
+        labels: Quantities that label each frame, and their scales.
+
+    Raises:
+        UserError: The text is neither.
+    """
+    if TASK_PREFIX + text in labels:
+        return ((1.0, Name(TASK_PREFIX + text)),)
+    try:
+        return parse_reward(text, labels, "learning.curriculum_task").terms
+    except UserError as error:
+        tasks = [name.removeprefix(TASK_PREFIX) for name in labels if name.startswith(TASK_PREFIX)]
+        raise UserError(
+            f"learning.curriculum_task {shown(text)} is unknown; tasks with known rewards in this domain: "
+            f"{', '.join(tasks) or 'none'}; as an expression: {error}"
+        ) from None

@@ -1,0 +1,89 @@
+"""Memory and time of a training run, estimated before its first process starts."""
+
+from __future__ import annotations
+
+from latentplan.config import Config
+from latentplan.config.estimates import Part, check_parts, estimate_model, estimate_search
+from latentplan.config.files import has_cuda
+from latentplan.replay.memory import FRAME_BYTES, count_replay_bytes, free_memory
+
+UNKNOWN_LENGTH_CAPACITY = 200_000
+LEARNING_COPIES = 6  # weights, gradients, two moments, the average, the acting model
+PROCESS_BYTES = 60 * 2**20  # of an environment in a process of its own
+CONTROL_STEP_S = 1e-5  # of the fastest simulator
+LARGEST_DEVICE = 2**40  # bytes that no graphics processor exceeds; torch alone can ask the driver
+UPDATE_S = 1e-3  # of the smallest update
+
+
+def count_replay_rows(config: Config, num_saved: int = 0) -> int:
+    """Rows of the replay: `replay.capacity`, or else enough for everything that the run collects.
+
+    Args:
+        config: Settings of the run.
+        num_saved: Rows that were saved. Without `replay.capacity` all of them fit.
+    """
+    if config.replay.capacity is not None:
+        return config.replay.capacity
+    if config.run.frames is None:
+        return max(UNKNOWN_LENGTH_CAPACITY, num_saved)
+    # Up to two rounds exceed the budget, and every episode ends with one frame without an action.
+    decisions = config.run.frames / config.env.action_repeat
+    per_episode = min(config.collection.episode_decisions or 20, 20)
+    collected = 2 * config.collection.round_decisions + config.collection.prefill_decisions
+    return max(int((1.0 + 1.0 / per_episode) * decisions) + collected, num_saved)
+
+
+def check_run(config: Config) -> None:
+    """Refuses settings that this machine cannot serve, before a simulator or torch is imported.
+
+    Where a graphics processor learns, the sizes of its own memory are checked by torch alone.
+
+    Raises:
+        UserError: The parts of the run do not fit into the free memory, or a decision would take minutes.
+    """
+    on_device = config.run.device != "cpu" and has_cuda()
+    learning = [estimate_model(config.model, LEARNING_COPIES), _estimate_update(config)]
+    collecting = [_estimate_environments(config), _estimate_rounds(config)]
+    search = estimate_search(config.planner, config.model, on_device and not config.collection.overlap)
+    replay = [_estimate_replay(config)]
+    if not on_device:
+        check_parts([*learning, *collecting, *replay, search], free_memory())
+        return
+    check_parts([*learning, *(replay if config.replay.on_device else ())], LARGEST_DEVICE, "the device")
+    check_parts([*collecting, *(() if config.replay.on_device else replay), search], free_memory())
+
+
+def _estimate_update(config: Config) -> Part:
+    learning, model = config.learning, config.model
+    sides = [16 // 2**layer for layer in range(len(model.encoder_channels))]
+    pictures = sum(channels * side * side for channels, side in zip(model.encoder_channels, sides, strict=True))
+    pictures += 5 * 64 * model.decoder_channels + 3072
+    beliefs = 6 * model.deter_dim + 8 * model.hidden_dim
+    frames = learning.batch_size * (learning.sequence_length + 1)
+    imagined = learning.imagination_starts * (learning.imagination_horizon + 1)
+    num_bytes = frames * (FRAME_BYTES + 4 * (pictures + beliefs)) + 4 * imagined * beliefs
+    advice = "--learning.batch_size, --learning.sequence_length, --learning.imagination_starts or the horizon there"
+    seconds = config.collection.updates_per_decision * UPDATE_S
+    if seconds > 1.0:
+        advice = "--collection.updates_per_decision"
+    return Part("an update", num_bytes, seconds, advice)
+
+
+def _estimate_environments(config: Config) -> Part:
+    num_envs = config.env.num_envs
+    num_bytes = num_envs * PROCESS_BYTES if num_envs > 1 else 0
+    return Part("the environments", num_bytes, config.env.action_repeat * CONTROL_STEP_S, "--env.num_envs")
+
+
+def _estimate_rounds(config: Config) -> Part:
+    collection, run = config.collection, config.run
+    decisions = max(collection.prefill_decisions, collection.round_decisions)
+    if run.frames is not None:
+        decisions = min(decisions, -(-run.frames // config.env.action_repeat))
+    advice = "--collection.prefill_decisions or --collection.round_decisions"
+    return Part("a round of collection", decisions * FRAME_BYTES, 0.0, advice)
+
+
+def _estimate_replay(config: Config) -> Part:
+    num_bytes = count_replay_bytes(count_replay_rows(config), 1, config.model.deter_dim)
+    return Part("the replay", num_bytes, 0.0, "--replay.capacity or --frames")

@@ -1,0 +1,125 @@
+"""`benchmark.py hostile`: hostile command lines and files, each in a program of its own, and the time until refusal."""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+import resource
+import subprocess
+import sys
+import tempfile
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+from bench.hostile_inputs import MARK, list_cases, write_files
+from bench.report import format_number, format_table, write_json
+from latentplan.config.checks import at_least
+from latentplan.config.parsing import option
+
+ROOT = Path(__file__).resolve().parents[2]
+TIMEOUT_S = 120
+LONGEST_LINE = 1000
+PROMISED_S = 2.0
+
+
+@dataclass(frozen=True)
+class Request:
+    """Flags of `benchmark.py hostile`.
+
+    Attributes:
+        checkpoint: Folder of a trained agent, of which damaged copies are made.
+        only: Part of the names of the inputs that are tried; empty tries all.
+        every: Tries every n-th input only.
+        json: Result as JSON.
+    """
+
+    checkpoint: Path = option(Path("checkpoints/cartpole-swingup"), metavar="DIR")
+    only: str = ""
+    every: int = 1
+    json: Path | None = option(None, metavar="FILE", is_output=True)
+
+    def __post_init__(self) -> None:
+        at_least(self, every=1)
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """How one input ended.
+
+    Attributes:
+        case: Name of the input.
+        problem: What was not as it should be; empty if nothing.
+        seconds: Time of the clock.
+        processor_seconds: Time of the processor, which says more than the clock on a busy machine.
+        output: The end of stderr.
+        length: Characters of stderr.
+    """
+
+    case: str
+    problem: str
+    seconds: float
+    processor_seconds: float
+    output: str = ""
+    length: int = 0
+
+
+def run(request: Request) -> int:
+    """Tries the inputs, prints those that were not refused as they should be, and returns 1 if there are any."""
+    agent, outcomes = request.checkpoint.resolve(), []
+    cases = [case for case in list_cases().items() if request.only in case[0]][:: request.every]
+    with tempfile.TemporaryDirectory() as name:
+        write_files(Path(name), agent)
+        for case, words in cases:
+            argv = [word.replace("{folder}", name).replace("{agent}", str(agent)) for word in words]
+            outcomes.append(try_input(case, argv, Path(name)))
+            if outcomes[-1].problem:
+                print(f"{case}: {outcomes[-1].problem}: {outcomes[-1].output}", flush=True)
+    seconds, busy = (
+        sorted(getattr(outcome, kind) for outcome in outcomes) for kind in ("seconds", "processor_seconds")
+    )
+    wrong = [outcome for outcome in outcomes if outcome.problem]
+    rows = [
+        ["inputs", str(len(outcomes))],
+        ["refused in one line, none executed", str(len(outcomes) - len(wrong))],
+        ["seconds of the clock, median and largest", f"{_median(seconds)} {format_number(max(seconds), 2)}"],
+        ["seconds of the processor, median and largest", f"{_median(busy)} {format_number(max(busy), 2)}"],
+        [f"over {PROMISED_S:g} s of the processor", str(sum(second > PROMISED_S for second in busy))],
+        ["longest line", str(max(outcome.length for outcome in outcomes))],
+    ]
+    print(format_table(["hostile inputs", ""], rows))
+    write_json(request.json, {"outcomes": [dataclasses.asdict(outcome) for outcome in outcomes]})
+    return 1 if wrong else 0
+
+
+def try_input(case: str, argv: list[str], folder: Path) -> Outcome:
+    """The outcome of one command line in a program of its own.
+
+    Args:
+        case: Name of the input.
+        argv: The words of the command line.
+        folder: Folder of the files, in which nothing may be executed.
+    """
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    command = [sys.executable, "-m", "latentplan", *argv]
+    started, before = time.perf_counter(), resource.getrusage(resource.RUSAGE_CHILDREN)
+    try:
+        done = subprocess.run(command, cwd=folder, env=environment, capture_output=True, timeout=TIMEOUT_S, check=False)
+    except subprocess.TimeoutExpired:
+        return Outcome(case, "it does not end", float(TIMEOUT_S), 0.0)
+    after = resource.getrusage(resource.RUSAGE_CHILDREN)
+    busy = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
+    output, problem = done.stderr.decode(errors="replace"), ""
+    if done.returncode != 2 or done.stdout:
+        problem = f"exit code {done.returncode}"
+    elif output.count("\n") != 1 or not output.startswith("error: "):
+        problem = "not one line"
+    elif len(output) > LONGEST_LINE:
+        problem = f"a line of {len(output)} characters"
+    elif (folder / MARK).exists():
+        problem = "it was executed"
+    return Outcome(case, problem, time.perf_counter() - started, busy, output[-300:], len(output))
+
+
+def _median(values: list[float]) -> str:
+    return format_number(values[len(values) // 2], 2)

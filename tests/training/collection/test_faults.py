@@ -1,0 +1,141 @@
+"""A run survives environments that fail, up to a budget; then it saves and stops."""
+
+import csv
+import json
+from functools import partial
+
+import numpy as np
+import pytest
+import torch
+
+from latentplan.commands.shell import run_guarded
+from latentplan.config import EnvironmentFault
+from latentplan.training import resume, train
+from latentplan.training.collection.collector import Collector
+from latentplan.training.run import _Run
+from tests.envs.faulty import Faulty
+from tests.training.run_folder import read_state
+
+pytestmark = pytest.mark.filterwarnings("ignore:.*its episode is cut short:RuntimeWarning")
+
+
+@pytest.fixture
+def faulty(tmp_path):
+    """Makes the factory of an environment that fails some times."""
+    (tmp_path / "faults").mkdir()
+    return lambda kind, times=1: partial(Faulty, kind, tmp_path / "faults", times)
+
+
+@pytest.fixture
+def collect(tiny, faulty):
+    """One round of 20 random decisions in an environment that fails at its third step, with the collector."""
+    made = []
+
+    def run(kind, times=1, **settings):
+        collector = Collector(tiny("", collection=settings), faulty(kind, times), "cpu")
+        made.append(collector)
+        return collector, collector.collect(None, "random", 20, 0)
+
+    yield run
+    for collector in made:
+        collector.close()
+
+
+def test_replay_holds_no_transition_of_a_step_that_failed(collect):
+    _, collected = collect("nan reward")
+    (rows,) = collected.rows
+    # Two steps, the frame before the third; then an episode of ten steps and its last frame, then seven steps.
+    assert np.flatnonzero(rows.is_first).tolist() == [0, 3, 14] and len(rows.frames) == 21
+    assert rows.rewards.tolist() == [1, 1, 0, *[1] * 10, 0, *[1] * 7]
+    assert rows.actions[[2, 13]].tolist() == [[0.0], [0.0]] and (rows.continues == 1.0).all()
+    assert np.isfinite(rows.rewards).all() and np.isfinite(rows.actions).all()
+    assert (collected.restarts, collected.fault, collected.env_frames) == (1, None, 19)
+    assert collected.episode_returns == [10.0]  # the episode that was cut short does not count
+
+
+def test_round_that_fails_too_often_returns_what_it_collected(collect):
+    _, collected = collect("exception", times=9, max_restarts=1)
+    assert len(collected.rows[0].frames) == 5 and collected.decisions == 5
+    assert "the lamp is out after 1 restarts (collection.max_restarts 1)" in str(collected.fault)
+
+
+def test_evaluation_plays_an_episode_again_when_its_environment_fails(collect, tiny, tmp_path):
+    collector, _ = collect("never", times=0)
+    expected = collector.evaluate(2)
+    other = Collector(tiny(""), partial(Faulty, "exception", tmp_path / "faults", 1), "cpu")
+    other.model.load_state_dict(collector.model.state_dict())
+    returns = other.evaluate(2)
+    other.close()
+    assert other.restarts.count == 1
+    assert [len(returns[mode]) for mode in returns] == [2, 2] and returns == expected
+
+
+def read_metrics(folder):
+    with (folder / "metrics.csv").open() as file:
+        return list(csv.DictReader(file))
+
+
+@pytest.mark.parametrize("kind", ["exception", "float frame"])
+def test_run_goes_on_after_faults_and_counts_them_in_its_metrics(kind, tiny, faulty, tmp_path):
+    result = train(tiny(tmp_path / "run"), faulty(kind, times=3))
+    assert result.exit_code == 0 and len(read_metrics(result.run_dir)) > 0
+    assert read_metrics(result.run_dir)[-1]["env_restarts"] == "3"
+    state = torch.load(result.run_dir / "resume" / "replay" / "rows.pt", weights_only=True)
+    assert torch.isfinite(state["rewards"]).all()
+
+
+@pytest.mark.parametrize("kind", ["exit", "hang"])
+def test_run_goes_on_after_a_crash_or_a_hang_of_the_environments_process(kind, tiny, faulty, tmp_path):
+    settings = {"overlap": True, "step_timeout_s": 0.5 if kind == "hang" else 60.0}
+    result = train(tiny(tmp_path / "run", collection=settings), faulty(kind, times=2))
+    assert result.exit_code == 0 and read_metrics(result.run_dir)[-1]["env_restarts"] == "2"
+
+
+@pytest.mark.parametrize("overlap", [False, True])
+def test_run_that_fails_too_often_is_saved_and_says_why(overlap, tiny, faulty, dot, tmp_path, capfd):
+    folder = tmp_path / "run"
+    config = tiny(folder, collection={"max_restarts": 4, "prefill_decisions": 20, "overlap": overlap})
+
+    def command(argv):
+        return train(config, faulty("exception", times=99)).exit_code
+
+    assert run_guarded(command, []) == 2
+    lines = capfd.readouterr().err.splitlines()
+    first = next(index for index, line in enumerate(lines) if line.startswith("error: "))
+    assert "the lamp is out after 4 restarts" in lines[first] and "the run is saved in" in lines[first]
+    assert lines[first + 1] == "Traceback (most recent call last):" and "faulty.py" in lines[first + 2]
+    assert lines[-1] == "ZeroDivisionError: the lamp is out"
+    rows = torch.load(folder / "resume" / "replay" / "rows.pt", weights_only=True)
+    assert int(rows["written"].sum()) >= 14  # the prefill until the fault is kept
+    if not overlap:
+        assert resume(folder, make_env=partial(Faulty, "never", tmp_path / "faults", 0)).exit_code == 0
+        assert json.loads((folder / "final.json").read_text())["env_frames"] >= 90
+
+
+def test_train_refuses_an_environment_whose_first_frame_is_wrong(tiny, tmp_path):
+    class Grey(Faulty):
+        def picture(self):
+            return super().picture()[..., 0]
+
+    with pytest.raises(EnvironmentFault, match=r"frames uint8 \(16, 16, 3\), got shape \(16, 16\)"):
+        train(tiny(tmp_path / "run", collection={"max_restarts": 1}), partial(Grey, "never", tmp_path, 0))
+
+
+def test_run_warns_of_black_frames(tiny, tmp_path):
+    class Dark(Faulty):
+        def picture(self):
+            return np.zeros((16, 16, 3), np.uint8)
+
+    with pytest.warns(RuntimeWarning, match="frames of an environment are black"):
+        train(tiny(tmp_path / "run"), partial(Dark, "never", tmp_path, 0))
+
+
+def test_run_whose_final_evaluation_fails_too_often_is_saved(tiny, dot, tmp_path, monkeypatch):
+    def fail(self, *_):
+        (self.folder / "resume" / "state.pt").unlink()  # so that only a new save brings it back
+        raise EnvironmentFault("the last lamp is out", "Traceback\n")
+
+    monkeypatch.setattr(_Run, "_finish", fail)
+    with pytest.raises(EnvironmentFault, match="the last lamp is out; the run is saved in") as fault:
+        train(tiny(tmp_path / "run"), dot)
+    assert fault.value.origin == "Traceback\n" and read_state(tmp_path / "run")["run"]["env_frames"] == 90
