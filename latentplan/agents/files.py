@@ -98,12 +98,8 @@ def _finish_renaming(folder: Path) -> None:
 
 def _read(path: Path) -> bytes:
     try:
-        if not path.is_file():
-            raise UserError(
-                f"{path} cannot be read: it is not a regular file"
-                if path.exists()
-                else f"{path} cannot be read: it is missing"
-            )
+        if path.exists() and not path.is_file():
+            raise UserError(f"{path} cannot be read: it is not a regular file")
         return path.read_bytes()
     except OSError as error:
         raise UserError(f"{path} cannot be read: {error.strerror}") from None
