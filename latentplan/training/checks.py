@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from pathlib import Path
 
 from latentplan.config import USER_DOMAIN, Config, PlannerConfig, UserError
 from latentplan.config.checks import shown
@@ -21,6 +22,8 @@ def check_settings(config: Config) -> None:
         UserError: A task, a planner or an expression does not exist, or the machine cannot serve the run.
     """
     check_run(config)
+    if config.run.run_dir is not None:
+        check_folder(config.run.run_dir)
     env, learning = config.env, config.learning
     if env.suite == DEFAULT_SUITE and env.domain != USER_DOMAIN:
         check_task(env.suite, env.domain, env.task)
@@ -36,6 +39,21 @@ def check_settings(config: Config) -> None:
 
         if config.planner.method not in PLANNERS:
             raise_unknown("planner", config.planner.method, PLANNERS)
+
+
+def check_folder(run_dir: str) -> None:
+    """Refuses a folder of a run that cannot be made, without making it.
+
+    Raises:
+        UserError: The name is empty, or a file is in the way.
+        OSError: The name is too long.
+    """
+    if run_dir == "":
+        raise UserError("--run-dir must name a folder, got an empty text")
+    folder = Path(run_dir).absolute()
+    existing = next(path for path in (folder, *folder.parents) if path.exists())
+    if not existing.is_dir():
+        raise UserError(f"cannot make the folder {run_dir}: {existing} is a file; choose another --run-dir")
 
 
 def parse_curriculum_task(text: str, labels: Mapping[str, float]) -> tuple[tuple[float, Node], ...]:
