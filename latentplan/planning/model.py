@@ -29,7 +29,9 @@ import dataclasses
 import inspect
 from collections.abc import Callable, Sequence
 from functools import partial
+from types import FunctionType
 from typing import Any, Protocol
+from weakref import WeakKeyDictionary
 
 import torch
 from einops import rearrange, repeat
@@ -38,6 +40,9 @@ from torch.utils._pytree import register_pytree_node, tree_leaves, tree_map
 
 State = Any  # a tensor, or a pytree (tuple, NamedTuple, dict, list, dataclass) of tensors, dim 0 = rows
 Bound = float | Sequence[Any] | Tensor  # one number, (action,), (horizon, action) or (batch, horizon, action)
+
+
+_takes_generator: WeakKeyDictionary[FunctionType, bool] = WeakKeyDictionary()
 
 
 class Model(Protocol):
@@ -118,6 +123,11 @@ def has_policy(model: object) -> bool:
 
 def takes_generator(function: Callable[..., Any]) -> bool:
     """Returns whether a function has an argument `generator`."""
+    plain = getattr(function, "__func__", function)  # of a method; methods are made anew at each access
+    if isinstance(plain, FunctionType):
+        if plain not in _takes_generator:  # a signature takes longer to read than a small step
+            _takes_generator[plain] = "generator" in inspect.signature(plain).parameters
+        return _takes_generator[plain]
     try:
         return "generator" in inspect.signature(function).parameters
     except (TypeError, ValueError):  # a compiled function may have no signature

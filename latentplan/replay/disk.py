@@ -11,7 +11,8 @@ import torch
 
 from latentplan.config import UserError
 from latentplan.config.commit import Extent, Log, Save, Saves
-from latentplan.replay.buffer import COLUMNS, FRAME_BYTES, FRAME_SHAPE, Replay, read_saved
+from latentplan.replay.buffer import COLUMNS, FRAME_SHAPE, Replay, read_saved
+from latentplan.replay.memory import FRAME_BYTES
 
 ROWS_FILE = "rows.pt"
 FORMAT = 1

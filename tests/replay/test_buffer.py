@@ -7,7 +7,7 @@ import torch
 
 from latentplan.config import UserError
 from latentplan.replay import memory
-from latentplan.replay.buffer import count_replay_bytes
+from latentplan.replay.memory import count_replay_bytes
 from tests.replay.numbered_rows import NumberedRows, frame_values, make_filled_replay, make_replay, sample
 
 

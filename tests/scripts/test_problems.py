@@ -61,6 +61,23 @@ def test_riccati_controller_without_bounds_reaches_the_lower_bound():
     torch.testing.assert_close(total().detach(), problem.lower_bound([0])[0], rtol=1e-3, atol=0.0)
 
 
+@pytest.mark.parametrize(("name", "limit"), [("pendulum", 345.0), ("navigation", 50.0), ("lq", 110.0)])
+def test_default_search_needs_no_settings(name, limit):
+    """A plain cross-entropy method, which was the default, costs 350, 72 and 129."""
+    problem, seeds = PROBLEMS[name], [0, 1, 2, 3]
+    planner = CEMPlanner(
+        action_dim=problem.action_dim,
+        action_low=problem.action_low,
+        action_high=problem.action_high,
+        horizon=problem.horizon,
+        num_samples=100,
+        num_iterations=3,
+    )
+    streams = [torch.Generator().manual_seed(seed) for seed in seeds]
+    controller = ModelPredictiveController(planner, problem.model(), generator=streams)
+    assert problem.run(controller.act, seeds).mean() <= limit
+
+
 @problems
 def test_planner_costs_less_than_no_action_and_no_less_than_the_bound(problem):
     planner = CEMPlanner(

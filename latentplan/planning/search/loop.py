@@ -209,6 +209,7 @@ class Search:
         """
         options, num_fresh = self.options, self.options.num_samples - self.num_proposals
         progress = self._begin(start)
+        std = self._sampling_std(progress.var)
         limit = torch.where(start.is_warm, options.num_warm_iterations, options.num_iterations)
         num_common = int(limit.min())
         known: list[Candidates] = []
@@ -219,7 +220,7 @@ class Search:
             if not is_first and not budget.allows("iteration", "choose"):
                 stopped = "deadline"
                 break
-            fresh = self._sample(progress, num_fresh)
+            fresh = self._sample(progress, std, num_fresh)
             fresh[:, 0] = start.mean if is_first else self.space.clean(progress.mean)
             if is_first:
                 self._place_elites(fresh, start)
@@ -293,12 +294,11 @@ class Search:
             probabilities = choices.start(start.mean, start.is_warm.to(self.device))
         return Progress(start.mean, var, probabilities, None, unknown, zeros, zeros, zeros.bool())
 
-    def _sample(self, progress: Progress, num: int) -> Tensor:
+    def _sample(self, progress: Progress, std: Tensor, num: int) -> Tensor:
         """Returns `num` clean points per environment, (batch, num, length, action)."""
-        mean, std = progress.mean[:, None], self._sampling_std(progress.var)[:, None]
         beta, white_share = self.options.noise_beta, self.options.white_noise_share
         noise = self.streams.noise(num, self.space.length, self.bounds.action_dim, beta, white_share, self.dtype)
-        samples = torch.addcmul(mean, std, noise)
+        samples = torch.addcmul(progress.mean[:, None], std[:, None], noise)
         if progress.probabilities is not None:
             assert self.space.choices is not None
             samples = self.space.choices.sample(samples, progress.probabilities, noise)

@@ -219,11 +219,11 @@ def test_scheduler_reset_drops_the_plan_of_the_running_request(model):
     assert decisions[-1].source == "plan"
 
 
-def test_scheduler_takes_clamped_zeros_without_a_policy():
+def test_scheduler_takes_the_middle_of_the_bounds_without_a_policy():
     planner = CEMPlanner(action_dim=1, horizon=HORIZON, action_low=0.2)
     model = FunctionModel(dynamics, reward)
     scheduler = PlanScheduler(planner, model, VirtualExecutor(planner, model, [1e9]))
-    assert scheduler.decide(torch.zeros(2, 1)).action.tolist() == [[pytest.approx(0.2)]] * 2
+    assert scheduler.decide(torch.zeros(2, 1)).action.tolist() == [[pytest.approx(0.6)]] * 2
 
 
 def test_scheduler_raises_a_search_error_once(model):
