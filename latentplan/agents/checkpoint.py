@@ -62,7 +62,7 @@ ALLOWED: dict[str, tuple[Callable[[Any], bool], str]] = {
     "env_frames": _is_number(0, LARGEST_COUNT, int),
     "updates": _is_number(0, LARGEST_COUNT, int),
     "minutes": _is_number(0, LARGEST_COUNT),
-    "metrics": _is_kind(list, "a list"),
+    "metrics": _is_kind((list, dict), "a list"),
     "final_evaluation": _is_kind(dict, "a dictionary"),
     "action_dim": _is_number(1, LARGEST_SIZE, int),
     "labels": (_are_labels, "a dictionary of scales above 0"),

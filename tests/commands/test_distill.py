@@ -28,6 +28,7 @@ def test_distill_refuses_settings_of_another_version(checkpoint, tmp_path, asser
     folder = shutil.copytree(checkpoint, tmp_path / "agent")
     info = json.loads((folder / "info.json").read_text())
     (folder / "info.json").write_text(json.dumps({**info, "config": config}))
+    (folder / "manifest.json").unlink()
     flags = ["--checkpoint", folder, "--out", tmp_path / "out", "--planner.horizon", "3"]
     assert_refused(["distill", *flags], "has settings of another version")
     assert not (tmp_path / "out").exists()

@@ -6,6 +6,7 @@ from latentplan.commands.flags import read_request
 from latentplan.commands.train import SHORT_FLAGS, Request, resolve
 from latentplan.config import Config
 from latentplan.config.files import compose, dump_config
+from latentplan.config.run_folder import RUN_FILE, run_saves
 
 
 def settings_of(line):
@@ -40,9 +41,20 @@ def test_flags_are_laid_over_the_file_and_the_preset(tmp_path):
     )
 
 
+def save_settings(config, folder):
+    """Writes the settings of a run and a save that holds nothing else."""
+
+    def write(part):
+        dump_config(config, part / RUN_FILE)
+        return {}
+
+    run_saves(folder).commit(write, {})
+    dump_config(config, folder / RUN_FILE)
+
+
 def test_resume_takes_saved_settings_with_the_given_changes(tmp_path):
     saved = settings_of("--domain cartpole --seed 3 --preset cpu")
-    dump_config(saved, tmp_path / "config.yaml")
+    save_settings(saved, tmp_path)
     request = read_request(Request, ["--resume", str(tmp_path), "--frames", "2e5", "--device", "cpu"])
     assert request.settings["run"] == {"frames": 200_000, "device": "cpu"} and request.resume == tmp_path
     found = resolve(request)
@@ -96,5 +108,5 @@ def test_train_refuses_bad_files_in_one_line(text, expected, assert_refused, tmp
 
 
 def test_resume_refuses_bad_changes(assert_refused, tmp_path):
-    dump_config(Config(), tmp_path / "config.yaml")
+    save_settings(Config(), tmp_path)
     assert_refused(["train", "--resume", tmp_path, "--frames", "0"], "run.frames must be above 0, got 0")
