@@ -16,9 +16,9 @@ from latentplan.agents.base import Agent
 from latentplan.agents.files import is_checkpoint, read_files, seal, write_files
 from latentplan.agents.modes import MODES, make_agent
 from latentplan.config import Config, PlannerConfig, UserError, from_dict, to_dict
-from latentplan.config.checks import nearest, shown
+from latentplan.config.checks import cut, nearest, shown
 from latentplan.config.commit import MANIFEST
-from latentplan.config.estimates import check_parts, estimate_model, estimate_search
+from latentplan.config.estimates import check_parts, estimate_search
 from latentplan.config.planner import override_planner
 from latentplan.config.reading import parse_json
 from latentplan.models import WorldModel
@@ -27,6 +27,7 @@ from latentplan.replay.memory import free_memory
 
 WEIGHTS = "weights.safetensors"
 INFO = "info.json"
+MOST_NAMES = 5  # known names in an error message
 LARGEST_INFO = 2**24  # bytes; a description with the metrics of a long run has some hundred thousand
 LARGEST_COUNT = 10**15  # of frames, updates and minutes; larger numbers are damage
 LARGEST_SIZE = 4096  # of actions, labels and goals
@@ -162,7 +163,6 @@ def load_model(path: str | Path, device: str = "cpu") -> tuple[WorldModel, Confi
     except (AttributeError, TypeError, ValueError) as error:
         raise UserError(f"the settings in {folder / INFO} cannot be used: {error}") from None
     sizes = info["action_dim"], info.get("labels"), info.get("goal_dim") or 0
-    check_parts([estimate_model(config.model, action_dim=info["action_dim"])], free_memory())
     try:
         state = {name: value.float() for name, value in load(content).items()}
         with torch.device("meta"):  # compares shapes before a model is allocated whose size the file names
@@ -255,8 +255,8 @@ def _find_checkpoint(root: Path) -> Path | None:
 
 
 def _suggestion(name: str, known: dict[str, str]) -> str:
-    """The end of an error message about a name: the nearest known name, else the first twenty known names."""
+    """The end of an error message about a name: the nearest known name, else the first known names."""
     similar = nearest(name, known, cutoff=0.6)
     if similar:
         return f"; did you mean {known[similar]}?"
-    return f"; available: {', '.join(list(known.values())[:20])}" if known else ""
+    return f"; available: {', '.join([cut(name) for name in list(known.values())[:MOST_NAMES]])}" if known else ""
