@@ -235,9 +235,11 @@ def resolve_checkpoint(path: str | Path) -> Path:
     if folder is not None:
         return folder
     reason = f"expected {WEIGHTS} and {INFO}" if root.exists() else "the folder does not exist"
-    parents = [parent for parent in (Path("checkpoints"), root.parent) if parent.is_dir()]
+    parents = [parent for parent in (root.parent, Path("checkpoints")) if parent.is_dir()]
     siblings = [sibling for parent in parents for sibling in sorted(parent.iterdir())]
-    known = {sibling.name: str(sibling) for sibling in siblings if _find_checkpoint(sibling)}
+    known: dict[str, str] = {}
+    for sibling in filter(_find_checkpoint, siblings):
+        known.setdefault(sibling.name, str(sibling))
     raise UserError(f"no checkpoint at {root}: {reason}{_suggestion(root.name, known)}")
 
 

@@ -2,6 +2,7 @@
 
 import csv
 import json
+import shutil
 from functools import partial
 
 import numpy as np
@@ -14,7 +15,7 @@ from latentplan.training import resume, train
 from latentplan.training.collection.collector import Collector
 from latentplan.training.run import _Run
 from tests.envs.faulty import Faulty
-from tests.training.run_folder import read_state
+from tests.training.run_folder import list_saves, read_state
 
 pytestmark = pytest.mark.filterwarnings("ignore:.*its episode is cut short:RuntimeWarning")
 
@@ -80,7 +81,7 @@ def test_run_goes_on_after_faults_and_counts_them_in_its_metrics(kind, tiny, fau
     result = train(tiny(tmp_path / "run"), faulty(kind, times=3))
     assert result.exit_code == 0 and len(read_metrics(result.run_dir)) > 0
     assert read_metrics(result.run_dir)[-1]["env_restarts"] == "3"
-    state = torch.load(result.run_dir / "resume" / "replay" / "rows.pt", weights_only=True)
+    state = torch.load(list_saves(result.run_dir)[-1] / "rows.pt", weights_only=True)
     assert torch.isfinite(state["rewards"]).all()
 
 
@@ -105,7 +106,7 @@ def test_run_that_fails_too_often_is_saved_and_says_why(overlap, tiny, faulty, d
     assert "the lamp is out after 4 restarts" in lines[first] and "the run is saved in" in lines[first]
     assert lines[first + 1] == "Traceback (most recent call last):" and "faulty.py" in lines[first + 2]
     assert lines[-1] == "ZeroDivisionError: the lamp is out"
-    rows = torch.load(folder / "resume" / "replay" / "rows.pt", weights_only=True)
+    rows = torch.load(list_saves(folder)[-1] / "rows.pt", weights_only=True)
     assert int(rows["written"].sum()) >= 14  # the prefill until the fault is kept
     if not overlap:
         assert resume(folder, make_env=partial(Faulty, "never", tmp_path / "faults", 0)).exit_code == 0
@@ -132,7 +133,8 @@ def test_run_warns_of_black_frames(tiny, tmp_path):
 
 def test_run_whose_final_evaluation_fails_too_often_is_saved(tiny, dot, tmp_path, monkeypatch):
     def fail(self, *_):
-        (self.folder / "resume" / "state.pt").unlink()  # so that only a new save brings it back
+        for save in list_saves(self.folder):
+            shutil.rmtree(save)  # so that only a new save brings it back
         raise EnvironmentFault("the last lamp is out", "Traceback\n")
 
     monkeypatch.setattr(_Run, "_finish", fail)
