@@ -126,6 +126,6 @@ def test_warm_start_without_noise_continues_the_previous_plan(planner, state, se
     plan = planner.plan(model, state, last, generator=seeded(seed))
     expected = last.mean[:, 1:]
     torch.testing.assert_close(plan.actions[:, :-1], expected, rtol=1e-4, atol=1e-5)
-    end = torch.zeros(ACTIONS) if planner.tail == "zero" else last.mean[:, -1]
     low, high = torch.tensor(planner.action_low), torch.tensor(planner.action_high)
+    end = (low + high) / 2.0 if planner.tail == "zero" else last.mean[:, -1]
     torch.testing.assert_close(plan.actions[:, -1], end.expand(BATCH, -1).clamp(low, high), rtol=1e-4, atol=1e-5)

@@ -1,7 +1,6 @@
 """Decisions about single frames: the compiled path and the path by calls of torch, against the reference."""
 
 import copy
-import ctypes
 import platform
 from pathlib import Path
 
@@ -218,7 +217,7 @@ def test_compiled_decision_equals_the_reference_on_older_processors(native, marc
     if not run_on(march):
         pytest.skip(f"the machine does not run code for {march}")
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    older = ctypes.CDLL(str(library._compile(("frame.c",), [f"-march={march}"])))
+    older = library._compile(("frame.c",), [f"-march={march}"])
     older.decide.argtypes = library.load().decide.argtypes
     monkeypatch.setattr(native_frame, "load", lambda: older)
     model, (_, inputs) = make_model((32, 48, 64)), native
