@@ -119,6 +119,8 @@ def test_warm_start_without_noise_continues_the_previous_plan(planner, state, se
         num_policy_samples=0,
         num_samples=16,
         num_elites=4,
+        keep_elite_fraction=0.0,
+        final="mean",
         action_low=planner.action_low,
         action_high=planner.action_high,
     )
