@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import ctypes
 import functools
-from collections.abc import Sequence
-from typing import NamedTuple
+from collections.abc import Iterable, Sequence
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -16,6 +16,7 @@ from latentplan.models.fast.library import load
 TILE = 16  # as in products.h: numbers of rows are multiples of this
 MULTIPLE = 32  # padded sizes are multiples of this
 LONGEST_ROW = 4096  # as in layers.h
+MOST_SPARE = 16  # arrays of one shape
 HALVES = {2: torch.bfloat16, 4: torch.float32, 8: torch.float64}
 
 Place = ctypes.c_void_p
@@ -52,6 +53,43 @@ def find_kernels(real: torch.dtype) -> Kernels | None:
     library = load(is_exact=real == torch.float64) if real in (torch.float32, torch.float64) else None
     size = 0 if library is None else library.size_of_half()
     return None if library is None or size == 0 else Kernels(library, real, HALVES[size])
+
+
+_spare: dict[tuple[tuple[int, ...], torch.dtype], list[Tensor]] = {}
+
+
+def borrow(*shape: int, dtype: torch.dtype) -> Tensor:
+    """An uninitialized array for intermediate results, to be returned by `give_back` where nothing reads it any more.
+
+    The next update borrows the same arrays. Large arrays that are allocated anew for every update break up the memory
+    of the C library: a run grew to four times the size of its data.
+    """
+    spare = _spare.get((shape, dtype))
+    try:
+        return spare.pop() if spare else torch.empty(shape, dtype=dtype)
+    except IndexError:  # another thread was faster
+        return torch.empty(shape, dtype=dtype)
+
+
+def give_back(tensors: Iterable[Tensor | None]) -> None:
+    """Keeps borrowed arrays for the next call of `borrow`."""
+    for tensor in tensors:
+        if tensor is not None:
+            spare = _spare.setdefault((tuple(tensor.shape), tensor.dtype), [])
+            if len(spare) < MOST_SPARE:
+                spare.append(tensor)
+
+
+def take_kept(ctx: Any) -> dict[str, Any]:
+    """The borrowed arrays in `ctx.kept`, for the only backward pass.
+
+    Raises:
+        RuntimeError: An earlier backward pass has given them back.
+    """
+    kept, ctx.kept = ctx.kept, None
+    if kept is None:
+        raise RuntimeError("the gradients of a compiled call can be computed once only, also with retain_graph=True")
+    return kept  # type: ignore[no-any-return]
 
 
 def describe_layer(linear: Tensor, scale: Tensor | None, shift: Tensor) -> Layer:

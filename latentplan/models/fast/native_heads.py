@@ -13,13 +13,16 @@ from latentplan.models.fast.native import (
     Kernels,
     Layer,
     Place,
+    borrow,
     check_called,
     describe_layer,
     find_kernels,
+    give_back,
     pad_rows,
     pad_size,
     point_to,
     split_norms,
+    take_kept,
     weight_gradient,
 )
 from latentplan.models.heads import Mlp, NormedLinear, ScalarHead
@@ -92,7 +95,7 @@ class _Applied(torch.autograd.Function):
         sizes = [pad_size(size) for size in (layers[0].inputs, layers[0].outputs, layers[1].outputs)]
         learns = any(ctx.needs_input_grad[1:])
         kept = {
-            name: torch.empty(len(flat), size, dtype=kernels.half) if learns or name in _SUMS else None
+            name: borrow(len(flat), size, dtype=kernels.half) if learns or name in _SUMS else None
             for name, size in zip((*_SUMS, *_INPUTS), (*sizes[1:], *sizes), strict=True)
         }
         results = torch.empty(len(flat), layers[2].outputs, dtype=kernels.real)
@@ -105,12 +108,12 @@ class _Applied(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, outer: Tensor) -> tuple[Tensor | None, ...]:
-        network, kernels, kept, parameters = ctx.network, ctx.kernels, ctx.kept, ctx.parameters
+        network, kernels, kept, parameters = ctx.network, ctx.kernels, take_kept(ctx), ctx.parameters
         outer = pad_rows(outer.reshape(-1, outer.shape[-1]), 0)
         learns = kept["inputs"] is not None
         sizes = [pad_size(layer.outputs) for layer in (network.output, network.second, network.first)]
         factors: dict[str, Any] = {
-            name: torch.empty(len(outer), size, dtype=kernels.half) if learns else None
+            name: borrow(len(outer), size, dtype=kernels.half) if learns else None
             for name, size in zip(_FACTORS, sizes, strict=True)
         }
         widths = [network.first.outputs, network.second.outputs]
@@ -123,14 +126,16 @@ class _Applied(torch.autograd.Function):
         if of_features is not None:
             of_features = of_features[: ctx.shape[:-1].numel()].view(ctx.shape)
         if not learns:
+            give_back(kept.values())
             return of_features, *([None] * len(parameters))
         norm = split_norms(norms, widths)
-        return (
-            of_features,
+        of_parameters = (
             *(weight_gradient(factors["of_first"], kept["inputs"], parameters[0]), *norm[:2]),
             *(weight_gradient(factors["of_second"], kept["hidden"], parameters[3]), *norm[2:]),
             *(weight_gradient(factors["of_output"], kept["last"], parameters[6]), outer.sum(0)),
         )
+        give_back([*kept.values(), *factors.values()])
+        return of_features, *of_parameters
 
 
 class _Mean(torch.autograd.Function):

@@ -21,12 +21,15 @@ from latentplan.models.fast.native import (
     Kernels,
     Layer,
     Place,
+    borrow,
     check_called,
     describe_layer,
     find_kernels,
     fits,
+    give_back,
     pad_size,
     point_to,
+    take_kept,
 )
 
 MOST_CONVOLUTIONS = 4  # as in encoder.c
@@ -139,15 +142,16 @@ class _Encoded(torch.autograd.Function):
             kept += side * side * len(weight)
         structure.rows = len(frames)
         embeddings = torch.empty(len(frames), len(linear), dtype=kernels.real)
-        ctx.kept = torch.empty(len(frames), kept, dtype=kernels.half)
-        point_to(structure, frames=frames, embeddings=embeddings, kept=ctx.kept)
+        ctx.kept = {"kept": borrow(len(frames), kept, dtype=kernels.half)}
+        point_to(structure, frames=frames, embeddings=embeddings, **ctx.kept)
         check_called(kernels.library.encode(ctypes.addressof(structure), None, torch.get_num_threads()))
         ctx.structure, ctx.kernels, ctx.layers, ctx.frames = structure, kernels, layers, frames
         return embeddings
 
     @staticmethod
     def backward(ctx: Any, outer: Tensor) -> tuple[Tensor | None, ...]:
-        gradients, threads, outer = _EncoderGradients(), torch.get_num_threads(), outer.contiguous()
+        kept, threads, outer = take_kept(ctx), torch.get_num_threads(), outer.contiguous()
+        gradients = _EncoderGradients()
         sums = [_LayerSums(weight, threads) for weight in ctx.layers[::2]]
         gradients.patches, gradients.linear = sums[0].structure, sums[1].structure
         for index, part in enumerate(sums[2:]):
@@ -155,6 +159,7 @@ class _Encoded(torch.autograd.Function):
         point_to(gradients, of_embeddings=outer)
         addresses = ctypes.addressof(ctx.structure), ctypes.addressof(gradients)
         check_called(ctx.kernels.library.encode(*addresses, threads))
+        give_back(kept.values())
         return None, *(part for layer in sums for part in layer.collect())
 
 
@@ -172,22 +177,26 @@ class _Reconstructed(torch.autograd.Function):
         )
         rows, places = len(features), 8 * 8
         errors = torch.empty(rows, dtype=kernels.real)
-        ctx.kept = torch.empty(rows, len(tokens) + places * len(mix), dtype=kernels.half)
-        ctx.differences = torch.empty(rows, places, len(paint), dtype=kernels.half)
-        point_to(structure, features=features, frames=frames, errors=errors, kept=ctx.kept, differences=ctx.differences)
+        ctx.kept = {
+            "kept": borrow(rows, len(tokens) + places * len(mix), dtype=kernels.half),
+            "differences": borrow(rows, places, len(paint), dtype=kernels.half),
+        }
+        point_to(structure, features=features, frames=frames, errors=errors, **ctx.kept)
         check_called(kernels.library.decode(ctypes.addressof(structure), None, torch.get_num_threads()))
         ctx.structure, ctx.kernels, ctx.layers, ctx.given = structure, kernels, layers, (features, frames)
         return errors
 
     @staticmethod
     def backward(ctx: Any, outer: Tensor) -> tuple[Tensor | None, ...]:
-        threads, outer, of_features = torch.get_num_threads(), outer.contiguous(), torch.empty_like(ctx.given[0])
+        kept, threads = take_kept(ctx), torch.get_num_threads()
+        outer, of_features = outer.contiguous(), torch.empty_like(ctx.given[0])
         sums = [_LayerSums(weight, threads) for weight in ctx.layers[::2]]
         gradients = _DecoderGradients()
         gradients.tokens, gradients.paint, gradients.mix = (part.structure for part in sums)
         point_to(gradients, of_errors=outer, of_features=of_features)
         addresses = ctypes.addressof(ctx.structure), ctypes.addressof(gradients)
         check_called(ctx.kernels.library.decode(*addresses, threads))
+        give_back(kept.values())
         return of_features, None, *(part for layer in sums for part in layer.collect())
 
 

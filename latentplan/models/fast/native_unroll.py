@@ -19,14 +19,17 @@ from latentplan.models.fast.native import (
     Kernels,
     Layer,
     Place,
+    borrow,
     check_called,
     describe_layer,
     find_kernels,
+    give_back,
     lay_rows,
     pad_rows,
     pad_size,
     point_to,
     split_norms,
+    take_kept,
     weight_gradient,
 )
 from latentplan.models.fast.native_heads import collect_parameters, describe_network
@@ -153,6 +156,7 @@ class _Call:
         if actions is None:
             self.given["actions"] = torch.empty(steps, rows, example.shape[-1], dtype=kernels.real)
         self.results = self._allocate(steps, rows, stoch)
+        self.kept: dict[str, Tensor | None] | None = {name: self.results[name] for name in (*_SUMS, *_INPUTS)}
         self.structure = self._describe(steps, rows, example.shape[-1], policy, decay)
         failed = kernels.library.unroll(ctypes.addressof(self.structure), torch.get_num_threads())
         check_called(failed)
@@ -173,7 +177,7 @@ class _Call:
         for name, size in zip((*_SUMS, *_INPUTS), sizes, strict=True):
             count = steps - (has_frames and name in ("inputs", "gate_inputs", "first", "gate_products"))
             kept = count if name in _SUMS or self.learns else 1
-            results[name] = torch.empty(kept, rows, pad_size(size), dtype=kernels.half)
+            results[name] = borrow(kept, rows, pad_size(size), dtype=kernels.half)
         return results
 
     def _describe(
@@ -202,10 +206,11 @@ class _Call:
     def backward(self, outer: tuple[Tensor | None, ...]) -> tuple[Tensor | None, Tensor | None, tuple[Tensor, ...]]:
         """Gradients of embeddings, actions and weights, given those of deters, stochs, means and stds."""
         weights, results, kernels = self.weights, self.results, self.kernels
+        kept = take_kept(self)
         laid = [None if part is None else lay_rows(part, kernels.real) for part in outer]
         factors = {
-            f"of_{name}": torch.empty_like(results[like] if self.learns else results[like][:1])
-            for name, like in zip(("first", "gates", "second", "raw"), _SUMS, strict=True)
+            f"of_{name}": borrow(*(part.shape if self.learns else (1, *part.shape[1:])), dtype=kernels.half)
+            for name, part in zip(("first", "gates", "second", "raw"), map(results.__getitem__, _SUMS), strict=True)
         }
         sizes = [len(weights.input), len(weights.gates), len(weights.hidden)]
         norms = torch.zeros(2 * sum(sizes), dtype=kernels.real)
@@ -229,7 +234,9 @@ class _Call:
         of_embeddings, of_actions = (
             None if part is None else part[:, : self.rows] for part in (of_embeddings, of_actions)
         )
-        return of_embeddings, of_actions, self._collect(factors, norms, sizes) if self.learns else ()
+        of_weights = self._collect(factors, norms, sizes) if self.learns else ()
+        give_back([*kept.values(), *factors.values()])
+        return of_embeddings, of_actions, of_weights
 
     def _collect(self, factors: dict[str, Tensor], norms: Tensor, sizes: list[int]) -> tuple[Tensor, ...]:
         """Gradients of all parameters, in the order of `Weights`."""

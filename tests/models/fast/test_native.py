@@ -239,3 +239,23 @@ def test_default_sizes_fit_the_compiled_functions():
     model = WorldModel(ModelConfig(), 6)
     assert all(map(native.fits, (model.dynamics, model.actor, model.reward_head, model.continue_head)))
     assert native_pictures.can_encode(model.encoder) and native_pictures.can_encode(model.decoder)
+
+
+def test_second_backward_pass_is_refused_because_the_arrays_were_given_back(dtype):
+    head = randomized(ScalarHead(9, 21, 31), dtype)
+    total = native_heads.apply(head.mlp, draw(20, 9, dtype=dtype)).sum()
+    total.backward(retain_graph=True)
+    with pytest.raises(RuntimeError, match="once only"):
+        total.backward()
+
+
+def test_arrays_of_one_update_serve_the_next(dtype):
+    decoder = randomized(Decoder(10, 3), dtype)
+    frames = torch.zeros(5, 64, 64, 3, dtype=torch.uint8)
+    results = []
+    for seed in (0, 1, 0):
+        features = draw(5, 10, seed=seed, dtype=dtype).requires_grad_()
+        results.append(gradients([native_pictures.reconstruction_errors(decoder, features, frames)], [features]))
+    first, _, again = results
+    assert all(torch.equal(one, two) for one, two in zip(first, again, strict=True))
+    assert sum(map(len, native._spare.values())) <= native.MOST_SPARE * len(native._spare)
