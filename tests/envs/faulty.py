@@ -46,10 +46,13 @@ class Faulty(gymnasium.Env):
         return picture
 
     def is_due(self):
-        count = len(list(self.folder.iterdir()))
-        if count < self.times:
-            (self.folder / str(count)).touch()
-        return count < self.times
+        for count in range(self.times):
+            try:
+                (self.folder / str(count)).touch(exist_ok=False)  # two processes may arrive at the same time
+                return True
+            except FileExistsError:
+                continue
+        return False
 
 
 def divide(result):
