@@ -18,7 +18,7 @@ from latentplan.models.fast import frames as sliced_frames
 from latentplan.models.fast import rollout as rollouts
 from latentplan.models.fast.native_frame import NativeFrameFunctions
 from latentplan.models.fast.one_frame import TorchFrameFunctions
-from latentplan.models.heads import Mlp, ScalarHead, action_distribution
+from latentplan.models.heads import Mlp, ScalarHead
 from latentplan.models.world_model import WorldModel
 
 ROLLOUT_PARTS = ("dynamics", "reward_head", "value_head", "actor")
@@ -154,11 +154,7 @@ class CpuBackend(_ConvertingBackend):
         """See `Backend.imagine`; the weights of the dynamics get no gradient."""
         if not (native.fits(model.dynamics) and native.fits(model.actor)):
             return super().imagine(model, start, action_noise, noise, decay)
-
-        def act(features: Tensor) -> tuple[Tensor, Tensor]:
-            return action_distribution(self.apply(model.actor.mlp, features))
-
-        return native_unroll.imagine(_rssm(model), model.actor, start, action_noise, noise, decay, act)
+        return native_unroll.imagine(_rssm(model), model.actor, start, action_noise, noise, decay)
 
     def encode(self, model: WorldModel, frames: Tensor) -> Tensor:
         """See `Backend.encode`."""

@@ -12,15 +12,12 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import torch
 from torch import Tensor
-from torch.nn import functional
 
 from latentplan.models.fast.library import load
+from latentplan.models.fast.native import MULTIPLE, TILE, pad
 
 if TYPE_CHECKING:
     from latentplan.models.fast.rollout import Trunk, Weights
-
-TILE = 16  # columns of a tile of weights, and row pairs
-MULTIPLE = 2 * TILE  # every size of the model must be a multiple of this
 
 
 class _Layer(ctypes.Structure):
@@ -65,7 +62,7 @@ def pack(weights: Weights, critic: tuple[Trunk, Tensor, Tensor]) -> Packed | Non
 
     def split_output(matrix: Tensor, shift: Tensor) -> tuple[Tensor, None, Tensor]:
         """A float32 product as two bfloat16 products: of the rounded weights, and of the rounding errors."""
-        matrix, shift = _pad(matrix, 1), _pad(shift, 0)
+        matrix, shift = pad(matrix, 1, MULTIPLE), pad(shift, 0, MULTIPLE)
         rounded = matrix.bfloat16()
         return torch.cat([rounded, (matrix - rounded.float()).bfloat16()], 1), None, shift
 
@@ -74,7 +71,7 @@ def pack(weights: Weights, critic: tuple[Trunk, Tensor, Tensor]) -> Packed | Non
         return [(rotate(first, deter), *first_norm), (second, *second_norm), split_output(matrix, shift)]
 
     layers = [
-        (torch.cat([_pad(weights.action, 0), weights.stoch]), *weights.input_norm),
+        (torch.cat([pad(weights.action, 0, MULTIPLE), weights.stoch]), *weights.input_norm),
         (rotate(weights.gates, hidden), *weights.gates_norm),
         (weights.prior, *weights.prior_norm),
         (weights.mean, None, weights.mean_shift.float()),
@@ -130,12 +127,6 @@ def _call(
     places = [None if tensor is None else tensor.data_ptr() for tensor in (deter, stoch, actions, rewards, values)]
     if library.imagine(ctypes.addressof(packed.model), *places, rows, time, torch.get_num_threads()):
         raise MemoryError(f"not enough memory for a rollout of {rows} rows")
-
-
-def _pad(matrix: Tensor, dim: int) -> Tensor:
-    """The matrix with zeros after the last row or column, up to a multiple of `MULTIPLE`."""
-    missing = -matrix.shape[dim] % MULTIPLE
-    return functional.pad(matrix, [0, 0] * (matrix.dim() - 1 - dim) + [0, missing])
 
 
 def _to_tiles(

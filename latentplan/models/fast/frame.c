@@ -82,8 +82,6 @@ typedef struct {
 } Product;
 
 static long padded(long size) { return (size + TILE - 1) / TILE * TILE; }
-static long larger(long left, long right) { return left > right ? left : right; }
-static long smaller(long left, long right) { return left < right ? left : right; }
 static void copy(float *to, const float *from, long size) { memcpy(to, from, (size_t)size * sizeof(float)); }
 
 // Products of `count` rows, the first of them `first`, with some tiles of weights; `count` and `tiles` are constants.

@@ -17,9 +17,6 @@ typedef struct {
     long inputs, outputs;
 } Layer;
 
-static inline long larger(long a, long b) { return a > b ? a : b; }
-static inline long smaller(long a, long b) { return a < b ? a : b; }
-
 static void *allocate(size_t size) { return aligned_alloc(64, (size + 63) / 64 * 64); }
 
 static inline size_t packed_size(const Layer *layer) {

@@ -62,7 +62,7 @@ def borrow(*shape: int, dtype: torch.dtype) -> Tensor:
     """An uninitialized array for intermediate results, to be returned by `give_back` where nothing reads it any more.
 
     The next update borrows the same arrays. Large arrays that are allocated anew for every update break up the memory
-    of the C library: a run grew to four times the size of its data.
+    of the C library, so that a run grows.
     """
     spare = _spare.get((shape, dtype))
     try:
@@ -92,6 +92,19 @@ def take_kept(ctx: Any) -> dict[str, Any]:
     return kept  # type: ignore[no-any-return]
 
 
+def require_kernels(tensor: Tensor) -> Kernels:
+    """The compiled functions for a tensor's format; a caller has asked `fits` whether there are any."""
+    kernels = find_kernels(tensor.dtype)
+    assert kernels is not None
+    return kernels
+
+
+def check_shape(name: str, tensor: Tensor | None, *shape: int) -> None:
+    """Raises ValueError for a tensor of another shape, because compiled functions read past its end."""
+    if tensor is not None and tensor.shape != shape:
+        raise ValueError(f"{name} has the shape {tuple(tensor.shape)}; the model needs {shape}")
+
+
 def describe_layer(linear: Tensor, scale: Tensor | None, shift: Tensor) -> Layer:
     """The layer with these weights (out, in); every tensor must be contiguous, and must live on."""
     outputs, inputs = linear.shape
@@ -110,12 +123,15 @@ def pad_size(size: int) -> int:
     return -(-size // MULTIPLE) * MULTIPLE
 
 
+def pad(tensor: Tensor, dim: int, multiple: int = TILE) -> Tensor:
+    """The tensor with zeros behind an axis, up to a multiple of a size."""
+    missing = -tensor.shape[dim] % multiple
+    return functional.pad(tensor, [0, 0] * (tensor.dim() - 1 - dim) + [0, missing]) if missing else tensor
+
+
 def pad_rows(tensor: Tensor, dim: int) -> Tensor:
     """The tensor with rows of zeros up to a multiple of `TILE` along an axis, contiguous."""
-    missing = -tensor.shape[dim] % TILE
-    if missing:
-        tensor = functional.pad(tensor, [0, 0] * (tensor.dim() - 1 - dim) + [0, missing])
-    return tensor.contiguous()
+    return pad(tensor, dim).contiguous()
 
 
 def lay_rows(tensor: Tensor, real: torch.dtype) -> Tensor:
@@ -150,7 +166,11 @@ def check_called(failed: int) -> None:
 
 def fits(module: nn.Module) -> bool:
     """Whether compiled functions can compute a module: float32 or float64 weights of moderate sizes on the CPU."""
-    parameters = list(module.parameters())
-    known = all(parameter.device.type == "cpu" and parameter.is_contiguous() for parameter in parameters)
-    small = all(max(parameter.shape) <= LONGEST_ROW for parameter in parameters)
-    return known and small and find_kernels(parameters[0].dtype) is not None
+    first, *others = module.parameters()
+    return (
+        all(
+            parameter.device.type == "cpu" and parameter.dtype == first.dtype and max(parameter.shape) <= LONGEST_ROW
+            for parameter in (first, *others)
+        )
+        and find_kernels(first.dtype) is not None
+    )

@@ -11,19 +11,16 @@ from typing import NamedTuple, cast
 
 import torch
 from torch import Tensor, nn
-from torch.nn import functional
 
 from latentplan.models.backend import FrameFunctions
 from latentplan.models.dynamics import Rssm, State
 from latentplan.models.encoder import FRAME_SIZE
 from latentplan.models.fast.library import load
+from latentplan.models.fast.native import TILE, Count, Place, pad
 from latentplan.models.heads import NormedLinear
 from latentplan.models.world_model import WorldModel
 
-TILE = 16  # as in frame.c
 MOST_PICTURES = 5
-
-Place, Count = ctypes.c_void_p, ctypes.c_long
 
 
 class _Layer(ctypes.Structure):
@@ -178,8 +175,8 @@ def _pack(model: WorldModel) -> tuple[_Model, list[Tensor]]:
 
     def layer(weight: Tensor, bias: Tensor | None = None, norm: nn.LayerNorm | None = None) -> _Layer:
         outputs, inputs = weight.shape
-        tiles = _pad(weight, 0).unflatten(0, (-1, TILE)).transpose(1, 2)
-        vectors = (None if bias is None else _pad(bias, 0), *((norm.weight, norm.bias) if norm else (None, None)))
+        tiles = pad(weight, 0).unflatten(0, (-1, TILE)).transpose(1, 2)
+        vectors = (None if bias is None else pad(bias, 0), *((norm.weight, norm.bias) if norm else (None, None)))
         return _Layer(keep(tiles), *(None if each is None else keep(each) for each in vectors), inputs, outputs)
 
     def linear(module: nn.Linear) -> _Layer:
@@ -190,11 +187,11 @@ def _pack(model: WorldModel) -> tuple[_Model, list[Tensor]]:
 
     def convolution(module: nn.Conv2d) -> _Layer:
         by_place = module.weight.permute(0, 2, 3, 1)  # (out, y, x, in)
-        return layer(_pad(by_place, 3).flatten(1), module.bias)
+        return layer(pad(by_place, 3).flatten(1), module.bias)
 
     convolutions = [cast(nn.Conv2d, each) for each in encoder.convolutions]
     channels = convolutions[-1].out_channels if convolutions else encoder.patches.out_features
-    embedding = _pad(encoder.linear.weight.unflatten(1, (-1, channels)), 2).flatten(1)
+    embedding = pad(encoder.linear.weight.unflatten(1, (-1, channels)), 2).flatten(1)
     seen = torch.cat([embedding, dynamics.posterior_deter.weight], 1)
     first, second = (cast(NormedLinear, each) for each in actor.trunk)
     packed = _Model(
@@ -213,8 +210,3 @@ def _pack(model: WorldModel) -> tuple[_Model, list[Tensor]]:
         hidden=dynamics.input.linear.out_features,
     )
     return packed, kept
-
-
-def _pad(tensor: Tensor, dim: int) -> Tensor:
-    """The tensor with zeros behind an axis, up to whole tiles."""
-    return functional.pad(tensor, [0, 0] * (tensor.dim() - 1 - dim) + [0, -tensor.shape[dim] % TILE])

@@ -10,17 +10,17 @@ from torch import Tensor
 
 from latentplan.models.fast.native import (
     Count,
-    Kernels,
     Layer,
     Place,
     borrow,
     check_called,
+    check_shape,
     describe_layer,
-    find_kernels,
     give_back,
     pad_rows,
     pad_size,
     point_to,
+    require_kernels,
     split_norms,
     take_kept,
     weight_gradient,
@@ -46,25 +46,31 @@ class _Gradients(ctypes.Structure):
 
 def apply(mlp: Mlp, features: Tensor) -> Tensor:
     """The outputs of a network, (..., out), for features (..., in); gradients reach the features and the weights."""
-    results: Tensor = _Applied.apply(features, *collect_parameters(mlp))
+    parameters = collect_parameters(mlp)
+    check_shape("features", features, *features.shape[:-1], parameters[0].shape[1])
+    results: Tensor = _Applied.apply(features, *parameters)
     return results
 
 
 def mean(head: ScalarHead, logits: Tensor) -> Tensor:
     """See `ScalarHead.mean`."""
+    check_shape("logits", logits, *logits.shape[:-1], len(head.values))
     means: Tensor = _Mean.apply(logits, head.values)
     return means
 
 
 def cross_entropy(head: ScalarHead, logits: Tensor, targets: Tensor) -> Tensor:
     """See `ScalarHead.loss`."""
-    losses: Tensor = _CrossEntropy.apply(logits, head.values, targets.detach())
+    check_shape("logits", logits, *targets.shape, len(head.values))
+    losses: Tensor = _CrossEntropy.apply(logits, head.values, targets.detach().to(logits.dtype))
     return losses
 
 
 def lambda_return(rewards: Tensor, discounts: Tensor, values: Tensor, lambda_: float) -> Tensor:
     """See `Backend.lambda_return`."""
-    returns: Tensor = _LambdaReturn.apply(rewards, discounts, values, lambda_)
+    check_shape("discounts", discounts, *rewards.shape)
+    check_shape("values", values, *rewards.shape)
+    returns: Tensor = _LambdaReturn.apply(rewards, discounts.to(rewards.dtype), values.to(rewards.dtype), lambda_)
     return returns
 
 
@@ -81,16 +87,10 @@ def describe_network(parameters: tuple[Tensor, ...]) -> tuple[Layer, Layer, Laye
     return describe_layer(*first), describe_layer(*second), describe_layer(output[0], None, output[1])
 
 
-def _kernels(tensor: Tensor) -> Kernels:
-    kernels = find_kernels(tensor.dtype)
-    assert kernels is not None
-    return kernels
-
-
 class _Applied(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, features: Tensor, *parameters: Tensor) -> Tensor:
-        kernels, layers = _kernels(parameters[0]), describe_network(parameters)
+        kernels, layers = require_kernels(parameters[0]), describe_network(parameters)
         flat = pad_rows(features.to(kernels.real).reshape(-1, features.shape[-1]), 0)
         sizes = [pad_size(size) for size in (layers[0].inputs, layers[0].outputs, layers[1].outputs)]
         learns = any(ctx.needs_input_grad[1:])
@@ -145,7 +145,7 @@ class _Mean(torch.autograd.Function):
         means = logits.new_empty(logits.shape[:-1])
         of_logits = torch.empty_like(logits) if ctx.needs_input_grad[0] else None
         places = [None if part is None else part.data_ptr() for part in (logits, values, means, of_logits)]
-        _kernels(logits).library.mean_of_bins(*places, means.numel(), logits.shape[-1])
+        require_kernels(logits).library.mean_of_bins(*places, means.numel(), logits.shape[-1])
         ctx.of_logits = of_logits
         return means
 
@@ -160,7 +160,7 @@ class _CrossEntropy(torch.autograd.Function):
         logits, targets, values = logits.contiguous(), targets.contiguous(), values.to(logits.dtype)
         losses, ctx.of_logits = torch.empty_like(targets), torch.empty_like(logits)
         places = [part.data_ptr() for part in (logits, values, targets, losses, ctx.of_logits)]
-        _kernels(logits).library.cross_entropy(*places, losses.numel(), logits.shape[-1])
+        require_kernels(logits).library.cross_entropy(*places, losses.numel(), logits.shape[-1])
         return losses
 
     @staticmethod
@@ -175,7 +175,7 @@ class _LambdaReturn(torch.autograd.Function):
         returns = torch.empty_like(rewards)
         places = [part.data_ptr() for part in (rewards, discounts, values)]
         steps, rows = len(rewards), rewards[0].numel()
-        _kernels(rewards).library.lambda_return(*places, lambda_, returns.data_ptr(), steps, rows)
+        require_kernels(rewards).library.lambda_return(*places, lambda_, returns.data_ptr(), steps, rows)
         ctx.tensors, ctx.lambda_ = (discounts, values, returns), lambda_
         return returns
 
@@ -184,5 +184,5 @@ class _LambdaReturn(torch.autograd.Function):
         outer, gradients = outer.contiguous(), [torch.empty_like(outer) for _ in range(3)]
         before = [part.data_ptr() for part in ctx.tensors]
         after = [part.data_ptr() for part in (outer, *gradients)]
-        _kernels(outer).library.lambda_return_back(*before, ctx.lambda_, *after, len(outer), outer[0].numel())
+        require_kernels(outer).library.lambda_return_back(*before, ctx.lambda_, *after, len(outer), outer[0].numel())
         return gradients[0], gradients[1], gradients[2], None

@@ -13,22 +13,22 @@ import torch
 from torch import Tensor, nn
 
 from latentplan.models.decoder import Decoder
-from latentplan.models.encoder import Encoder
+from latentplan.models.encoder import FRAME_SIZE, Encoder
 from latentplan.models.fast.native import (
     LONGEST_ROW,
     TILE,
     Count,
-    Kernels,
     Layer,
     Place,
     borrow,
     check_called,
+    check_shape,
     describe_layer,
-    find_kernels,
     fits,
     give_back,
     pad_size,
     point_to,
+    require_kernels,
     take_kept,
 )
 
@@ -78,6 +78,7 @@ class _DecoderGradients(ctypes.Structure):
 
 def encode(encoder: Encoder, frames: Tensor) -> Tensor:
     """Embeddings (rows, embedding) of uint8 frames (rows, 64, 64, 3); gradients reach the weights."""
+    _check_frames(frames, len(frames))
     weight = encoder.patches.weight / 255.0
     shift = encoder.patches.bias - 0.5 * encoder.patches.weight.sum(-1)  # see `Encoder._project`
     layers = [weight, shift, encoder.linear.weight, encoder.linear.bias]
@@ -90,6 +91,8 @@ def encode(encoder: Encoder, frames: Tensor) -> Tensor:
 
 def reconstruction_errors(decoder: Decoder, features: Tensor, frames: Tensor) -> Tensor:
     """Squared errors (rows,) of decoded pictures; gradients reach features (rows, feature) and weights."""
+    check_shape("features", features, len(features), decoder.tokens.in_features)
+    _check_frames(frames, len(features))
     kernel, bias = decoder.mix.parameters()
     layers = [decoder.tokens.weight, decoder.tokens.bias, decoder.paint.weight, decoder.paint.bias]
     layers += [kernel.permute(0, 2, 3, 1), bias]
@@ -103,10 +106,10 @@ def can_encode(module: nn.Module) -> bool:
     return fits(module) and all(part.weight[0].numel() <= LONGEST_ROW for part in layers)
 
 
-def _kernels(weight: Tensor) -> Kernels:
-    kernels = find_kernels(weight.dtype)
-    assert kernels is not None
-    return kernels
+def _check_frames(frames: Tensor, rows: int) -> None:
+    check_shape("frames", frames, rows, FRAME_SIZE, FRAME_SIZE, 3)
+    if frames.dtype != torch.uint8:
+        raise ValueError(f"frames must be uint8, got {frames.dtype}")
 
 
 class _LayerSums:
@@ -130,7 +133,7 @@ class _LayerSums:
 class _Encoded(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, frames: Tensor, *layers: Tensor) -> Tensor:
-        kernels, layers = _kernels(layers[0]), tuple(layer.contiguous() for layer in layers)
+        kernels, layers = require_kernels(layers[0]), tuple(layer.contiguous() for layer in layers)
         patches, shift, linear, bias, *rest = layers
         structure = _Encoder(
             describe_layer(patches, None, shift), describe_layer(linear, None, bias), num_convolutions=len(rest) // 2
@@ -166,7 +169,7 @@ class _Encoded(torch.autograd.Function):
 class _Reconstructed(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, features: Tensor, frames: Tensor, *layers: Tensor) -> Tensor:
-        kernels, layers = _kernels(layers[0]), tuple(layer.contiguous() for layer in layers)
+        kernels, layers = require_kernels(layers[0]), tuple(layer.contiguous() for layer in layers)
         features = features.to(kernels.real).contiguous()
         tokens, tokens_bias, paint, paint_bias, mix, mix_bias = layers
         structure = _Decoder(

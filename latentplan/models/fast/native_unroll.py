@@ -14,27 +14,27 @@ import torch
 from torch import Tensor
 
 from latentplan.models.dynamics import Gaussian, State
+from latentplan.models.fast import native_heads
 from latentplan.models.fast.native import (
     Count,
-    Kernels,
     Layer,
     Place,
     borrow,
     check_called,
+    check_shape,
     describe_layer,
-    find_kernels,
     give_back,
     lay_rows,
     pad_rows,
     pad_size,
     point_to,
+    require_kernels,
     split_norms,
     take_kept,
     weight_gradient,
 )
-from latentplan.models.fast.native_heads import collect_parameters, describe_network
 from latentplan.models.fast.unroll import Weights, collect_weights
-from latentplan.models.heads import sample_action
+from latentplan.models.heads import action_distribution, sample_action
 
 if TYPE_CHECKING:
     from latentplan.models.dynamics import Rssm
@@ -90,28 +90,15 @@ def predict(dynamics: Rssm, start: State, actions: Tensor) -> tuple[Tensor, Gaus
 
 
 def imagine(
-    dynamics: Rssm, actor: Actor, start: State, action_noise: Tensor, noise: Tensor, decay: float, apply_actor: Any
+    dynamics: Rssm, actor: Actor, start: State, action_noise: Tensor, noise: Tensor, decay: float
 ) -> tuple[Tensor, Tensor]:
-    """The same as `Dynamics.imagine` with an actor as the policy; gradients reach the actor through the dynamics.
-
-    Args:
-        dynamics: The dynamics; their weights get no gradient.
-        actor: The policy, which reads states without a gradient.
-        start: States, (rows, ...) each, without a gradient.
-        action_noise: Standard normal draws for the actions, (horizon, rows, action).
-        noise: Standard normal draws for the latents, (horizon, rows, latent).
-        decay: Share of a state's gradient that a step passes back to the state before.
-        apply_actor: Mean and std of the action for features (..., feature), with gradients to the actor.
-
-    Returns:
-        Features, the start first, (horizon + 1, rows, feature); std of the actions, (horizon, rows, action).
-    """
+    """The same as `unroll.imagine`, for which see the arguments."""
     weights = collect_weights(dynamics, prior=True)
     with torch.no_grad():
         call = _Call(weights, start.deter, start.stoch, None, None, noise, (actor, action_noise), decay)
         features = call.features[:, : len(start.deter)]
     # The actor runs once more on all states at once, because its gradient needs no recurrence.
-    mean, std = apply_actor(features[:-1])
+    mean, std = action_distribution(native_heads.apply(actor.mlp, features[:-1]))
     return _Imagined.apply(sample_action(mean, std, action_noise), features, call), std
 
 
@@ -140,14 +127,13 @@ class _Call:
         policy: tuple[Actor, Tensor] | None = None,
         decay: float = 1.0,
     ) -> None:
-        kernels = find_kernels(weights.gates.dtype)
-        assert kernels is not None
-        self.kernels: Kernels = kernels
+        self.kernels = kernels = require_kernels(weights.gates)
         self.weights, self.rows = weights, len(deter)
         self.learns = policy is None  # in imagined rollouts the weights get no gradient
         has_frames, draws = embeddings is not None, None if policy is None else policy[1]
         example = actions if actions is not None else draws
         assert example is not None
+        self._check_shapes(deter, stoch, embeddings, noise, example, len(example) + has_frames)
         self.given = {
             name: None if part is None else pad_rows(part.to(kernels.real), part.dim() - 2)
             for name, part in zip(_GIVEN, (deter, stoch, embeddings, noise, draws, actions), strict=True)
@@ -155,13 +141,30 @@ class _Call:
         rows, steps = len(self.given["start_deter"]), len(example) + has_frames  # type: ignore[arg-type]
         if actions is None:
             self.given["actions"] = torch.empty(steps, rows, example.shape[-1], dtype=kernels.real)
-        self.results = self._allocate(steps, rows, stoch)
+        self.results = self._allocate(steps, rows)
         self.kept: dict[str, Tensor | None] | None = {name: self.results[name] for name in (*_SUMS, *_INPUTS)}
         self.structure = self._describe(steps, rows, example.shape[-1], policy, decay)
         failed = kernels.library.unroll(ctypes.addressof(self.structure), torch.get_num_threads())
         check_called(failed)
 
-    def _allocate(self, steps: int, rows: int, stoch: Tensor | None) -> dict[str, Tensor]:
+    def _check_shapes(
+        self,
+        deter: Tensor,
+        stoch: Tensor | None,
+        embeddings: Tensor | None,
+        noise: Tensor | None,
+        example: Tensor,
+        steps: int,
+    ) -> None:
+        weights, rows = self.weights, self.rows
+        latent = len(weights.output) // 2
+        check_shape("deter", deter, rows, len(weights.gates) // 3)
+        check_shape("stoch", stoch, rows, latent)
+        check_shape("embeddings", embeddings, steps, rows, len(weights.hidden))
+        check_shape("noise", noise, steps, rows, latent)
+        check_shape("actions", example, len(example), rows, weights.input.shape[1] - latent)
+
+    def _allocate(self, steps: int, rows: int) -> dict[str, Tensor]:
         weights, kernels, has_frames = self.weights, self.kernels, self.given["embeddings"] is not None
         deter, latent = weights.gates.shape[0] // 3, weights.output.shape[0] // 2
         first, gates, second = len(weights.input), len(weights.gates), len(weights.hidden)
@@ -191,7 +194,9 @@ class _Call:
             describe_layer(weights.output, None, weights.output_bias),
         )
         if policy is not None:
-            structure.actor = (Layer * 3)(*describe_network(collect_parameters(policy[0].mlp)))
+            structure.actor = (Layer * 3)(
+                *native_heads.describe_network(native_heads.collect_parameters(policy[0].mlp))
+            )
         structure.rows, structure.steps, structure.action, structure.decay = rows, steps, action, decay
         structure.latent, structure.deter = len(weights.output) // 2, len(weights.gates) // 3
         structure.keeps_inputs = self.learns

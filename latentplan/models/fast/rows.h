@@ -21,6 +21,9 @@ typedef double real;
 typedef float real;
 #endif
 
+static inline long larger(long a, long b) { return a > b ? a : b; }
+static inline long smaller(long a, long b) { return a < b ? a : b; }
+
 static inline float read_bfloat16(bfloat16 half) {
     uint32_t bits = (uint32_t)half << 16;
     float value;

@@ -107,7 +107,7 @@ static inline wide gate_of(const Norm *norm, long chunk, long i, long size) {
 }
 
 // The next state of the GRU.
-static inline void gate_row(real *after, const Norm *norm, const real *before, long size) {
+static inline void update_row(real *after, const Norm *norm, const real *before, long size) {
     FOR_LANES(i, size) {
         wide candidate = tanh_of(sigmoid_of(gate_of(norm, 0, i, size)) * gate_of(norm, 1, i, size));
         wide update = sigmoid_of(gate_of(norm, 2, i, size) - 1), old = load(before + i, size - i);
@@ -143,7 +143,7 @@ static void advance(const Block *block, long step, long index) {
         real *after = u->deters + row_of(block, step, r) * u->state_stride[0];
         write_row(u->gate_products + row_of(block, index, r) * gates, products + r * gates, u->gates.outputs);
         Norm norm = compute_norm(products + r * gates, u->gates.scale, u->gates.shift, u->gates.outputs);
-        gate_row(after, &norm, before, u->deter);
+        update_row(after, &norm, before, u->deter);
     }
 }
 

@@ -14,6 +14,8 @@ typedef real wide __attribute__((vector_size(LANES * sizeof(real))));
 
 #if PAIR == 2
 
+#include "vectors.h"
+
 static inline __mmask16 mask_of(long left) { return left >= LANES ? 0xffff : (__mmask16)((1u << left) - 1); }
 static inline wide load(const real *from, long left) { return (wide)_mm512_maskz_loadu_ps(mask_of(left), from); }
 static inline void store(real *to, wide values, long left) { _mm512_mask_storeu_ps(to, mask_of(left), (__m512)values); }
@@ -29,17 +31,6 @@ static inline void store_half(half *to, wide values, long left) {
 
 static inline real sum_of(wide values) { return _mm512_reduce_add_ps((__m512)values); }
 
-// 2^x = 2^n 2^f with |f| <= 1/2; the polynomial is Taylor's of degree 5, relative error 3e-6.
-static inline wide power_of_two_of(wide x) {
-    __m512 n = _mm512_roundscale_ps((__m512)x, _MM_FROUND_TO_NEAREST_INT | _MM_FROUND_NO_EXC);
-    wide f = x - (wide)n, p = f * 1.33335581e-3f + 9.61812911e-3f;
-    p = p * f + 5.55041087e-2f;
-    p = p * f + 2.40226507e-1f;
-    p = p * f + 6.93147181e-1f;
-    p = p * f + 1.0f;
-    return (wide)_mm512_scalef_ps((__m512)p, n);
-}
-
 // The reciprocal with a step of Newton's method; 0 for infinity.
 static inline wide reciprocal_of(wide x) {
     wide first = (wide)_mm512_rcp14_ps((__m512)x);
@@ -49,7 +40,7 @@ static inline wide reciprocal_of(wide x) {
 static inline wide sigmoid_of(wide x) {
     // Beyond 80 the sigmoid is 0 or 1 in float32; infinite powers would give NaN.
     wide limited = (wide)_mm512_max_ps(_mm512_set1_ps(-80.0f), (__m512)x);
-    return reciprocal_of(power_of_two_of(limited * -1.44269504f) + 1.0f);
+    return reciprocal_of((wide)power_of_two((__m512)(limited * -1.44269504f)) + 1.0f);
 }
 
 #else

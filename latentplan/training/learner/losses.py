@@ -344,8 +344,8 @@ def mean_within(values: Tensor, within: Tensor) -> Tensor:
 def _probe_errors(model: WorldModel, features: Tensor, labels: Tensor) -> Tensor:
     """Mean squared error of the quantities read from features, in typical sizes, (...); features get no gradient."""
     with model.trunk_precision(cache=False):
-        predicted = model.backend.apply(model.probe_head, features.detach()) * model.label_scales
-    return ((predicted - labels) / model.label_scales).square().mean(-1)
+        predicted = model.backend.apply(model.probe_head, features.detach())
+    return (predicted - labels / model.label_scales).square().mean(-1)
 
 
 def _free_kl(left: Gaussian, right: Gaussian, free_nats: float) -> Tensor:

@@ -10,7 +10,7 @@ from latentplan.models.decoder import Decoder
 from latentplan.models.dynamics import Rssm
 from latentplan.models.encoder import Encoder
 from latentplan.models.fast import CpuBackend, native, native_heads, native_pictures, native_unroll
-from latentplan.models.heads import Actor, ScalarHead, action_distribution
+from latentplan.models.heads import Actor, ScalarHead
 
 STEPS = 5
 SIZES = {"odd sizes": (7, 5, 11, 13, 3, 17), "sizes of a run": (32, 32, 64, 64, 6, 64)}  # rows, latent, deter, ...
@@ -98,11 +98,7 @@ def test_imagine_equals_autograd(sizes, dtype, decay):
     actor = randomized(Actor(deter + latent, hidden, action), dtype)
     start = State(draw(rows, deter, dtype=dtype).tanh(), draw(rows, latent, seed=1, dtype=dtype))
     noise = draw(STEPS, rows, action, seed=2, dtype=dtype), draw(STEPS, rows, latent, seed=3, dtype=dtype)
-
-    def act(features):
-        return action_distribution(native_heads.apply(actor.mlp, features))
-
-    found = native_unroll.imagine(dynamics, actor, start, *noise, decay, act)
+    found = native_unroll.imagine(dynamics, actor, start, *noise, decay)
     expected = dynamics.imagine(actor, start, *noise, decay)
     assert_equal(*(gradients(each, list(actor.parameters())) for each in (found, expected)), dtype)
 
@@ -180,7 +176,7 @@ def make_calls(dtype):
         "observe": lambda number: native_unroll.observe(dynamics, embeddings, moves, spoiled(number), draws)[0].stoch,
         "predict": lambda number: native_unroll.predict(dynamics, start(number), moves)[0],
         "imagine": lambda number: native_unroll.imagine(
-            dynamics, actor, start(number), noise, draw(STEPS, rows, latent, dtype=dtype), 1.0, actor
+            dynamics, actor, start(number), noise, draw(STEPS, rows, latent, dtype=dtype), 1.0
         )[0].transpose(0, 1),
         "apply": lambda number: native_heads.apply(head.mlp, spoiled(number)),
         "mean": lambda number: native_heads.mean(head, spoiled(number)[:, :31]),
@@ -259,3 +255,30 @@ def test_arrays_of_one_update_serve_the_next(dtype):
     first, _, again = results
     assert all(torch.equal(one, two) for one, two in zip(first, again, strict=True))
     assert sum(map(len, native._spare.values())) <= native.MOST_SPARE * len(native._spare)
+
+
+def test_inputs_of_another_shape_are_refused_before_compiled_code_reads_them(dtype):
+    sizes = SIZES["odd sizes"]
+    rows, latent, deter, hidden, action, embedding = sizes
+    dynamics, head = make_dynamics(sizes, dtype), randomized(ScalarHead(deter, hidden, 31), dtype)
+    encoder, decoder = randomized(Encoder((4, 4), 8), dtype), randomized(Decoder(deter, 3), dtype)
+    start = State(draw(rows, deter, dtype=dtype), draw(rows, latent, dtype=dtype))
+    frames, logits = torch.zeros(rows, 64, 64, 3, dtype=torch.uint8), draw(rows, 31, dtype=dtype)
+    wrong = draw(rows, deter + 1, dtype=dtype)
+    values = draw(STEPS, rows, dtype=dtype)
+    calls = [
+        lambda: native_unroll.predict(dynamics, start, draw(rows, STEPS, action + 1, dtype=dtype)),
+        lambda: native_unroll.predict(dynamics, State(wrong, start.stoch), draw(rows, STEPS, action, dtype=dtype)),
+        lambda: native_unroll.predict(dynamics, start, draw(rows + 1, STEPS, action, dtype=dtype)),
+        lambda: native_heads.apply(head.mlp, wrong),
+        lambda: native_heads.mean(head, logits[:, :-1]),
+        lambda: native_heads.cross_entropy(head, logits, draw(rows + 1, dtype=dtype)),
+        lambda: native_heads.lambda_return(values, values, values[:, :-1], 0.9),
+        lambda: native_pictures.encode(encoder, frames[:, :-1]),
+        lambda: native_pictures.encode(encoder, frames.float()),
+        lambda: native_pictures.reconstruction_errors(decoder, wrong, frames),
+        lambda: native_pictures.reconstruction_errors(decoder, start.deter, frames[:-1]),
+    ]
+    for call in calls:
+        with pytest.raises(ValueError, match="shape|uint8"):
+            call()
