@@ -100,6 +100,7 @@ def test_kernel_passes_gradients_when_inputs_require_them():
 
 @pytest.mark.parametrize("settings", [{"CC": "false"}, {"CC": "/nowhere/cc"}, {"LATENTPLAN_KERNELS": "0"}])
 def test_load_returns_none_without_a_working_compiler_and_says_so_once(settings, tmp_path, monkeypatch, caplog):
+    monkeypatch.delenv("LATENTPLAN_KERNELS", raising=False)
     for name, value in {"XDG_CACHE_HOME": str(tmp_path), **settings}.items():
         monkeypatch.setenv(name, value)
     library._say_slower.cache_clear()
