@@ -202,6 +202,16 @@ def test_mppi_plans_the_same_when_returns_are_scaled_and_shifted(point, states, 
     torch.testing.assert_close(plans[0].mean, plans[1].mean, atol=1e-4, rtol=1e-4)
 
 
+def test_mppi_weighs_equal_returns_alike(seeded):
+    model = FunctionModel(lambda state, action: state, lambda state, action: torch.full((len(state),), -1.0))
+    planner = mppi_planner(action_dim=2, horizon=4, num_samples=64, final="mean")
+    seen = []
+    plan = planner.plan(model, torch.zeros(2, 1), generator=seeded(), callback=seen.append)
+    assert not plan.info["is_fallback"].any()
+    torch.testing.assert_close(plan.mean, seen[0].actions.mean(dim=1))
+    torch.testing.assert_close(plan.expected_return, torch.full((2,), -4.0))
+
+
 def test_mixed_noise_has_smooth_samples_that_explore_and_white_ones_that_stay_close():
     streams = Streams(torch.Generator().manual_seed(0), 1, torch.device("cpu"))
     noise = streams.noise(40_000, 10, 1, 2.0, 0.5, torch.float64)[0, :, :, 0]
