@@ -297,8 +297,10 @@ class Search:
     def _sample(self, progress: Progress, std: Tensor, num: int) -> Tensor:
         """Returns `num` clean points per environment, (batch, num, length, action)."""
         beta, white_share = self.options.noise_beta, self.options.white_noise_share
-        noise = self.streams.noise(num, self.space.length, self.bounds.action_dim, beta, white_share, self.dtype)
-        samples = torch.addcmul(progress.mean[:, None], std[:, None], noise)
+        length, action_dim = self.space.length, self.bounds.action_dim
+        noise, scale = self.streams.noise(num, length, action_dim, beta, white_share, self.dtype)
+        spread = std[:, None] if scale is None else std[:, None] * scale
+        samples = torch.addcmul(progress.mean[:, None], spread, noise)
         if progress.probabilities is not None:
             assert self.space.choices is not None
             samples = self.space.choices.sample(samples, progress.probabilities, noise)

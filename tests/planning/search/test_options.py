@@ -166,7 +166,7 @@ def test_warm_and_cold_environments_have_their_own_iterations(point, states, mak
 @pytest.mark.parametrize("beta", [0.0, 1.0, 3.0])
 def test_coloured_noise_has_unit_variance_and_correlated_steps(beta):
     streams = Streams(torch.Generator().manual_seed(0), 1, torch.device("cpu"))
-    noise = streams.noise(20_000, 12, 1, beta, 0.0, torch.float64)[0, :, :, 0]
+    noise = streams.noise(20_000, 12, 1, beta, 0.0, torch.float64)[0][0, :, :, 0]
     torch.testing.assert_close(noise.var(dim=0), torch.ones(12, dtype=torch.float64), atol=0.05, rtol=0)
     neighbours = (noise[:, 1:] * noise[:, :-1]).mean().item()
     opposite_ends = (noise[:, 0] * noise[:, -1]).mean().item()
@@ -179,7 +179,7 @@ def test_mppi_equals_its_formula(point, states, seeded):
     planner = mppi_planner(action_dim=2, horizon=4, num_samples=128, num_policy_samples=0, **options)
     plan = planner.plan(point, states[:1], generator=seeded())
     streams = Streams(seeded(), 1, torch.device("cpu"))
-    candidates = (0.4 * streams.noise(128, 4, 2, 0.0, 0.0, torch.float32)[0]).clamp(-1, 1)
+    candidates = (0.4 * streams.noise(128, 4, 2, 0.0, 0.0, torch.float32)[0][0]).clamp(-1, 1)
     candidates[0] = 0.0
     returns = []
     for sequence in candidates:
@@ -214,8 +214,9 @@ def test_mppi_weighs_equal_returns_alike(seeded):
 
 def test_mixed_noise_has_smooth_samples_that_explore_and_white_ones_that_stay_close():
     streams = Streams(torch.Generator().manual_seed(0), 1, torch.device("cpu"))
-    noise = streams.noise(40_000, 10, 1, 2.0, 0.5, torch.float64)[0, :, :, 0]
-    smooth, white = noise.chunk(2)
+    noise, scale = streams.noise(40_000, 10, 1, 2.0, 0.5, torch.float64)
+    torch.testing.assert_close(noise.var(dim=(0, 1, 3)), torch.ones(10, dtype=torch.float64), atol=0.03, rtol=0)
+    smooth, white = (noise * scale)[0, :, :, 0].chunk(2)
     assert smooth.std().item() == pytest.approx(1.25, abs=0.03) and white.std().item() == pytest.approx(0.5, abs=0.01)
     correlation = [(part[:, 1:] * part[:, :-1]).mean().item() / part.var().item() for part in (smooth, white)]
     assert correlation[0] > 0.6 and abs(correlation[1]) < 0.02
