@@ -263,6 +263,15 @@ def test_last_action_is_unknown_where_a_plan_is_cold_or_another_agent_acted():
     torch.testing.assert_close(after.take(torch.tensor([1])).last_action, torch.tensor([[8.0, 9.0]]))
 
 
+def test_plan_from_dict_keeps_on_the_cpu_what_a_plan_says_about_time():
+    """The device `meta` stands for an accelerator."""
+    plan = Plan.around(torch.zeros(2, 3, 1)).executed(torch.ones(2, dtype=torch.long))
+    copy = Plan.from_dict(plan.to_dict(), torch.device("meta"))
+    for name in ("is_warm", "elapsed", "is_followed"):
+        assert torch.equal(getattr(copy, name), getattr(plan, name))
+    assert copy.actions.is_meta and copy.last_action.is_meta
+
+
 @pytest.mark.parametrize("shape", [(6, 2), (3, 6, 2), (3, 4, 2)])
 def test_plan_around_a_trajectory_starts_the_search_there(recorder, make_planner, seeded, shape):
     trajectory = torch.rand(shape, generator=seeded(4)) - 0.5
