@@ -376,6 +376,36 @@ def test_gradient_goes_on_where_it_helps_and_after_a_cold_start(point, make_plan
     assert calls  # an environment that starts cold has no pause
 
 
+@pytest.mark.parametrize("gradient_steps", [5, 20])
+def test_gradient_of_an_environment_does_not_depend_on_the_others(seeded, gradient_steps):
+    """The state is the curvature: a flat environment pauses, a steep one goes on, a kink undoes most steps."""
+
+    def reward(state, action):
+        smooth = -state[:, 0] * (action - 0.3).square().sum(dim=1)
+        return torch.where(state[:, 0] < 0, -(action - 0.3).abs().sum(dim=1), smooth)
+
+    model = FunctionModel(lambda state, action: state, reward)
+    curvatures = torch.tensor([[0.0], [1.0], [-1.0]])
+    planner = PLANNERS["cem_gradient"](
+        action_dim=2, horizon=3, num_samples=16, num_iterations=1, gradient_steps=gradient_steps
+    )
+
+    def play(states):
+        plan, plans = None, []
+        for search in range(6):
+            plan = planner.plan(model, states, plan, generator=seeded(search))
+            plans.append(plan)
+        return plans
+
+    together = play(curvatures)
+    for row in range(3):
+        for alone, batched in zip(play(curvatures[row : row + 1]), together, strict=True):
+            torch.testing.assert_close(alone.actions[0], batched.actions[row])
+            torch.testing.assert_close(alone.expected_return[0], batched.expected_return[row])
+            for name in ("gradient_pause", "gradient_wait"):
+                assert alone.info[name][0] == batched.info[name][row]
+
+
 def test_gradient_step_is_a_twentieth_of_the_range_by_default(make_planner, seeded):
     model = FunctionModel(lambda state, action: state, lambda state, action: action.sum(dim=1))
     planner = make_planner(
