@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, fields
 from functools import cached_property
 from typing import Any
 
@@ -20,8 +20,7 @@ from latentplan.planning.search.loop import Search
 from latentplan.planning.search.problem import Problem, View
 from latentplan.planning.search.purity import FirstSearches
 from latentplan.planning.search.sampling import Generators
-
-SIDES = ("low", "high")
+from latentplan.planning.search.space import read_bounds
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -80,11 +79,7 @@ class CEMPlanner(SearchOptions):
     @cached_property
     def bounds(self) -> tuple[torch.Tensor, torch.Tensor]:
         """Lowest and highest action, each (1 or batch, 1 or horizon, action), float64."""
-        low, high = (per_step(getattr(self, f"action_{side}"), self.action_dim, f"action_{side}") for side in SIDES)
-        low, high = (bound.clone() for bound in (low, high))
-        for dim, values in self.choices.items():
-            low[..., dim], high[..., dim] = min(values), max(values)
-        return low, high
+        return self._read_bounds(self.action_low, self.action_high)
 
     @cached_property
     def first_searches(self) -> FirstSearches:
@@ -147,7 +142,7 @@ class CEMPlanner(SearchOptions):
             raise ValueError(f"keep must be candidates, states or None, got {keep!r}")
         # In inference mode the plan could not be a training target, and gradient steps would fail.
         with torch.inference_mode(False), torch.no_grad():
-            low, high = self.bounds if bounds is None else self._replace_bounds(bounds)
+            low, high = self.bounds if bounds is None else self._read_bounds(*bounds)
             last = None if last_action is None else torch.as_tensor(last_action)
             is_new = self.first_searches.add(model)
             start, spread, discount = self._init_mean, self._init_std, self.discount
@@ -171,8 +166,12 @@ class CEMPlanner(SearchOptions):
     def _init_std(self) -> torch.Tensor | None:
         return None if self.init_std is None else per_step(self.init_std, self.action_dim, "init_std")
 
-    def _replace_bounds(self, bounds: tuple[Bound, Bound]) -> tuple[torch.Tensor, torch.Tensor]:
-        return replace(self, action_low=bounds[0], action_high=bounds[1]).bounds
+    def _read_bounds(self, low: Bound, high: Bound) -> tuple[torch.Tensor, torch.Tensor]:
+        lowest, highest = read_bounds(low, high, self.action_dim, self.choices)
+        if not bool((lowest < highest).all()):
+            given = f"action_low {lowest.squeeze().tolist()} must lie below action_high {highest.squeeze().tolist()}"
+            raise ValueError(given)
+        return lowest, highest
 
 
 def icem_planner(**settings: Any) -> CEMPlanner:
@@ -230,9 +229,7 @@ def _check_problem(planner: CEMPlanner) -> None:
     check_whole(planner, 1, "action_dim")
     if not 0.0 < planner.discount <= 1.0:
         raise ValueError(f"discount must lie in (0, 1], got {planner.discount}")
-    low, high = planner.bounds
-    if not bool((low < high).all()):
-        raise ValueError(f"action_low {low.squeeze().tolist()} must lie below action_high {high.squeeze().tolist()}")
+    _ = planner.bounds  # refuses bounds that do not fit
     if isinstance(planner.init_mean, Plan) and planner.init_mean.actions.shape[-1] != planner.action_dim:
         dim = planner.init_mean.actions.shape[-1]
         raise ValueError(f"init_mean is a plan of {dim} numbers per action, action_dim is {planner.action_dim}")

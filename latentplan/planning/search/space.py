@@ -7,13 +7,36 @@ constraints and controllers only see actions that can be executed.
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 
 import torch
 from torch import Tensor
 
+from latentplan.planning.model import Bound, per_step
 from latentplan.planning.search.choices import Choices
+
+
+def read_bounds(
+    low: Bound, high: Bound, action_dim: int, choices: Mapping[int, Sequence[float]]
+) -> tuple[Tensor, Tensor]:
+    """Returns the lowest and the highest action, each (1 or batch, 1 or horizon, action), float64.
+
+    Args:
+        low: Lowest action of continuous dimensions, see `CEMPlanner`.
+        high: Highest action of continuous dimensions.
+        action_dim: Numbers in an action.
+        choices: By discrete dimension, its values, which replace the bounds there.
+
+    Raises:
+        ValueError: A bound has a wrong shape, or is not finite.
+    """
+    lowest = per_step(low, action_dim, "action_low").clone()
+    highest = per_step(high, action_dim, "action_high").clone()
+    for dim, values in choices.items():
+        lowest[..., dim], highest[..., dim] = min(values), max(values)
+    return lowest, highest
 
 
 @dataclass(frozen=True)
