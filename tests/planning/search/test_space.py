@@ -297,6 +297,25 @@ def test_scheduler_without_plan_and_policy_acts_in_the_middle_of_the_bounds(poin
     torch.testing.assert_close(decision.action, torch.tensor([[0.5, -0.5]] * 2))
 
 
+@pytest.mark.parametrize("policy", [None, lambda state, generator: torch.full((len(state), 2), 0.8)])
+def test_scheduler_without_plan_takes_values_that_exist(point, make_planner, policy):
+    """With a plan the action is the plan's; without, the policy's or the middle, at the nearest value."""
+
+    class Busy:
+        is_idle = False
+
+        def poll(self):
+            return None
+
+    planner = make_planner(action_choices={1: (-2.0, 0.0, 1.0, 5.0)})
+    model = FunctionModel(point.dynamics, point.reward, policy=policy)
+    action = PlanScheduler(planner, model, Busy()).decide(torch.zeros(2, 4)).action
+    assert action.tolist() == [[pytest.approx(0.0 if policy is None else 0.8), 1.0]] * 2
+    whole = make_planner(action_choices=(2.0, 3.0, 4.0))  # none lies within action_low and action_high
+    action = PlanScheduler(whole, model, Busy()).decide(torch.zeros(2, 4)).action
+    assert action.tolist() == [[3.0 if policy is None else 2.0] * 2] * 2
+
+
 def test_penalties_see_actions_and_not_knots(recorder, make_planner, seeded):
     planner = make_planner(
         action_spline="zero", num_knots=2, init_mean=0.5, init_std=0.0, num_iterations=1, final="better"
