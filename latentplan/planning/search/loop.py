@@ -183,13 +183,16 @@ class Search:
                 mode = self.bounds.fit(self.scorer.act(self.state, self.bounds)[:, None].expand_as(actions))
             is_policy = torch.isfinite(mode).flatten(1).all(1)
             actions = torch.where(is_policy[:, None, None], mode, actions)
+        if not self.space.is_plain:
+            actions = self.space.decode(self.space.encode(actions))
         progress = self._begin(self._encode(shifted))
         info = {**progress.describe([], "deadline"), "is_policy": is_policy}
         if self.scorer.constraints:
             info["violation"] = torch.full_like(progress.expected_return, float("nan"))
         ones = torch.ones(self.batch, dtype=torch.long)
-        elites, is_warm, var = shifted.elites, shifted.is_warm, self.space.decode_var(progress.var)
-        return Plan(actions, shifted.mean, var, progress.expected_return, info, elites, is_warm, ones)
+        elites, is_warm = shifted.elites, shifted.is_warm
+        mean, var = self.space.decode(progress.mean), self.space.decode_var(progress.var)
+        return Plan(actions, mean, var, progress.expected_return, info, elites, is_warm, ones)
 
     def _iterate(
         self, start: WarmStart, proposals: Tensor | None, budget: Budget

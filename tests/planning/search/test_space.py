@@ -208,6 +208,32 @@ def test_rate_limit_holds_from_the_last_action_on(make_planner, seeded, limit, o
         state, last = -state, action
 
 
+@pytest.mark.parametrize(
+    "policy", [None, lambda state, generator: torch.where(state[:, :1] > 0, 1.0, -1.0).expand(-1, 2)]
+)
+@pytest.mark.parametrize("options", [{}, {"action_spline": "linear", "num_knots": 2}, {"action_choices": {1: 3}}])
+def test_plan_without_time_for_a_search_holds_limits_too(make_planner, seeded, policy, options):
+    model = FunctionModel(lambda state, action: state, greedy().reward, policy=policy)
+    own = {"num_policy_samples": 8, "tail": "policy"} if policy else {}
+    planner, state = make_planner(**options | own), torch.tensor([[1.0], [-1.0]])
+    limits = [rate_limit(0.3)]
+    loose = planner.plan(model, state, generator=seeded())  # not limited
+    plan = planner.plan(model, state, loose, constraints=limits, deadline_ms=0.0, last_action=torch.zeros(2, 2))
+    assert plan.info["stopped"] == "deadline" and plan.info["iterations"].tolist() == [0, 0]
+    continuous = plan.actions[..., :1] if "action_choices" in options else plan.actions
+    assert continuous.diff(dim=1, prepend=torch.zeros(2, 1, continuous.shape[-1])).abs().max() <= 0.3 + 1e-5
+    if "action_choices" in options:
+        assert torch.isin(plan.actions[..., 1], torch.arange(3.0)).all()
+
+
+def test_plan_without_time_for_a_search_is_a_spline_too(make_planner, seeded):
+    planner = make_planner(action_spline="linear", num_knots=2)
+    before = planner.plan(greedy(), torch.ones(2, 1), generator=seeded())
+    plan = planner.plan(greedy(), torch.ones(2, 1), before, deadline_ms=0.0)
+    assert before.actions.abs().min() > 0.1  # the shifted plan ends in a zero and therefore bends
+    torch.testing.assert_close(plan.actions.diff(n=2, dim=1), torch.zeros(2, 4, 2), atol=1e-6, rtol=0)
+
+
 def test_rate_limit_counts_from_the_given_last_action(recorder, make_planner, seeded):
     last = torch.tensor([[-0.9, 0.4]])
     plan = make_planner(num_iterations=8, num_samples=512, final="best").plan(
