@@ -22,6 +22,20 @@ from latentplan.planning.search.purity import FirstSearches
 from latentplan.planning.search.sampling import Generators
 from latentplan.planning.search.space import read_bounds
 
+# Options for which a planner has a value of its own.
+CEM_GRADIENT: dict[str, Any] = {"gradient_steps": 5}
+ICEM: dict[str, Any] = {"noise_beta": 2.0, "white_noise_share": 0.0, "keep_elite_fraction": 0.3, "final": "best"}
+MPPI: dict[str, Any] = {
+    "num_iterations": 1,
+    "smoothing": 1.0,
+    "temperature": 0.1,
+    "adapt_std": False,
+    "keep_elite_fraction": 0.0,
+    "noise_beta": 2.0,
+    "white_noise_share": 0.5,
+    "final": "better",
+}
+
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class CEMPlanner(SearchOptions):
@@ -181,8 +195,7 @@ def icem_planner(**settings: Any) -> CEMPlanner:
         **settings: Arguments of `CEMPlanner`; they replace `noise_beta` 2, `white_noise_share` 0, `keep_elite_fraction`
             0.3 and `final` "best".
     """
-    own: dict[str, Any] = {"noise_beta": 2.0, "white_noise_share": 0.0, "keep_elite_fraction": 0.3, "final": "best"}
-    return CEMPlanner(**own | settings)
+    return CEMPlanner(**ICEM | settings)
 
 
 def mppi_planner(**settings: Any) -> CEMPlanner:
@@ -195,10 +208,8 @@ def mppi_planner(**settings: Any) -> CEMPlanner:
             `adapt_std` False, `keep_elite_fraction` 0, `noise_beta` 2, `white_noise_share` 0.5, `final` "better",
             `num_elites`, which is all of `num_samples`, and `warm_start_iterations`, which is `num_iterations`.
     """
-    own: dict[str, Any] = {"num_elites": settings.get("num_samples", SearchOptions.num_samples), "num_iterations": 1}
-    own |= {"smoothing": 1.0, "temperature": 0.1, "adapt_std": False, "keep_elite_fraction": 0.0}
-    own |= {"noise_beta": 2.0, "white_noise_share": 0.5, "final": "better"}
-    merged = own | settings
+    merged = MPPI | settings
+    merged.setdefault("num_elites", merged.get("num_samples", SearchOptions.num_samples))
     if merged.get("warm_start_iterations") is None:
         merged["warm_start_iterations"] = merged["num_iterations"]
     return CEMPlanner(**merged)
@@ -212,16 +223,15 @@ def cem_gradient_planner(**settings: Any) -> CEMPlanner:
     Args:
         **settings: Arguments of `CEMPlanner`; they replace `gradient_steps` 5.
     """
-    return CEMPlanner(**{"gradient_steps": 5} | settings)
+    return CEMPlanner(**CEM_GRADIENT | settings)
 
 
 # By planner, the options for which it has a value of its own.
 OWN_OPTIONS: dict[Callable[..., Any], set[str]] = {
     CEMPlanner: set(),
-    cem_gradient_planner: {"gradient_steps"},
-    icem_planner: {"noise_beta", "white_noise_share", "keep_elite_fraction", "final"},
-    mppi_planner: {"num_elites", "num_iterations", "warm_start_iterations", "smoothing", "temperature", "adapt_std"}
-    | {"keep_elite_fraction", "noise_beta", "white_noise_share", "final"},
+    cem_gradient_planner: set(CEM_GRADIENT),
+    icem_planner: set(ICEM),
+    mppi_planner: {*MPPI, "num_elites", "warm_start_iterations"},
 }
 
 
