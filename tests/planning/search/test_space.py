@@ -154,6 +154,16 @@ def test_search_over_knots_finds_smooth_plans_with_fewer_candidates(make_planner
     assert knots.expected_return.mean() > plain.expected_return.mean() + 0.5
 
 
+def test_splines_are_inverted_once_for_all_decisions(recorder, make_planner, seeded, monkeypatch):
+    calls, invert = [], torch.linalg.pinv
+    monkeypatch.setattr(torch.linalg, "pinv", lambda matrix: (calls.append(matrix), invert(matrix))[1])
+    planner = make_planner(action_spline="cubic", horizon=11, num_knots=4)
+    for _ in range(3):
+        planner.plan(recorder, torch.zeros(1, 1), generator=seeded())
+    planner.plan(recorder, torch.zeros(1, 1).double(), generator=seeded())
+    assert len(calls) == 2  # one for each precision
+
+
 def test_search_over_knots_starts_warm_and_keeps_elites(make_planner, seeded):
     model = FunctionModel(lambda state, action: state + action, lambda state, action: -state.square().sum(dim=1))
     options = {"action_spline": "linear", "num_knots": 3, "keep_elite_fraction": 0.5, "final": "better"}
