@@ -15,6 +15,7 @@ from latentplan.config.parsing import raise_unknown
 
 NAMES = (*PROBLEMS, *SIMULATED)
 ELITE_SHARE = 0.1
+GRADIENT_COST = 3  # a backward pass costs about two forward
 Act = Callable[[Tensor], Tensor]  # act(state (rows, state)) -> action (rows, action), within the problem's bounds
 
 
@@ -40,7 +41,7 @@ class Task:
         samples: Candidates per iteration.
         iterations: Iterations of each decision.
         settings: Settings of the planner, which replace its own.
-        rows: Number of model steps that were evaluated so far; a step with gradients counts as three.
+        rows: Number of model steps that were evaluated so far; a step with gradients counts as `GRADIENT_COST`.
     """
 
     problem: ControlProblem
@@ -114,4 +115,4 @@ class CountingModel:
         return result
 
     def _count(self, steps: int) -> None:
-        self._task.rows += 3 * steps if torch.is_grad_enabled() else steps  # a backward pass costs about two forward
+        self._task.rows += GRADIENT_COST * steps if torch.is_grad_enabled() else steps
