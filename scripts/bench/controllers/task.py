@@ -9,12 +9,12 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from bench.peers.problem import count_elites
 from bench.problems import PROBLEMS, ControlProblem
 from bench.simulated_problems import SIMULATED
 from latentplan.config.parsing import raise_unknown
 
 NAMES = (*PROBLEMS, *SIMULATED)
-ELITE_SHARE = 0.1
 GRADIENT_COST = 3  # a backward pass costs about two forward
 Act = Callable[[Tensor], Tensor]  # act(state (rows, state)) -> action (rows, action), within the problem's bounds
 
@@ -53,7 +53,7 @@ class Task:
     @property
     def num_elites(self) -> int:
         """A tenth of the candidates, at least two."""
-        return max(2, round(ELITE_SHARE * self.samples))
+        return count_elites(self.samples)
 
     @property
     def scale(self) -> tuple[float, float]:
