@@ -69,7 +69,12 @@ class Plan:
     - `is_policy`: whether no iteration fitted the deadline and the actions are the policy's, (batch,); false unless the
       policy makes proposals, and false with constraints or an objective for which the policy was not trained;
     - `violation`: violation of the chosen sequence, only with constraints, (batch,);
-    - `stopped`: the reason the search ended, "iterations" or "deadline".
+    - `stopped`: the reason the search ended, "iterations" or "deadline";
+    - `gradient_pause`: number of searches that the last pause of gradient steps takes, (batch,), only with gradient
+      steps;
+    - `gradient_wait`: number of its searches that are left, (batch,), only with gradient steps;
+    - `probabilities`: probability of each value, (batch, length, discrete, value), only with discrete actions; the
+      length is the horizon, with a spline the number of knots.
 
     A planner of another kind must give `is_fallback`, `is_policy` and `num_nonfinite`.
 
