@@ -17,6 +17,7 @@ WIDEST_STD = 1e15  # the square of this std, and sums of such squares, are finit
 STEEPEST_NOISE = 100.0  # far below this exponent all steps share one cosine; from 150 on powers overflow
 NUM_POLICY_SAMPLES = 24
 ELITE_SHARE = 0.125
+TAKING_DEFAULT_ELITES = ("cem", "cem_gradient", "icem")  # planners without a number of elites of their own
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -188,7 +189,8 @@ class PlannerConfig(SearchOptions):
         above_zero(self, "surprise_limit")
 
     def _check_num_elites(self) -> None:
-        if self.method == "cem" or self.num_elites != PlannerConfig.num_elites:  # else the method takes its own number
+        takes_default = self.method in TAKING_DEFAULT_ELITES
+        if takes_default or self.num_elites != PlannerConfig.num_elites:  # else the method has its own number
             super()._check_num_elites()
 
 

@@ -19,12 +19,12 @@ from latentplan.planning.model import (
     count_rows,
     describe_step_result,
     is_sampling,
-    per_step,
     state_device,
     supports,
 )
 from latentplan.planning.search.choices import Choices, read_choices
 from latentplan.planning.search.registry import Planner
+from latentplan.planning.search.space import read_bounds
 
 _ROWS, _HORIZON, _NUM = 4, 3, 2
 _OPTIONAL = ("value", "policy", "continues", "uncertainty", "rollout", "fast_step", "propose", "particles")
@@ -84,9 +84,10 @@ def check_model(
         raise TypeError("check_model() needs action_dim or planner")
     index = torch.arange(_ROWS) % count_rows(state)
     rows = tree_map(lambda leaf: leaf[index.to(leaf.device)], state)
-    actions = _draw_actions(action_dim, action_low, action_high)
+    choices = read_choices(action_choices, action_dim)
+    actions = _draw_actions(*read_bounds(action_low, action_high, action_dim, choices))
     actions = actions.to(dtype=action_dtype(state), device=state_device(state))
-    if choices := read_choices(action_choices, action_dim):
+    if choices:
         actions = Choices(choices, actions.dtype, actions.device).snap(actions)
     checked = _Seeded(model, actions.device) if is_sampling(model) else model
     problems = list(_find_problems(checked, rows, actions, tolerance))
@@ -111,13 +112,12 @@ class _Seeded:
         return getattr(self._model, name)
 
 
-def _draw_actions(action_dim: int, low: Bound, high: Bound) -> Tensor:
+def _draw_actions(low: Tensor, high: Tensor) -> Tensor:
     """Returns actions within the bounds of the first steps and of the first environment, (rows, horizon, action)."""
     generator = torch.Generator().manual_seed(0)
-    drawn = torch.rand(_ROWS, _HORIZON, action_dim, generator=generator, dtype=torch.float64)
-    lowest, highest = (per_step(bound, action_dim, "a bound")[:1] for bound in (low, high))
+    drawn = torch.rand(_ROWS, _HORIZON, low.shape[-1], generator=generator, dtype=torch.float64)
     steps = torch.arange(_HORIZON)
-    lowest, highest = (bound[:, steps.clamp_max(bound.shape[1] - 1)] for bound in (lowest, highest))
+    lowest, highest = (bound[:1, steps.clamp_max(bound.shape[1] - 1)] for bound in (low, high))
     return lowest + (highest - lowest) * drawn
 
 

@@ -12,8 +12,9 @@ from einops import rearrange
 from torch import Tensor
 from torch.utils._pytree import tree_map
 
-# Attributes of a `Plan` that are tensors with the environment as dim 0.
-TENSORS = ("actions", "mean", "var", "expected_return", "elites", "is_warm", "elapsed", "is_followed")
+# Attributes of a `Plan` that are tensors with the environment as dim 0; the last three are always on the CPU.
+ON_CPU = ("is_warm", "elapsed", "is_followed")
+TENSORS = ("actions", "mean", "var", "expected_return", "elites", *ON_CPU)
 
 
 @dataclass(frozen=True)
@@ -68,7 +69,12 @@ class Plan:
     - `is_policy`: whether no iteration fitted the deadline and the actions are the policy's, (batch,); false unless the
       policy makes proposals, and false with constraints or an objective for which the policy was not trained;
     - `violation`: violation of the chosen sequence, only with constraints, (batch,);
-    - `stopped`: the reason the search ended, "iterations" or "deadline".
+    - `stopped`: the reason the search ended, "iterations" or "deadline";
+    - `gradient_pause`: number of searches that the last pause of gradient steps takes, (batch,), only with gradient
+      steps;
+    - `gradient_wait`: number of its searches that are left, (batch,), only with gradient steps;
+    - `probabilities`: probability of each value, (batch, length, discrete, value), only with discrete actions; the
+      length is the horizon, with a spline the number of knots.
 
     A planner of another kind must give `is_fallback`, `is_policy` and `num_nonfinite`.
 
@@ -215,13 +221,13 @@ class Plan:
 
     @classmethod
     def from_dict(cls, values: dict[str, Any], device: torch.device) -> Plan:
-        """The plan that `to_dict` copied; all but `is_warm` and `elapsed` moves to a device."""
+        """The plan that `to_dict` copied; all but `is_warm`, `elapsed` and `is_followed` moves to a device."""
 
         def move(value: Any) -> Any:
             return value.to(device) if isinstance(value, Tensor) else value
 
-        on_cpu = {name: values[name] for name in ("is_warm", "elapsed")}
-        moved = {name: move(values[name]) for name in TENSORS if name not in on_cpu}
+        on_cpu = {name: values[name] for name in ON_CPU}
+        moved = {name: move(values[name]) for name in TENSORS if name not in ON_CPU}
         return cls(info={name: move(value) for name, value in values["info"].items()}, **moved, **on_cpu)
 
     def updated(self, mask: Tensor, new: Plan) -> Plan:

@@ -87,6 +87,15 @@ class Request(ComputeRequest):
             if name not in PEERS:
                 raise_unknown("peer", name, [*PEERS, "none"])
 
+    def compared(self) -> dict[str, Any]:
+        """The settings that must be the same in results that are compared."""
+        names = ("samples", "iterations", "seeds", "tuning_seeds")
+        return {name: getattr(self, name) for name in names} | {
+            "threads": self.threads or 1,
+            "budgets": [name for name in BUDGETS if name in self.budgets],
+            "budget_ms": self.budget_ms,
+        }
+
 
 @dataclass
 class Arm:
@@ -109,6 +118,11 @@ class Arm:
     choices: list[dict[str, Any]]
     settings: dict[str, Any] = field(default_factory=dict)
     tuning_cost: float = math.inf
+
+    @property
+    def title(self) -> str:
+        """Library, planner and problem."""
+        return f"{self.library} {self.planner} on {self.problem}"
 
     def ask(self, do: str, iterations: int, request: Request, **given: Any) -> dict[str, Any]:
         """The answer of the library's process.
@@ -136,12 +150,12 @@ class Arm:
 
 def run(request: Request) -> int:
     """Plays every problem with every planner; prints a table and writes the result after each problem."""
+    earlier = [row for path in request.earlier for row in read_rows(path, request)]
     request.use_device(1)
     import torch
 
     from bench.machine import describe_machine
 
-    earlier = [row for path in request.earlier for row in read_rows(path, request)]
     rows: list[dict[str, Any]] = []
     best: list[dict[str, Any]] = []
     left_out: dict[str, str] = {}
@@ -150,7 +164,7 @@ def run(request: Request) -> int:
         others = [name for name in libraries if name != OURS]
         facts = {
             "versions": {OURS: __version__, **{name: installed_version(name, FOLDER) for name in others}},
-            "settings": {"samples": request.samples, "seeds": request.seeds, "tuning_seeds": request.tuning_seeds},
+            "settings": request.compared(),
             "machine": describe_machine(torch.device("cpu")),
         }
         listed = {name: process.ask({"do": "list"})["planners"] for name, process in libraries.items()}
@@ -193,15 +207,18 @@ def read_rows(path: Path, request: Request) -> list[dict[str, Any]]:
     """The rows of an earlier result.
 
     Raises:
-        UserError: The file holds no result with the same seeds.
+        UserError: The file holds no result with the same settings.
     """
     try:
-        rows: list[dict[str, Any]] = json.loads(path.read_text())["rows"]
-        seeds = {len(row["costs"]) for row in rows}
+        result = json.loads(path.read_text())
+        rows: list[dict[str, Any]] = result["rows"]
+        had = dict(result["settings"])
     except (OSError, ValueError, KeyError, TypeError) as error:
-        raise UserError(f"--earlier {path}: no result of this benchmark: {error}") from None
-    if seeds - {request.seeds}:
-        raise UserError(f"--earlier {path} has {seeds.pop()} seeds, this call {request.seeds}")
+        raise UserError(f"--earlier {path}: no result of this benchmark: {error!r}") from None
+    now = request.compared()
+    differences = [f"{name} {had.get(name)}, this call {now[name]}" for name in now if had.get(name) != now[name]]
+    if differences:
+        raise UserError(f"--earlier {path} was measured with other settings: {'; '.join(differences)}")
     return rows
 
 
@@ -228,7 +245,7 @@ def compare(arms: Sequence[Arm], request: Request, left_out: dict[str, str]) -> 
 
         def do_library(library: str) -> None:
             for arm in [arm for arm in among if arm.library == library]:
-                with _left_out_on_error(f"{arm.library} {arm.planner} on {arm.problem}", left_out):
+                with _left_out_on_error(arm.title, left_out):
                     results[id(arm)] = task(arm)
 
         with ThreadPoolExecutor(request.jobs) as pool:
@@ -242,35 +259,40 @@ def compare(arms: Sequence[Arm], request: Request, left_out: dict[str, str]) -> 
     each(lambda arm: arm.choose(request), arms)
     base = {id(arm): request.iterations for arm in arms}
     equal = play(base, arms)
-    arms = [arm for arm in arms if id(arm) in equal]
+    times = take_turns([arm for arm in arms if id(arm) in equal], base, request, left_out)
+    arms = [arm for arm in arms if id(arm) in times]
     if not arms:
         return []
-    times = take_turns(arms, base, request)
     rows = [make_row("evaluations", arm, equal, base, times) for arm in arms]
     if "milliseconds" not in request.budgets:
         return rows
-    counts = fit_counts(arms, request.budget_ms or times[id(arms[0])], times, request)
-    timely = {**equal, **play(counts, [arm for arm in arms if counts[id(arm)] != request.iterations])}
-    arms = [arm for arm in arms if id(arm) in timely]
-    times = take_turns(arms, counts, request)
+    counts = fit_counts(arms, request.budget_ms or times[id(arms[0])], times, request, left_out)
+    timely = {key: equal[key] for key, count in counts.items() if count == request.iterations}
+    timely |= play(counts, [arm for arm in arms if id(arm) in counts and id(arm) not in timely])
+    times = take_turns([arm for arm in arms if id(arm) in timely], counts, request, left_out)
     rows = rows if "evaluations" in request.budgets else []
-    return rows + [make_row("milliseconds", arm, timely, counts, times) for arm in arms]
+    return rows + [make_row("milliseconds", arm, timely, counts, times) for arm in arms if id(arm) in times]
 
 
-def fit_counts(arms: Sequence[Arm], budget_ms: float, times: dict[int, float], request: Request) -> dict[int, int]:
+def fit_counts(
+    arms: Sequence[Arm], budget_ms: float, times: dict[int, float], request: Request, left_out: dict[str, str]
+) -> dict[int, int]:
     """The number of iterations of each arm that fits into a time; measured, and corrected once.
 
     Args:
-        arms: The arms.
+        arms: The arms; one that fails has no number.
         budget_ms: Milliseconds of a decision.
         times: Milliseconds of a decision with `request.iterations`, by the arm's identity.
         request: The flags.
+        left_out: Receives the reason of an arm that fails.
     """
-    single = take_turns(arms, {id(arm): 1 for arm in arms}, request)
-    counts = {id(arm): request.iterations for arm in arms}
+    single = take_turns(arms, {id(arm): 1 for arm in arms}, request, left_out)
+    counts = {key: request.iterations for key in single}
     for _ in range(2):
-        counts = {key: fit_iterations(budget_ms, single[key], times[key], count) for key, count in counts.items()}
-        times = take_turns(arms, counts, request)
+        counts = {key: fit_iterations(budget_ms, single[key], times[key], counts[key]) for key in counts}
+        arms = [arm for arm in arms if id(arm) in counts]
+        times = take_turns(arms, counts, request, left_out)
+        counts = {key: counts[key] for key in times}
     return counts
 
 
@@ -289,13 +311,21 @@ def fit_iterations(budget_ms: float, one_ms: float, all_ms: float, iterations: i
     return max(1, int((TOLERANCE * budget_ms - one_ms) / each_ms + 1.0))
 
 
-def take_turns(arms: Sequence[Arm], counts: dict[int, int], request: Request) -> dict[int, float]:
-    """Median milliseconds of a decision of each arm, timed in turns so that a busy machine slows down all of them."""
+def take_turns(
+    arms: Sequence[Arm], counts: dict[int, int], request: Request, left_out: dict[str, str]
+) -> dict[int, float]:
+    """Median milliseconds of a decision of each arm, timed in turns so that a busy machine slows down all of them.
+
+    An arm that fails has no time.
+    """
     laps: dict[int, list[float]] = {id(arm): [] for arm in arms}
     for _ in range(WARM_UP + request.timed):
         for arm in arms:
-            laps[id(arm)].append(arm.ask("time", counts[id(arm)], request)["ms"])
-    return {key: median(values[WARM_UP:]) for key, values in laps.items()}
+            if arm.title in left_out:
+                continue
+            with _left_out_on_error(arm.title, left_out):
+                laps[id(arm)].append(arm.ask("time", counts[id(arm)], request)["ms"])
+    return {id(arm): median(laps[id(arm)][WARM_UP:]) for arm in arms if arm.title not in left_out}
 
 
 def make_row(

@@ -12,7 +12,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import mujoco
 import torch
@@ -21,21 +21,9 @@ from torch import Tensor
 from bench.problems import ControlProblem
 from latentplan.agents.checkpoint import load_model
 from latentplan.models import State
-from latentplan.planning import MuJoCoModel, Physics
+from latentplan.planning import Model, MuJoCoModel, Physics
 
 CHECKPOINT = Path(__file__).resolve().parents[2] / "checkpoints" / "walker-walk"
-
-
-class RolloutModel(Protocol):
-    """A model with a fused rollout."""
-
-    def step(self, state: Tensor, action: Tensor) -> tuple[Tensor, Tensor]:
-        """Returns the next state and the reward (rows,)."""
-        ...
-
-    def rollout(self, state: Tensor, actions: Tensor) -> tuple[Tensor, Tensor]:
-        """Returns the rewards (rows, horizon) and the last state."""
-        ...
 
 
 @dataclass(frozen=True)
@@ -57,9 +45,9 @@ def push() -> SimulatedProblem:
     """Returns the problem of pushing a box to a goal with a ball.
 
     A ball of radius 0.05 is pushed by two forces on a plane, where a square box of width 0.2 slides and turns with
-    friction. A step takes 0.04 s. The cost of a step is the distance of the box to the goal at (0.4, 0), plus 0.2 times
-    the distance of ball and box, plus 0.001 |force|². A run starts with the box at the origin and the ball on the side
-    of the goal, at (0.25, 0.05), up to 0.05 off, so the ball first has to go around the box.
+    friction. A step takes 0.04 s. The cost of a step is the distance of the box to the goal at (0.4, -0.1), plus 0.2
+    times the distance of ball and box, plus 0.001 |force|². A run starts with the box at the origin and the ball at
+    (-0.05, 0.2), up to 0.03 off in each direction.
     """
     goal = torch.tensor([0.4, -0.1], dtype=torch.float64)
 
@@ -175,7 +163,7 @@ def _from_mujoco(
 
 
 def _problem(
-    name: str, simulator: RolloutModel, action_dim: int, draw_start: Callable[[torch.Generator], Tensor], **sizes: Any
+    name: str, simulator: Model, action_dim: int, draw_start: Callable[[torch.Generator], Tensor], **sizes: Any
 ) -> SimulatedProblem:
     """Returns the problem of a model, for actions in [-1, 1]."""
 

@@ -6,6 +6,7 @@ import pytest
 
 from latentplan.config import PlannerConfig, from_dict
 from latentplan.config.removed import drop_removed
+from latentplan.planning import PLANNERS, make_planner
 
 
 def test_from_dict_loads_the_planner_settings_of_every_shipped_checkpoint(root):
@@ -24,6 +25,20 @@ def test_planner_config_has_the_effect_of_the_values_that_older_runs_spelled_out
     derived = PlannerConfig()
     assert derived.num_warm_iterations == spelled.num_warm_iterations
     assert derived.num_proposals(has_policy=True) == spelled.num_proposals(has_policy=True)
+
+
+@pytest.mark.parametrize("method", PLANNERS)
+def test_planner_config_refuses_what_its_planner_would_refuse(method):
+    settings = {"method": method, "num_samples": 8, "num_policy_samples": 0}
+    if method == "mppi":  # the planner takes all samples as elites
+        assert make_planner(method, PlannerConfig(**settings), action_dim=1).num_best == 8
+        return
+    with pytest.raises(ValueError, match="num_elites .* must not exceed num_samples"):
+        PlannerConfig(**settings)
+
+
+def test_planner_config_leaves_num_elites_to_a_planner_of_the_user():
+    assert PlannerConfig(method="mine", num_samples=8, num_policy_samples=0).num_elites == 16
 
 
 def test_planner_config_checks_num_elites_only_if_the_method_uses_the_value():

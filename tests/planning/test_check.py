@@ -133,6 +133,15 @@ def test_check_takes_the_bounds_of_a_planner(states):
         check_model(model, states)
 
 
+def test_check_tries_all_discrete_values_whatever_the_bounds(states):
+    seen = []
+    model = FunctionModel(lambda state, action: state, lambda state, action: (seen.append(action), action[:, 0])[1])
+    check_model(model, states, planner=CEMPlanner(action_dim=2, action_choices={0: (2.0, 5.0, 9.0)}))
+    tried = torch.cat(seen)
+    assert tried[:, 0].unique().tolist() == [2.0, 5.0, 9.0]
+    assert (tried[:, 1].abs() <= 1.0).all() and len(tried[:, 1].unique()) > 3
+
+
 @pytest.mark.parametrize(
     ("state", "hint"),
     [

@@ -15,7 +15,6 @@ from latentplan.planning.model import (
     State,
     action_dtype,
     count_rows,
-    per_step,
     state_device,
     supports,
     take_step,
@@ -23,7 +22,9 @@ from latentplan.planning.model import (
 from latentplan.planning.objectives import Constraint, Term, apply_view
 from latentplan.planning.plan import Plan
 from latentplan.planning.realtime.planner import PlanBuffer
+from latentplan.planning.search.choices import Choices, read_choices
 from latentplan.planning.search.registry import Planner
+from latentplan.planning.search.space import Bounds, read_bounds
 
 NUM_LATENCIES = 16
 
@@ -233,21 +234,22 @@ class PlanScheduler:
         nominal = self._nominals[tick - age]
         if not supports(self._acting, "policy") or getattr(self.planner, "action_choices", None) is not None:
             return nominal.actions[:, age]  # a discrete action plus a correction is no action
-        return nominal.correct(age, state, self._act_by_policy).clamp(*self._bounds(state, age))
+        return self._bounds(state, age).fit_step(nominal.correct(age, state, self._act_by_policy), 0)
 
     def _act_by_policy(self, state: State) -> Tensor:
         """Returns the policy's mode, or the middle of the bounds without a policy, (batch, action)."""
-        low, high = self._bounds(state)
-        if not supports(self._acting, "policy"):
-            return ((low + high) / 2).expand(count_rows(state), -1)
-        return self._acting.policy(state, None).to(low.dtype).clamp(low, high)  # type: ignore[no-any-return]
+        bounds, num = self._bounds(state), count_rows(state)
+        if supports(self._acting, "policy"):
+            return bounds.fit_step(self._acting.policy(state, None), 0)
+        return bounds.fit_step(((bounds.low + bounds.high) / 2)[:, 0].expand(num, -1), 0)
 
-    def _bounds(self, state: State, step: int = 0) -> tuple[Tensor, Tensor]:
-        """Returns lowest and highest action of a step of a plan, each (1 or batch, action)."""
+    def _bounds(self, state: State, step: int = 0) -> Bounds:
+        """Returns the bounds of a step of a plan, (1 or batch, 1, action), and its discrete dimensions."""
         planner, dtype, device = self.planner, action_dtype(state), state_device(state)
-        bounds: Any = (planner.action_low, planner.action_high)
-        low, high = (per_step(bound, planner.action_dim, "bounds").to(device, dtype) for bound in bounds)
-        return low[:, min(step, low.shape[1] - 1)], high[:, min(step, high.shape[1] - 1)]
+        values = read_choices(getattr(planner, "action_choices", None), planner.action_dim)
+        bounds = read_bounds(planner.action_low, planner.action_high, planner.action_dim, values)
+        low, high = (bound[:, [min(step, bound.shape[1] - 1)]].to(device, dtype) for bound in bounds)
+        return Bounds(low, high, Choices(values, dtype, device) if values else None)
 
 
 class NominalTrajectory:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, fields
 from functools import cached_property
 from typing import Any
 
@@ -20,8 +20,21 @@ from latentplan.planning.search.loop import Search
 from latentplan.planning.search.problem import Problem, View
 from latentplan.planning.search.purity import FirstSearches
 from latentplan.planning.search.sampling import Generators
+from latentplan.planning.search.space import read_bounds
 
-SIDES = ("low", "high")
+# Options for which a planner has a value of its own.
+CEM_GRADIENT: dict[str, Any] = {"gradient_steps": 5}
+ICEM: dict[str, Any] = {"noise_beta": 2.0, "white_noise_share": 0.0, "keep_elite_fraction": 0.3, "final": "best"}
+MPPI: dict[str, Any] = {
+    "num_iterations": 1,
+    "smoothing": 1.0,
+    "temperature": 0.1,
+    "adapt_std": False,
+    "keep_elite_fraction": 0.0,
+    "noise_beta": 2.0,
+    "white_noise_share": 0.5,
+    "final": "better",
+}
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -80,11 +93,7 @@ class CEMPlanner(SearchOptions):
     @cached_property
     def bounds(self) -> tuple[torch.Tensor, torch.Tensor]:
         """Lowest and highest action, each (1 or batch, 1 or horizon, action), float64."""
-        low, high = (per_step(getattr(self, f"action_{side}"), self.action_dim, f"action_{side}") for side in SIDES)
-        low, high = (bound.clone() for bound in (low, high))
-        for dim, values in self.choices.items():
-            low[..., dim], high[..., dim] = min(values), max(values)
-        return low, high
+        return self._read_bounds(self.action_low, self.action_high)
 
     @cached_property
     def first_searches(self) -> FirstSearches:
@@ -147,7 +156,7 @@ class CEMPlanner(SearchOptions):
             raise ValueError(f"keep must be candidates, states or None, got {keep!r}")
         # In inference mode the plan could not be a training target, and gradient steps would fail.
         with torch.inference_mode(False), torch.no_grad():
-            low, high = self.bounds if bounds is None else self._replace_bounds(bounds)
+            low, high = self.bounds if bounds is None else self._read_bounds(*bounds)
             last = None if last_action is None else torch.as_tensor(last_action)
             is_new = self.first_searches.add(model)
             start, spread, discount = self._init_mean, self._init_std, self.discount
@@ -171,8 +180,12 @@ class CEMPlanner(SearchOptions):
     def _init_std(self) -> torch.Tensor | None:
         return None if self.init_std is None else per_step(self.init_std, self.action_dim, "init_std")
 
-    def _replace_bounds(self, bounds: tuple[Bound, Bound]) -> tuple[torch.Tensor, torch.Tensor]:
-        return replace(self, action_low=bounds[0], action_high=bounds[1]).bounds
+    def _read_bounds(self, low: Bound, high: Bound) -> tuple[torch.Tensor, torch.Tensor]:
+        lowest, highest = read_bounds(low, high, self.action_dim, self.choices)
+        if not bool((lowest < highest).all()):
+            given = f"action_low {lowest.squeeze().tolist()} must lie below action_high {highest.squeeze().tolist()}"
+            raise ValueError(given)
+        return lowest, highest
 
 
 def icem_planner(**settings: Any) -> CEMPlanner:
@@ -182,8 +195,7 @@ def icem_planner(**settings: Any) -> CEMPlanner:
         **settings: Arguments of `CEMPlanner`; they replace `noise_beta` 2, `white_noise_share` 0, `keep_elite_fraction`
             0.3 and `final` "best".
     """
-    own: dict[str, Any] = {"noise_beta": 2.0, "white_noise_share": 0.0, "keep_elite_fraction": 0.3, "final": "best"}
-    return CEMPlanner(**own | settings)
+    return CEMPlanner(**ICEM | settings)
 
 
 def mppi_planner(**settings: Any) -> CEMPlanner:
@@ -196,10 +208,8 @@ def mppi_planner(**settings: Any) -> CEMPlanner:
             `adapt_std` False, `keep_elite_fraction` 0, `noise_beta` 2, `white_noise_share` 0.5, `final` "better",
             `num_elites`, which is all of `num_samples`, and `warm_start_iterations`, which is `num_iterations`.
     """
-    own: dict[str, Any] = {"num_elites": settings.get("num_samples", SearchOptions.num_samples), "num_iterations": 1}
-    own |= {"smoothing": 1.0, "temperature": 0.1, "adapt_std": False, "keep_elite_fraction": 0.0}
-    own |= {"noise_beta": 2.0, "white_noise_share": 0.5, "final": "better"}
-    merged = own | settings
+    merged = MPPI | settings
+    merged.setdefault("num_elites", merged.get("num_samples", SearchOptions.num_samples))
     if merged.get("warm_start_iterations") is None:
         merged["warm_start_iterations"] = merged["num_iterations"]
     return CEMPlanner(**merged)
@@ -213,16 +223,15 @@ def cem_gradient_planner(**settings: Any) -> CEMPlanner:
     Args:
         **settings: Arguments of `CEMPlanner`; they replace `gradient_steps` 5.
     """
-    return CEMPlanner(**{"gradient_steps": 5} | settings)
+    return CEMPlanner(**CEM_GRADIENT | settings)
 
 
 # By planner, the options for which it has a value of its own.
 OWN_OPTIONS: dict[Callable[..., Any], set[str]] = {
     CEMPlanner: set(),
-    cem_gradient_planner: {"gradient_steps"},
-    icem_planner: {"noise_beta", "white_noise_share", "keep_elite_fraction", "final"},
-    mppi_planner: {"num_elites", "num_iterations", "warm_start_iterations", "smoothing", "temperature", "adapt_std"}
-    | {"keep_elite_fraction", "noise_beta", "white_noise_share", "final"},
+    cem_gradient_planner: set(CEM_GRADIENT),
+    icem_planner: set(ICEM),
+    mppi_planner: {*MPPI, "num_elites", "warm_start_iterations"},
 }
 
 
@@ -230,9 +239,7 @@ def _check_problem(planner: CEMPlanner) -> None:
     check_whole(planner, 1, "action_dim")
     if not 0.0 < planner.discount <= 1.0:
         raise ValueError(f"discount must lie in (0, 1], got {planner.discount}")
-    low, high = planner.bounds
-    if not bool((low < high).all()):
-        raise ValueError(f"action_low {low.squeeze().tolist()} must lie below action_high {high.squeeze().tolist()}")
+    _ = planner.bounds  # refuses bounds that do not fit
     if isinstance(planner.init_mean, Plan) and planner.init_mean.actions.shape[-1] != planner.action_dim:
         dim = planner.init_mean.actions.shape[-1]
         raise ValueError(f"init_mean is a plan of {dim} numbers per action, action_dim is {planner.action_dim}")

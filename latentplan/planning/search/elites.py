@@ -135,8 +135,9 @@ def select_elites(candidates: Tensor, scores: Scores, *, num_elites: int, temper
     weights = is_valid.to(candidates.dtype)
     if temperature is not None:
         exponents = best if violation is None or not is_ranked else _weight_exponents(best, violation)
-        exponents = torch.where(is_valid[:, :1], exponents, 0.0)  # a softmax over nothing would be NaN
-        weights = weights * torch.softmax(exponents / (temperature * _spread(exponents)), dim=1)
+        # A softmax over nothing would be NaN. Below the best, exponents stay finite where all returns are equal.
+        exponents = torch.where(is_valid[:, :1], exponents - exponents[:, :1], 0.0)
+        weights = weights * torch.softmax(exponents / _spread(exponents) / temperature, dim=1)
     weights = weights / weights.sum(dim=1, keepdim=True).clamp_min(torch.finfo(weights.dtype).tiny)
     chosen = torch.take_along_dim(candidates, index[:, :, None, None], dim=1)
     # A NaN action would make the weighted mean NaN, even with weight 0.

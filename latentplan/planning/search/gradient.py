@@ -97,11 +97,12 @@ def ascend(
         size = torch.full_like(current[:, :1, :1], FIRST_STEP if step_size is None else step_size)
         before, violation, slope = _measure(scorer, rows, current, scale)
         value, failures = before, torch.zeros_like(before)
-        for _ in range(num_steps):
+        for step in range(num_steps):
             trial = space.decode(space.encode(space.bounds.fit(current + size * slope)))
             trial_value, trial_violation, trial_slope = _measure(scorer, rows, trial, scale)
             accept = (trial_value > value) & (trial_violation <= violation)
             accept = accept | (torch.isfinite(trial_value) & ~torch.isfinite(value))
+            accept = accept & (failures < MOST_FAILURES)  # whether others go on changes nothing
             value = torch.where(accept, trial_value, value)
             violation = torch.where(accept, trial_violation, violation)
             chosen = accept[:, None, None]
@@ -109,7 +110,7 @@ def ascend(
             slope = torch.where(chosen, trial_slope, slope)
             size = torch.where(chosen, size, size / 2)
             failures = torch.where(accept, 0, failures + 1)
-            if bool((failures >= MOST_FAILURES).all()):
+            if step + 1 >= MOST_FAILURES and bool((failures >= MOST_FAILURES).all()):
                 break
     return Refined(current, value, violation if scorer.constraints else None, (value - before).nan_to_num(0.0))
 

@@ -34,7 +34,7 @@ from latentplan.planning.search.elites import (
     select_elites,
     spread_of_returns,
 )
-from latentplan.planning.search.gradient import Pause, Refined, ascend
+from latentplan.planning.search.gradient import Pause, ascend
 from latentplan.planning.search.problem import (
     Problem,
     View,
@@ -133,20 +133,13 @@ class Search:
         # Without a finite candidate the plan is the tail of the previous plan, or the start of a cold search.
         has_elites = progress.has_elites[:, None, None]
         mean = space.decode(space.clean(torch.where(has_elites, progress.mean, space.encode(shifted.mean))))
-        actions, expected, violation = self._choose(progress, mean, proposals)
+        choice = self._choose(progress, mean, proposals)
         budget.lap("choose")
         pause = self._pause() if options.gradient_steps else None
-        if pause is not None and bool((pause.left > 0).all()):
-            pause = pause.waited()
-        elif pause is not None and not budget.allows("gradient"):
-            stopped = "deadline"
-        elif pause is not None:
-            refined = self._refine(actions)
-            actions, violation = refined.actions, refined.violations
-            expected = torch.where(torch.isfinite(refined.returns), refined.returns, expected)
-            assert progress.elites is not None
-            pause = pause.renewed(refined.gain, spread_of_returns(progress.elites))
-            budget.lap("gradient")
+        if pause is not None:
+            choice, pause, is_late = self._refine(choice, pause, progress, budget)
+            stopped = "deadline" if is_late else stopped
+        actions, expected, violation = choice
         info = {**progress.describe(history, stopped), "is_policy": torch.zeros_like(progress.has_elites)}
         if violation is not None:
             info["violation"] = violation
@@ -190,13 +183,16 @@ class Search:
                 mode = self.bounds.fit(self.scorer.act(self.state, self.bounds)[:, None].expand_as(actions))
             is_policy = torch.isfinite(mode).flatten(1).all(1)
             actions = torch.where(is_policy[:, None, None], mode, actions)
+        if not self.space.is_plain:
+            actions = self.space.decode(self.space.encode(actions))
         progress = self._begin(self._encode(shifted))
         info = {**progress.describe([], "deadline"), "is_policy": is_policy}
         if self.scorer.constraints:
             info["violation"] = torch.full_like(progress.expected_return, float("nan"))
         ones = torch.ones(self.batch, dtype=torch.long)
-        elites, is_warm, var = shifted.elites, shifted.is_warm, self.space.decode_var(progress.var)
-        return Plan(actions, shifted.mean, var, progress.expected_return, info, elites, is_warm, ones)
+        elites, is_warm = shifted.elites, shifted.is_warm
+        mean, var = self.space.decode(progress.mean), self.space.decode_var(progress.var)
+        return Plan(actions, mean, var, progress.expected_return, info, elites, is_warm, ones)
 
     def _iterate(
         self, start: WarmStart, proposals: Tensor | None, budget: Budget
@@ -297,8 +293,10 @@ class Search:
     def _sample(self, progress: Progress, std: Tensor, num: int) -> Tensor:
         """Returns `num` clean points per environment, (batch, num, length, action)."""
         beta, white_share = self.options.noise_beta, self.options.white_noise_share
-        noise = self.streams.noise(num, self.space.length, self.bounds.action_dim, beta, white_share, self.dtype)
-        samples = torch.addcmul(progress.mean[:, None], std[:, None], noise)
+        length, action_dim = self.space.length, self.bounds.action_dim
+        noise, scale = self.streams.noise(num, length, action_dim, beta, white_share, self.dtype)
+        spread = std[:, None] if scale is None else std[:, None] * scale
+        samples = torch.addcmul(progress.mean[:, None], spread, noise)
         if progress.probabilities is not None:
             assert self.space.choices is not None
             samples = self.space.choices.sample(samples, progress.probabilities, noise)
@@ -363,15 +361,29 @@ class Search:
         pause = (info[name].to(self.device) for name in ("gradient_pause", "gradient_wait"))
         return Pause(*(torch.where(is_warm, part, none) for part in pause))
 
-    def _refine(self, actions: Tensor) -> Refined:
-        return ascend(
-            self.scorer,
-            self.state,
-            actions,
-            num_steps=self.options.gradient_steps,
-            step_size=self.options.gradient_step_size,
-            space=self.space,
-        )
+    def _refine(self, choice: Choice, pause: Pause, progress: Progress, budget: Budget) -> tuple[Choice, Pause, bool]:
+        """Refines the chosen sequences by gradient ascent, in the environments that do not pause.
+
+        Returns:
+            The choice, the pause of the next search, and whether the deadline left no time for the ascent.
+        """
+        is_due, waited = pause.left == 0, pause.waited()
+        if not bool(is_due.any()):
+            return choice, waited, False
+        if not budget.allows("gradient"):
+            return choice, waited, True
+        actions, expected, violation = choice
+        num_steps, step_size = self.options.gradient_steps, self.options.gradient_step_size
+        refined = ascend(self.scorer, self.state, actions, num_steps=num_steps, step_size=step_size, space=self.space)
+        actions = torch.where(is_due[:, None, None], refined.actions, actions)
+        expected = torch.where(is_due & torch.isfinite(refined.returns), refined.returns, expected)
+        if violation is not None and refined.violations is not None:
+            violation = torch.where(is_due, refined.violations, violation)
+        assert progress.elites is not None
+        renewed = pause.renewed(refined.gain, spread_of_returns(progress.elites))
+        pause = Pause(*(torch.where(is_due, new, old) for new, old in zip(renewed, waited, strict=True)))
+        budget.lap("gradient")
+        return (actions, expected, violation), pause, False
 
     def _cold_start(self) -> WarmStart:
         return WarmStart(self.rest, None, torch.zeros(self.batch, dtype=torch.bool))

@@ -43,8 +43,8 @@ class Streams:
 
     def noise(
         self, num: int, horizon: int, action_dim: int, noise_beta: float, white_share: float, dtype: torch.dtype
-    ) -> Tensor:
-        """Returns Gaussian noise, (1 or batch, num, horizon, action).
+    ) -> tuple[Tensor, Tensor | None]:
+        """Returns Gaussian noise of unit variance, (1 or batch, num, horizon, action), and the scale of each sequence.
 
         Args:
             num: Number of sequences.
@@ -56,19 +56,22 @@ class Streams:
             dtype: Precision of the noise.
 
         Returns:
-            Noise of unit variance if all of it has one colour; otherwise coloured sequences first.
+            The noise, coloured sequences first, and the factors of its standard deviation, (num, 1, 1); None if all of
+            it has one colour.
         """
         size = (num, horizon, action_dim)
         drawn = [torch.randn(size, generator=source, device=self._device, dtype=dtype) for source in self._noise]
         white = drawn[0][None] if len(drawn) == 1 else torch.stack(drawn)
         num_white = round(white_share * num)
         if noise_beta == 0.0 or horizon == 1 or num_white == num:
-            return white
+            return white, None
         factor = torch.tensor(_colour_factor(horizon, noise_beta), device=self._device, dtype=dtype)
+        smooth = torch.einsum("th,bnha->bnta", factor, white[:, : num - num_white])
         if num_white == 0:
-            return torch.einsum("th,bnha->bnta", factor, white)
-        smooth = torch.einsum("th,bnha->bnta", SMOOTH_SCALE * factor, white[:, : num - num_white])
-        return torch.cat([smooth, WHITE_SCALE * white[:, num - num_white :]], dim=1)
+            return smooth, None
+        scale = torch.full((num, 1, 1), SMOOTH_SCALE, device=self._device, dtype=dtype)
+        scale[num - num_white :] = WHITE_SCALE
+        return torch.cat([smooth, white[:, num - num_white :]], dim=1), scale
 
     def policy_generators(self) -> list[torch.Generator]:
         """Returns a stream for each environment's policy samples."""

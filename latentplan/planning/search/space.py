@@ -7,13 +7,36 @@ constraints and controllers only see actions that can be executed.
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 
 import torch
 from torch import Tensor
 
+from latentplan.planning.model import Bound, per_step
 from latentplan.planning.search.choices import Choices
+
+
+def read_bounds(
+    low: Bound, high: Bound, action_dim: int, choices: Mapping[int, Sequence[float]]
+) -> tuple[Tensor, Tensor]:
+    """Returns the lowest and the highest action, each (1 or batch, 1 or horizon, action), float64.
+
+    Args:
+        low: Lowest action of continuous dimensions, see `CEMPlanner`.
+        high: Highest action of continuous dimensions.
+        action_dim: Numbers in an action.
+        choices: By discrete dimension, its values, which replace the bounds there.
+
+    Raises:
+        ValueError: A bound has a wrong shape, or is not finite.
+    """
+    lowest = per_step(low, action_dim, "action_low").clone()
+    highest = per_step(high, action_dim, "action_high").clone()
+    for dim, values in choices.items():
+        lowest[..., dim], highest[..., dim] = min(values), max(values)
+    return lowest, highest
 
 
 @dataclass(frozen=True)
@@ -104,10 +127,8 @@ class Space:
         if spline is None:
             return
         self.length = num_knots
-        matrix = torch.tensor(_spline_matrix(spline, horizon, num_knots), dtype=torch.float64)
-        self._matrix, self._inverse = matrix.to(bounds.low), torch.linalg.pinv(matrix).to(bounds.low)
-        self._hold = torch.tensor(_spline_matrix("zero", horizon, num_knots)).to(bounds.low)
-        self._steps = torch.linspace(0, horizon - 1, num_knots).round().long().to(bounds.low.device)
+        maps = _spline_maps(spline, horizon, num_knots, bounds.low.dtype, bounds.low.device)
+        self._matrix, self._inverse, self._hold, self._steps = maps
         self.point_bounds = bounds.select(self._steps)
 
     @property
@@ -172,23 +193,39 @@ class Space:
 
 
 @lru_cache(maxsize=32)
-def _spline_matrix(spline: str, horizon: int, num_knots: int) -> list[list[float]]:
-    """Returns the weight of each knot in each action, (horizon, knot).
+def _spline_maps(
+    spline: str, horizon: int, num_knots: int, dtype: torch.dtype, device: torch.device
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Returns the matrices of a spline, made once because a pseudo-inverse at every decision takes long.
+
+    Returns:
+        The weight of each knot in each action (horizon, knot), its pseudo-inverse (knot, horizon), the weights of a
+        spline that holds each knot (horizon, knot), and the steps of the knots (knot,) int.
+    """
+    matrix = _spline_matrix(spline, horizon, num_knots)
+    maps = (matrix, torch.linalg.pinv(matrix), _spline_matrix("zero", horizon, num_knots))
+    steps = torch.linspace(0, horizon - 1, num_knots).round().long()
+    forward, inverse, hold = (each.to(device, dtype) for each in maps)
+    return forward, inverse, hold, steps.to(device)
+
+
+def _spline_matrix(spline: str, horizon: int, num_knots: int) -> Tensor:
+    """Returns the weight of each knot in each action, (horizon, knot) float64.
 
     `zero` holds each knot for an equal share of the horizon. `linear` and `cubic` have knots at equal distances from
     the first action to the last; the slopes of the cubic spline at its knots are those of Catmull and Rom.
     """
     if spline == "zero" or num_knots == 1:
         knot = torch.arange(horizon) * num_knots // horizon
-        return torch.nn.functional.one_hot(knot, num_knots).double().tolist()  # type: ignore[no-any-return]
+        return torch.nn.functional.one_hot(knot, num_knots).double()
     time = torch.linspace(0, num_knots - 1, horizon, dtype=torch.float64)
     left = time.floor().clamp(max=num_knots - 2).long()
     part = (time - left)[:, None]
     eye = torch.eye(num_knots, dtype=torch.float64)
     before, after = eye[left], eye[left + 1]
     if spline == "linear":
-        return ((1 - part) * before + part * after).tolist()  # type: ignore[no-any-return]
+        return (1 - part) * before + part * after
     slopes = torch.gradient(eye, dim=0)[0]
     basis = (2 * part**3 - 3 * part**2 + 1, part**3 - 2 * part**2 + part, 3 * part**2 - 2 * part**3, part**3 - part**2)
     parts = zip(basis, (before, slopes[left], after, slopes[left + 1]), strict=True)
-    return torch.stack([weight * value for weight, value in parts]).sum(dim=0).tolist()  # type: ignore[no-any-return]
+    return torch.stack([weight * value for weight, value in parts]).sum(dim=0)

@@ -15,7 +15,8 @@ from mbrl.planning.trajectory_opt import (  # type: ignore[import-not-found]
 from torch import Tensor
 
 from bench.controllers.serve import Entry, serve
-from bench.controllers.task import ELITE_SHARE, Act, Task
+from bench.controllers.task import Act, Task
+from bench.peers.problem import ELITE_SHARE
 
 DECAY = 1.3  # of iCEM's population, the library's own
 LAST = tuple({"return_mean_elites": choice} for choice in (True, False))

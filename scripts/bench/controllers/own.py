@@ -1,5 +1,8 @@
 """This library's planners, with their own defaults: only the problem and the budget are named.
 
+All sequences that a decision evaluates count: those of the iterations, the mean and the best one that `final` compares,
+and those of the gradient ascent. `num_samples` is what the budget leaves for each iteration.
+
 A planner `NAME-wide` starts with a standard deviation of half the range of the actions, in place of a quarter.
 """
 
@@ -11,7 +14,7 @@ from typing import Any
 import torch
 
 from bench.controllers.serve import Entry, serve
-from bench.controllers.task import Act, Task
+from bench.controllers.task import GRADIENT_COST, Act, Task
 from latentplan.planning import PLANNERS, ModelPredictiveController, make_planner
 
 
@@ -22,17 +25,27 @@ def controller(name: str, is_wide: bool = False) -> Callable[[Task, Sequence[int
         problem = task.problem
         bounds: dict[str, Any] = {"action_low": problem.action_low, "action_high": problem.action_high}
         size: dict[str, Any] = {"action_dim": problem.action_dim, "horizon": problem.horizon}
-        if getattr(make_planner(name, **size), "num_iterations", None) == 1:  # it spends its budget in one iteration
-            budget: dict[str, Any] = {"num_samples": task.samples * task.iterations}
-        else:
-            iterations = {"num_iterations": task.iterations, "warm_start_iterations": task.iterations}
-            budget = {"num_samples": task.samples, **iterations}
+        budget: dict[str, Any] = budget_options(make_planner(name, **size), task)
         width: dict[str, Any] = {"init_std": task.scale[1]} if is_wide else {}
         planner = make_planner(name, **size, **bounds, **budget, **width, **task.settings)
         streams = [torch.Generator().manual_seed(seed) for seed in seeds]
         return ModelPredictiveController(planner, task.model(), generator=streams).act
 
     return make
+
+
+def budget_options(planner: Any, task: Task) -> dict[str, int]:
+    """The options with which a planner with these defaults evaluates `samples` times `iterations` sequences.
+
+    Args:
+        planner: The planner with its defaults.
+        task: The task; a budget that is too small for what follows the iterations is exceeded.
+    """
+    compared = 2 if planner.final == "better" else 0
+    ascent = GRADIENT_COST * (1 + planner.gradient_steps) if planner.gradient_steps else 0  # the start and each step
+    iterations = 1 if planner.num_iterations == 1 else task.iterations
+    samples = (task.samples * task.iterations - compared - ascent) // iterations
+    return {"num_samples": max(2, samples), "num_iterations": iterations, "warm_start_iterations": iterations}
 
 
 if __name__ == "__main__":

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import contextlib
 import json
-import os
 import random
 import sys
 import time
@@ -15,6 +13,7 @@ from typing import Any, NamedTuple
 import torch
 
 from bench.controllers.task import Act, Task, find_problem
+from bench.peers.serve import answer_lines
 
 MakeController = Callable[[Task, Sequence[int]], Act]
 
@@ -45,21 +44,18 @@ def serve(planners: Mapping[str, Entry]) -> None:
     """
     torch.set_num_threads(int(sys.argv[1]))
     loops: dict[str, Iterator[float]] = {}
-    with os.fdopen(os.dup(1), "w") as answers:
-        os.dup2(2, 1)
-        for line in sys.stdin:
-            request = json.loads(line)
-            try:
-                answer = _answer(planners, request, line, loops)
-            except Exception as error:
-                answer = {"error": " ".join(f"{type(error).__name__}: {error}".split())[:300]}
-            answers.write(json.dumps(answer) + "\n")
-            answers.flush()
+
+    def answer(line: str) -> dict[str, Any]:
+        try:
+            return _answer(planners, line, loops)
+        except Exception as error:
+            return {"error": " ".join(f"{type(error).__name__}: {error}".split())[:300]}
+
+    answer_lines(answer)
 
 
-def _answer(
-    planners: Mapping[str, Entry], request: dict[str, Any], line: str, loops: dict[str, Iterator[float]]
-) -> dict[str, Any]:
+def _answer(planners: Mapping[str, Entry], line: str, loops: dict[str, Iterator[float]]) -> dict[str, Any]:
+    request = json.loads(line)
     if request["do"] == "list":
         return {"planners": {name: list(entry.choices) for name, entry in planners.items()}}
     entry = planners[request["planner"]]
@@ -74,8 +70,8 @@ def play(entry: Entry, task: Task, seeds: Sequence[int]) -> dict[str, Any]:
     """The total cost of each seed, and the evaluated sequences per decision."""
     costs: list[float] = []
     for group in [seeds] if entry.is_batched else [[seed] for seed in seeds]:
-        with _seeded(group[0]):
-            costs += task.problem.run(entry.make(task, group), group).tolist()
+        _seed_global_streams(group[0])
+        costs += task.problem.run(entry.make(task, group), group).tolist()
     decisions = len(seeds) * task.problem.num_steps
     return {"costs": costs, "evaluations": task.rows / (decisions * task.problem.horizon)}
 
@@ -112,12 +108,10 @@ def _task(request: dict[str, Any]) -> Task:
 _cached_problem = cache(find_problem)
 
 
-@contextlib.contextmanager
-def _seeded(seed: int) -> Iterator[None]:
+def _seed_global_streams(seed: int) -> None:
     """Seeds every global random stream; some libraries draw from NumPy's."""
     import numpy as np
 
     torch.manual_seed(seed)
     np.random.seed(seed)
     random.seed(seed)
-    yield

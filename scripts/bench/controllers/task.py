@@ -9,12 +9,13 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from bench.peers.problem import count_elites
 from bench.problems import PROBLEMS, ControlProblem
 from bench.simulated_problems import SIMULATED
 from latentplan.config.parsing import raise_unknown
 
 NAMES = (*PROBLEMS, *SIMULATED)
-ELITE_SHARE = 0.1
+GRADIENT_COST = 3  # a backward pass costs about two forward
 Act = Callable[[Tensor], Tensor]  # act(state (rows, state)) -> action (rows, action), within the problem's bounds
 
 
@@ -40,7 +41,7 @@ class Task:
         samples: Candidates per iteration.
         iterations: Iterations of each decision.
         settings: Settings of the planner, which replace its own.
-        rows: Number of model steps that were evaluated so far; a step with gradients counts as three.
+        rows: Number of model steps that were evaluated so far; a step with gradients counts as `GRADIENT_COST`.
     """
 
     problem: ControlProblem
@@ -52,7 +53,7 @@ class Task:
     @property
     def num_elites(self) -> int:
         """A tenth of the candidates, at least two."""
-        return max(2, round(ELITE_SHARE * self.samples))
+        return count_elites(self.samples)
 
     @property
     def scale(self) -> tuple[float, float]:
@@ -114,4 +115,4 @@ class CountingModel:
         return result
 
     def _count(self, steps: int) -> None:
-        self._task.rows += 3 * steps if torch.is_grad_enabled() else steps  # a backward pass costs about two forward
+        self._task.rows += GRADIENT_COST * steps if torch.is_grad_enabled() else steps

@@ -46,7 +46,7 @@ class Problem:
     @property
     def num_elites(self) -> int:
         """A tenth of the candidates, at least two."""
-        return max(2, round(ELITE_SHARE * self.samples))
+        return count_elites(self.samples)
 
     @property
     def model_config(self) -> ModelConfig:
@@ -61,6 +61,11 @@ class Problem:
     def from_json(text: str) -> Problem:
         """The problem that `to_json` wrote."""
         return Problem(**json.loads(text))
+
+
+def count_elites(samples: int) -> int:
+    """The number of elites that planners of other libraries take: a tenth of the candidates, at least two."""
+    return max(2, round(ELITE_SHARE * samples))
 
 
 class FullPrecisionModel(WorldModel):

@@ -30,14 +30,23 @@ def serve(make_search: MakeSearch) -> None:
     problem = Problem.from_json(sys.argv[1])
     torch.set_num_threads(problem.threads)
     torch.manual_seed(problem.seed)
+    searches: dict[str, Search] = {}
+
+    def answer(line: str) -> dict[str, Any]:
+        dtype = json.loads(line)["dtype"]
+        if dtype not in searches:
+            searches[dtype] = make_search(problem, build_model(problem, dtype))
+        return _timed(searches[dtype], problem)
+
+    answer_lines(answer)
+
+
+def answer_lines(answer: Callable[[str], dict[str, Any]]) -> None:
+    """Answers each line of the input with a line of JSON; what a library prints goes to the error stream."""
     with os.fdopen(os.dup(1), "w") as answers:
         os.dup2(2, 1)
-        searches: dict[str, Search] = {}
         for line in sys.stdin:
-            dtype = json.loads(line)["dtype"]
-            if dtype not in searches:
-                searches[dtype] = make_search(problem, build_model(problem, dtype))
-            answers.write(json.dumps(_timed(searches[dtype], problem)) + "\n")
+            answers.write(json.dumps(answer(line)) + "\n")
             answers.flush()
 
 

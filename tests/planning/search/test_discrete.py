@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from latentplan.planning import FunctionModel, ModelPredictiveController, check_model, rate_limit
+from latentplan.planning import CEMPlanner, FunctionModel, ModelPredictiveController, check_model, rate_limit
 
 
 def still(reward):
@@ -79,6 +79,17 @@ def test_values_of_a_cold_search_are_drawn_alike_and_a_warm_one_prefers_the_last
     hold.plan(model, torch.zeros(1, 1), plan, generator=seeded())
     shares = torch.bincount(seen[0].long(), minlength=4) / 8000
     assert shares.amax().item() == pytest.approx(0.5 + 0.5 / 4, abs=0.02)
+
+
+def test_values_of_a_cold_search_are_drawn_alike_at_every_step_with_the_default_noise(seeded):
+    seen = []
+    model = still(lambda state, action: torch.zeros(len(state)))
+    model.rollout = lambda state, actions: (seen.append(actions.long()), (actions[..., 0] * 0, state))[1]
+    planner = CEMPlanner(action_dim=1, horizon=8, action_choices=5, num_samples=20_000, num_iterations=1)
+    planner.plan(model, torch.zeros(1, 1), generator=seeded())
+    shares = torch.nn.functional.one_hot(seen[0][..., 0]).float().mean(dim=0)  # (step, value)
+    # 0.01 is more than three standard deviations of a share of 10,000 independent samples of each kind of noise.
+    torch.testing.assert_close(shares, torch.full((8, 5), 0.2), atol=0.01, rtol=0)
 
 
 def test_coloured_noise_keeps_a_value_for_several_steps(make_planner, seeded):

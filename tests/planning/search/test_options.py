@@ -166,7 +166,7 @@ def test_warm_and_cold_environments_have_their_own_iterations(point, states, mak
 @pytest.mark.parametrize("beta", [0.0, 1.0, 3.0])
 def test_coloured_noise_has_unit_variance_and_correlated_steps(beta):
     streams = Streams(torch.Generator().manual_seed(0), 1, torch.device("cpu"))
-    noise = streams.noise(20_000, 12, 1, beta, 0.0, torch.float64)[0, :, :, 0]
+    noise = streams.noise(20_000, 12, 1, beta, 0.0, torch.float64)[0][0, :, :, 0]
     torch.testing.assert_close(noise.var(dim=0), torch.ones(12, dtype=torch.float64), atol=0.05, rtol=0)
     neighbours = (noise[:, 1:] * noise[:, :-1]).mean().item()
     opposite_ends = (noise[:, 0] * noise[:, -1]).mean().item()
@@ -179,7 +179,7 @@ def test_mppi_equals_its_formula(point, states, seeded):
     planner = mppi_planner(action_dim=2, horizon=4, num_samples=128, num_policy_samples=0, **options)
     plan = planner.plan(point, states[:1], generator=seeded())
     streams = Streams(seeded(), 1, torch.device("cpu"))
-    candidates = (0.4 * streams.noise(128, 4, 2, 0.0, 0.0, torch.float32)[0]).clamp(-1, 1)
+    candidates = (0.4 * streams.noise(128, 4, 2, 0.0, 0.0, torch.float32)[0][0]).clamp(-1, 1)
     candidates[0] = 0.0
     returns = []
     for sequence in candidates:
@@ -202,10 +202,21 @@ def test_mppi_plans_the_same_when_returns_are_scaled_and_shifted(point, states, 
     torch.testing.assert_close(plans[0].mean, plans[1].mean, atol=1e-4, rtol=1e-4)
 
 
+def test_mppi_weighs_equal_returns_alike(seeded):
+    model = FunctionModel(lambda state, action: state, lambda state, action: torch.full((len(state),), -1.0))
+    planner = mppi_planner(action_dim=2, horizon=4, num_samples=64, final="mean")
+    seen = []
+    plan = planner.plan(model, torch.zeros(2, 1), generator=seeded(), callback=seen.append)
+    assert not plan.info["is_fallback"].any()
+    torch.testing.assert_close(plan.mean, seen[0].actions.mean(dim=1))
+    torch.testing.assert_close(plan.expected_return, torch.full((2,), -4.0))
+
+
 def test_mixed_noise_has_smooth_samples_that_explore_and_white_ones_that_stay_close():
     streams = Streams(torch.Generator().manual_seed(0), 1, torch.device("cpu"))
-    noise = streams.noise(40_000, 10, 1, 2.0, 0.5, torch.float64)[0, :, :, 0]
-    smooth, white = noise.chunk(2)
+    noise, scale = streams.noise(40_000, 10, 1, 2.0, 0.5, torch.float64)
+    torch.testing.assert_close(noise.var(dim=(0, 1, 3)), torch.ones(10, dtype=torch.float64), atol=0.03, rtol=0)
+    smooth, white = (noise * scale)[0, :, :, 0].chunk(2)
     assert smooth.std().item() == pytest.approx(1.25, abs=0.03) and white.std().item() == pytest.approx(0.5, abs=0.01)
     correlation = [(part[:, 1:] * part[:, :-1]).mean().item() / part.var().item() for part in (smooth, white)]
     assert correlation[0] > 0.6 and abs(correlation[1]) < 0.02
@@ -363,6 +374,36 @@ def test_gradient_goes_on_where_it_helps_and_after_a_cold_start(point, make_plan
     calls.clear()
     planner.plan(flat, torch.zeros(2, 1), plan.forget(torch.tensor([True, False])), generator=seeded())
     assert calls  # an environment that starts cold has no pause
+
+
+@pytest.mark.parametrize("gradient_steps", [5, 20])
+def test_gradient_of_an_environment_does_not_depend_on_the_others(seeded, gradient_steps):
+    """The state is the curvature: a flat environment pauses, a steep one goes on, a kink undoes most steps."""
+
+    def reward(state, action):
+        smooth = -state[:, 0] * (action - 0.3).square().sum(dim=1)
+        return torch.where(state[:, 0] < 0, -(action - 0.3).abs().sum(dim=1), smooth)
+
+    model = FunctionModel(lambda state, action: state, reward)
+    curvatures = torch.tensor([[0.0], [1.0], [-1.0]])
+    planner = PLANNERS["cem_gradient"](
+        action_dim=2, horizon=3, num_samples=16, num_iterations=1, gradient_steps=gradient_steps
+    )
+
+    def play(states):
+        plan, plans = None, []
+        for search in range(6):
+            plan = planner.plan(model, states, plan, generator=seeded(search))
+            plans.append(plan)
+        return plans
+
+    together = play(curvatures)
+    for row in range(3):
+        for alone, batched in zip(play(curvatures[row : row + 1]), together, strict=True):
+            torch.testing.assert_close(alone.actions[0], batched.actions[row])
+            torch.testing.assert_close(alone.expected_return[0], batched.expected_return[row])
+            for name in ("gradient_pause", "gradient_wait"):
+                assert alone.info[name][0] == batched.info[name][row]
 
 
 def test_gradient_step_is_a_twentieth_of_the_range_by_default(make_planner, seeded):

@@ -92,6 +92,15 @@ def test_refit_names_shapes_that_do_not_fit():
         refit(CANDIDATES, RETURNS, MEAN, VAR, num_elites=5, smoothing=0.8)
 
 
+@pytest.mark.parametrize("value", [-1.0, 0.0, 0.1, 1e30])
+@pytest.mark.parametrize("violations", [None, torch.zeros(1, 8), torch.ones(1, 8)])
+def test_select_elites_weighs_equal_scores_alike(value, violations):
+    returns = torch.full((1, 8), value)
+    returns[0, -1] = torch.nan
+    elites = select_elites(torch.zeros(1, 8, 3, 2), Scores(returns, violations), num_elites=8, temperature=0.1)
+    torch.testing.assert_close(elites.weights, torch.tensor([[1 / 7] * 7 + [0.0]]))
+
+
 def test_select_elites_ranks_and_weighs_feasible_candidates_first():
     violations = torch.tensor([[0.0, 0.0, 2.0, 1.0]], dtype=torch.float64)
     scores = Scores(RETURNS[None], violations)

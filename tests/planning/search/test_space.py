@@ -154,6 +154,16 @@ def test_search_over_knots_finds_smooth_plans_with_fewer_candidates(make_planner
     assert knots.expected_return.mean() > plain.expected_return.mean() + 0.5
 
 
+def test_splines_are_inverted_once_for_all_decisions(recorder, make_planner, seeded, monkeypatch):
+    calls, invert = [], torch.linalg.pinv
+    monkeypatch.setattr(torch.linalg, "pinv", lambda matrix: (calls.append(matrix), invert(matrix))[1])
+    planner = make_planner(action_spline="cubic", horizon=11, num_knots=4)
+    for _ in range(3):
+        planner.plan(recorder, torch.zeros(1, 1), generator=seeded())
+    planner.plan(recorder, torch.zeros(1, 1).double(), generator=seeded())
+    assert len(calls) == 2  # one for each precision
+
+
 def test_search_over_knots_starts_warm_and_keeps_elites(make_planner, seeded):
     model = FunctionModel(lambda state, action: state + action, lambda state, action: -state.square().sum(dim=1))
     options = {"action_spline": "linear", "num_knots": 3, "keep_elite_fraction": 0.5, "final": "better"}
@@ -206,6 +216,32 @@ def test_rate_limit_holds_from_the_last_action_on(make_planner, seeded, limit, o
             assert (action - last).abs().max() <= 0.3 + 1e-5
         assert controller.plan.actions.diff(dim=1).abs().max() <= 0.3 + 1e-5
         state, last = -state, action
+
+
+@pytest.mark.parametrize(
+    "policy", [None, lambda state, generator: torch.where(state[:, :1] > 0, 1.0, -1.0).expand(-1, 2)]
+)
+@pytest.mark.parametrize("options", [{}, {"action_spline": "linear", "num_knots": 2}, {"action_choices": {1: 3}}])
+def test_plan_without_time_for_a_search_holds_limits_too(make_planner, seeded, policy, options):
+    model = FunctionModel(lambda state, action: state, greedy().reward, policy=policy)
+    own = {"num_policy_samples": 8, "tail": "policy"} if policy else {}
+    planner, state = make_planner(**options | own), torch.tensor([[1.0], [-1.0]])
+    limits = [rate_limit(0.3)]
+    loose = planner.plan(model, state, generator=seeded())  # not limited
+    plan = planner.plan(model, state, loose, constraints=limits, deadline_ms=0.0, last_action=torch.zeros(2, 2))
+    assert plan.info["stopped"] == "deadline" and plan.info["iterations"].tolist() == [0, 0]
+    continuous = plan.actions[..., :1] if "action_choices" in options else plan.actions
+    assert continuous.diff(dim=1, prepend=torch.zeros(2, 1, continuous.shape[-1])).abs().max() <= 0.3 + 1e-5
+    if "action_choices" in options:
+        assert torch.isin(plan.actions[..., 1], torch.arange(3.0)).all()
+
+
+def test_plan_without_time_for_a_search_is_a_spline_too(make_planner, seeded):
+    planner = make_planner(action_spline="linear", num_knots=2)
+    before = planner.plan(greedy(), torch.ones(2, 1), generator=seeded())
+    plan = planner.plan(greedy(), torch.ones(2, 1), before, deadline_ms=0.0)
+    assert before.actions.abs().min() > 0.1  # the shifted plan ends in a zero and therefore bends
+    torch.testing.assert_close(plan.actions.diff(n=2, dim=1), torch.zeros(2, 4, 2), atol=1e-6, rtol=0)
 
 
 def test_rate_limit_counts_from_the_given_last_action(recorder, make_planner, seeded):
@@ -263,6 +299,15 @@ def test_last_action_is_unknown_where_a_plan_is_cold_or_another_agent_acted():
     torch.testing.assert_close(after.take(torch.tensor([1])).last_action, torch.tensor([[8.0, 9.0]]))
 
 
+def test_plan_from_dict_keeps_on_the_cpu_what_a_plan_says_about_time():
+    """The device `meta` stands for an accelerator."""
+    plan = Plan.around(torch.zeros(2, 3, 1)).executed(torch.ones(2, dtype=torch.long))
+    copy = Plan.from_dict(plan.to_dict(), torch.device("meta"))
+    for name in ("is_warm", "elapsed", "is_followed"):
+        assert torch.equal(getattr(copy, name), getattr(plan, name))
+    assert copy.actions.is_meta and copy.last_action.is_meta
+
+
 @pytest.mark.parametrize("shape", [(6, 2), (3, 6, 2), (3, 4, 2)])
 def test_plan_around_a_trajectory_starts_the_search_there(recorder, make_planner, seeded, shape):
     trajectory = torch.rand(shape, generator=seeded(4)) - 0.5
@@ -286,6 +331,25 @@ def test_scheduler_without_plan_and_policy_acts_in_the_middle_of_the_bounds(poin
     planner = make_planner(action_low=low, action_high=low + 1.0)
     decision = PlanScheduler(planner, FunctionModel(point.dynamics, point.reward), Busy()).decide(torch.zeros(2, 4))
     torch.testing.assert_close(decision.action, torch.tensor([[0.5, -0.5]] * 2))
+
+
+@pytest.mark.parametrize("policy", [None, lambda state, generator: torch.full((len(state), 2), 0.8)])
+def test_scheduler_without_plan_takes_values_that_exist(point, make_planner, policy):
+    """With a plan the action is the plan's; without, the policy's or the middle, at the nearest value."""
+
+    class Busy:
+        is_idle = False
+
+        def poll(self):
+            return None
+
+    planner = make_planner(action_choices={1: (-2.0, 0.0, 1.0, 5.0)})
+    model = FunctionModel(point.dynamics, point.reward, policy=policy)
+    action = PlanScheduler(planner, model, Busy()).decide(torch.zeros(2, 4)).action
+    assert action.tolist() == [[pytest.approx(0.0 if policy is None else 0.8), 1.0]] * 2
+    whole = make_planner(action_choices=(2.0, 3.0, 4.0))  # none lies within action_low and action_high
+    action = PlanScheduler(whole, model, Busy()).decide(torch.zeros(2, 4)).action
+    assert action.tolist() == [[3.0 if policy is None else 2.0] * 2] * 2
 
 
 def test_penalties_see_actions_and_not_knots(recorder, make_planner, seeded):
