@@ -157,7 +157,8 @@ def between(config: Any, **bounds: tuple[float, float]) -> None:
 def one_of(config: Any, **choices: tuple[str | None, ...]) -> None:
     """Require fields to be one of the values allowed."""
     for name, allowed in choices.items():
-        _require(config, name, getattr(config, name) in allowed, f"one of {', '.join(map(str, allowed))}")
+        words = ", ".join("null" if choice is None else choice for choice in allowed)
+        _require(config, name, getattr(config, name) in allowed, f"one of {words}")
 
 
 def _require(config: Any, name: str, holds: bool, allowed: str) -> None:
