@@ -21,7 +21,8 @@ LONGEST_LINE = 1000  # a longer message repeats input, and is cut to `LONGEST_WO
 class UserError(ValueError):
     """A mistake of the user; the message is one line that says what to give instead.
 
-    A message repeats at most 200 characters of each path or value; see `cut`.
+    A message has at most 1,000 characters, and no word in it more than 200: of a longer word, such as a path without
+    spaces, and of a longer message the beginning and the end are kept, 200 characters in all; see `cut`.
     """
 
     def __init__(self, message: object = "") -> None:

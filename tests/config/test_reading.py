@@ -70,7 +70,9 @@ def test_cut_shortens_long_words_and_long_messages():
     assert cut("as it is") == "as it is"
     words = cut(f"cannot read {'a' * 5000}: no such file")
     assert words.startswith("cannot read aaa") and words.endswith("aaa: no such file") and len(words) < 240
-    assert len(cut("a b " * 10**6)) <= 200 and len(str(UserError("x" * 10**6))) <= 200
+    assert cut("a b " * 250) == "a b " * 250  # a text of 1,000 characters with spaces stays
+    assert len(cut("a b " * 250 + "a")) <= 200 and len(cut("a b " * 10**6)) <= 200
+    assert len(str(UserError("x" * 10**6))) <= 200
 
 
 VALUES = {
