@@ -147,14 +147,6 @@ def within(config: Any, **bounds: tuple[float, float]) -> None:
         _require(config, name, low <= getattr(config, name) <= high, f"in [{low}, {high}]")
 
 
-def between(config: Any, **bounds: tuple[float, float]) -> None:
-    """Require fields to be at least the first bound and at most the second."""
-    for name, (low, high) in bounds.items():
-        value = getattr(config, name)
-        _require(config, name, value >= low, f"at least {low}")
-        _require(config, name, value <= high, f"at most {high}")
-
-
 def one_of(config: Any, **choices: tuple[str | None, ...]) -> None:
     """Require fields to be one of the values allowed."""
     for name, allowed in choices.items():
