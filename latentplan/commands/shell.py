@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import errno
 import os
 import signal
 import sys
@@ -59,8 +58,6 @@ def run_guarded(command: Callable[[Sequence[str]], int], argv: Sequence[str]) ->
     except OSError as error:
         if error.strerror is None:
             raise
-        if error.errno == errno.ENAMETOOLONG:
-            return _refuse(f"a file name is too long: {str(error.filename)[:80]}...")
         name = "" if error.filename is None else f": {shown(str(error.filename))}"
         return _refuse(f"the system refused a file or a process{name}: {error.strerror}")
 
