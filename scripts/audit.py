@@ -19,7 +19,7 @@ TIMEOUT_S = 600
 
 
 def main() -> int:
-    """Prints the outcome and returns the exit code: 1 where a package has a known vulnerability or pip-audit is missing."""
+    """Prints the outcome and returns the exit code: 1 for a known vulnerability, or without pip-audit."""
     if importlib.util.find_spec("pip_audit") is None:
         print("audit: not done, because pip-audit is not installed: pip install pip-audit")
         return 1
