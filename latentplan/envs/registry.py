@@ -59,7 +59,7 @@ def default_task(domain: str, suite: str = DEFAULT_SUITE) -> str:
     tasks = find_suite(suite).tasks
     if domain not in tasks:
         raise UserError(describe_unknown_name("domain", domain, tasks))
-    return tasks[domain]
+    return tasks[domain][0]
 
 
 def describe_unknown_name(kind: str, name: str, available: Iterable[str]) -> str:

@@ -33,7 +33,7 @@ LAMP = EnvConfig(suite="lamps", domain="lamp", action_repeat=2)
 
 @pytest.fixture(autouse=True)
 def lamps(monkeypatch):
-    monkeypatch.setitem(SUITES, "lamps", Suite("tests.envs.lamp_suite:make", {"lamp": "bright"}))
+    monkeypatch.setitem(SUITES, "lamps", Suite("tests.envs.lamp_suite:make", {"lamp": ("bright",)}))
 
 
 def test_make_env_calls_the_factory_of_the_suite():
