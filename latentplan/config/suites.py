@@ -6,11 +6,10 @@ A new suite is a file with its factory and one entry in `SUITES`; `latentplan.en
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
-from latentplan.config.checks import UserError, shown
-from latentplan.config.parsing import raise_unknown
+from latentplan.config.checks import UserError, nearest, shown
 
 DEFAULT_SUITE = "dm_control"
 
@@ -69,8 +68,8 @@ def find_suite(name: str) -> Suite:
     return SUITES[name]
 
 
-def check_task(suite: str, domain: str, task: object) -> None:
-    """Refuses a task that the suite does not have, from the table alone.
+def check_task(suite: str, domain: str, task: object = None) -> tuple[str, ...]:
+    """The tasks of a domain, the usual one first; refuses names that the suite does not have, from the table alone.
 
     Args:
         suite: Name of the suite.
@@ -78,8 +77,19 @@ def check_task(suite: str, domain: str, task: object) -> None:
         task: Name of the task; None stands for the usual task of the domain.
 
     Raises:
-        UserError: There is no such suite, or the domain has no such task.
+        UserError: There is no such suite, or it has no such domain, or the domain has no such task.
     """
-    tasks = find_suite(suite).tasks.get(domain)
-    if task is not None and tasks is not None and task not in tasks:
-        raise_unknown(f"task of {domain}", str(task), tasks)
+    domains = find_suite(suite).tasks
+    if domain not in tuple(domains):  # settings that are made in Python may hold a value that is no text
+        raise UserError(_describe_unknown("domain", domain, domains))
+    tasks = domains[domain]
+    if task is not None and task not in tasks:
+        raise UserError(_describe_unknown(f"task of {domain}", task, tasks))
+    return tasks
+
+
+def _describe_unknown(kind: str, name: object, available: Iterable[str]) -> str:
+    """An error message for an unknown name, with all available names and the nearest name."""
+    choices = sorted(available)
+    similar = nearest(name, choices, cutoff=0.0)
+    return f"unknown {kind} {shown(name)}; available: {', '.join(choices)}. Did you mean {similar!r}?"
