@@ -13,7 +13,7 @@ from datetime import datetime
 from pathlib import Path
 from typing import Any
 
-from latentplan.config import MAX_THREADS, Config, Device, PlannerConfig, UserError, from_dict, to_dict
+from latentplan.config import MAX_THREADS, Config, Device, ModelConfig, PlannerConfig, UserError, from_dict, to_dict
 from latentplan.config.checks import EnvironmentFault, cut, shown, within
 from latentplan.config.estimates import check_parts, estimate_search
 from latentplan.config.extras import describe_missing, extra_of
@@ -122,14 +122,24 @@ def search_settings(saved: Config, given: Mapping[str, Any]) -> PlannerConfig:
         given: Settings of the search that were given, by name.
 
     Raises:
-        UserError: A given value is not allowed beside the saved ones, or this machine cannot serve the search.
+        UserError: A given value is not allowed beside the saved ones.
+    """
+    return build_config({"planner": override_planner(to_dict(saved.planner), given)}).planner
+
+
+def check_search(planner: PlannerConfig, model: ModelConfig) -> None:
+    """Refuses a search that this machine cannot serve, before torch is imported.
+
+    Args:
+        planner: Settings of the search.
+        model: Sizes of the model.
+
+    Raises:
+        UserError: The search does not fit into the free memory, or a decision would take minutes.
     """
     from latentplan.replay.memory import free_memory
 
-    settings = build_config({"planner": override_planner(to_dict(saved.planner), given)}).planner
-    if given:
-        check_parts([estimate_search(settings, saved.model, has_cuda())], free_memory())
-    return settings
+    check_parts([estimate_search(planner, model, has_cuda())], free_memory())
 
 
 @dataclass(frozen=True, kw_only=True)
