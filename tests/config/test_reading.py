@@ -7,7 +7,7 @@ import pytest
 
 from latentplan.config import EnvironmentFault, UserError
 from latentplan.config.checks import cut, nearest, shown
-from latentplan.config.reading import DEEPEST, is_shallow, parse_json, read_text, read_yaml
+from latentplan.config.reading import DEEPEST, is_shallow, parse_json, read_bytes, read_text, read_yaml
 
 
 def test_read_text_follows_links_to_regular_files_up_to_a_size(tmp_path):
@@ -16,6 +16,11 @@ def test_read_text_follows_links_to_regular_files_up_to_a_size(tmp_path):
     assert read_text(tmp_path / "link", largest=20) == "é" * 10
     with pytest.raises(UserError, match="more than 19 bytes"):
         read_text(tmp_path / "file", largest=19)
+
+
+def test_read_bytes_allocates_what_a_file_holds_not_what_it_may_hold(tmp_path):
+    (tmp_path / "file").write_bytes(bytes(range(256)) * 10_000)
+    assert read_bytes(tmp_path / "file", largest=2**60) == bytes(range(256)) * 10_000
 
 
 @pytest.mark.parametrize(
