@@ -17,7 +17,7 @@ from gymnasium.vector.utils import CloudpickleWrapper
 
 from latentplan.config import UserError
 from latentplan.config.checks import EnvironmentFault
-from latentplan.envs.faults import describe_failure
+from latentplan.envs.faults import check_reset, check_step, describe_failure
 from latentplan.envs.threads import single_threaded_children
 
 START_SECONDS = 300.0  # for the imports and the first objects of an environment
@@ -195,7 +195,10 @@ def read_facts(env: gymnasium.Env[Any, Any]) -> dict[str, Any]:
 
 
 def _run(env: gymnasium.Env[Any, Any], method: str, arguments: tuple[Any, ...], named: dict[str, Any]) -> Any:
-    return env.get_wrapper_attr(method)(*arguments, **named)
+    """The result of a method of an environment; that of `reset` and `step` is checked."""
+    result = env.get_wrapper_attr(method)(*arguments, **named)
+    check = {"reset": check_reset, "step": check_step}.get(method)
+    return result if check is None else check(result, env.observation_space.shape or ())
 
 
 def _serve(connection: Connection, factory: CloudpickleWrapper) -> None:

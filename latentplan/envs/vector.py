@@ -17,7 +17,6 @@ from gymnasium.wrappers import TimeLimit
 
 from latentplan.config import EnvConfig, derive_seed
 from latentplan.config.checks import EnvironmentFault
-from latentplan.envs.faults import check_picture, check_reward
 from latentplan.envs.process import CLOSING_SECONDS, Lane, LocalLane, ProcessLane
 from latentplan.envs.registry import make_env
 from latentplan.envs.user import make_from
@@ -196,8 +195,7 @@ class GuardedVectorEnv(VectorEnv[np.ndarray, np.ndarray, Any]):
         given_up: EnvironmentFault | None = None
         for index, lane in enumerate(self.lanes):  # every answer is taken, also after a fault of another environment
             try:
-                frame, reward, terminated[index], truncated[index], info = lane.answer()
-                rewards[index] = check_reward(reward)
+                frame, rewards[index], terminated[index], truncated[index], info = lane.answer()
                 self._keep(index, frame, info)
                 env_frames[index] = info["env_frames"]
             except EnvironmentFault as fault:
@@ -232,7 +230,7 @@ class GuardedVectorEnv(VectorEnv[np.ndarray, np.ndarray, Any]):
         self.lanes[index].restart()
 
     def _keep(self, index: int, frame: Any, info: dict[str, Any]) -> None:
-        self._frames[index] = check_picture(frame, self._frames.shape[1:])
+        self._frames[index] = frame
         self._labels[index] = info.get("labels")
 
     def _info(self, env_frames: np.ndarray, failed: np.ndarray) -> dict[str, Any]:
@@ -267,13 +265,11 @@ class GuardedEnv(gymnasium.Env[np.ndarray, np.ndarray]):
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         """See the environment's own `reset`."""
-        frame, info = self._call("reset", seed=seed, options=options)
-        return self._checked(frame), info
+        return self._call("reset", seed=seed, options=options)  # type: ignore[no-any-return]
 
     def step(self, action: np.ndarray) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         """See the environment's own `step`."""
-        frame, reward, terminated, truncated, info = self._call("step", action)
-        return self._checked(frame), self._guarded(check_reward, reward), terminated, truncated, info
+        return self._call("step", action)  # type: ignore[no-any-return]
 
     def render(self) -> Any:
         """See the environment's own `render`."""
@@ -283,9 +279,6 @@ class GuardedEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         """Ends the environment."""
         self._lane.ask_to_close()
         self._lane.close()
-
-    def _checked(self, frame: Any) -> np.ndarray:
-        return self._guarded(partial(check_picture, shape=self.observation_space.shape or ()), frame)
 
     def _call(self, method: str, *arguments: Any, **named: Any) -> Any:
         self._lane.ask(method, *arguments, **named)
