@@ -118,8 +118,9 @@ class ProcessLane:
 
     @property
     def facts(self) -> dict[str, Any]:
-        """See `Lane.facts`; waits for the process."""
-        self._await_start()
+        """See `Lane.facts`; the first look waits for the process."""
+        if self._facts is None:
+            self._await_start()
         assert self._facts is not None
         return self._facts
 

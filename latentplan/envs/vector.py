@@ -7,7 +7,7 @@ import signal
 import time
 import warnings
 from dataclasses import dataclass
-from functools import cached_property, partial
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import gymnasium
@@ -102,7 +102,7 @@ class Restarts:
         self.budget, self.count = budget, 0
 
     def spend(self, fault: EnvironmentFault) -> None:
-        """Allow one restart because of a fault.
+        """Allow one restart because of a fault, and warn of it.
 
         Raises:
             EnvironmentFault: The budget is spent; the fault has the origin of the one given.
@@ -111,6 +111,11 @@ class Restarts:
             often = f"after {self.count} restarts (collection.max_restarts {self.budget})"
             raise EnvironmentFault(f"{fault} {often}", fault.origin)
         self.count += 1
+        warnings.warn(
+            f"{fault}: its episode is cut short, and it is made anew ({self.count} of {self.budget} restarts)",
+            RuntimeWarning,
+            stacklevel=4,
+        )
 
 
 class GuardedVectorEnv(VectorEnv[np.ndarray, np.ndarray, Any]):
@@ -225,7 +230,6 @@ class GuardedVectorEnv(VectorEnv[np.ndarray, np.ndarray, Any]):
 
     def _restart(self, index: int, fault: EnvironmentFault) -> None:
         self.restarts.spend(fault)
-        _warn_of_restart(fault, self.restarts)
         self._is_renewed[index] = True
         self.lanes[index].restart()
 
@@ -243,7 +247,7 @@ class GuardedVectorEnv(VectorEnv[np.ndarray, np.ndarray, Any]):
 class GuardedEnv(gymnasium.Env[np.ndarray, np.ndarray]):
     """One environment whose faults are raised as `EnvironmentFault`, and that is then made anew.
 
-    Spaces and metadata are known once `facts` was read.
+    The first look at its spaces, metadata or `facts` waits for the environment's process.
 
     Args:
         lane: The environment.
@@ -253,15 +257,32 @@ class GuardedEnv(gymnasium.Env[np.ndarray, np.ndarray]):
     def __init__(self, lane: Lane, restarts: Restarts) -> None:
         self._lane, self._restarts = lane, restarts
 
-    @cached_property
+    @property
     def facts(self) -> dict[str, Any]:
-        """Attributes of the environment; see `Lane.facts`. The first look waits for the environment's process."""
-        facts = self._lane.facts
-        self.metadata = facts["metadata"]
-        self.observation_space, self.action_space = facts["observation_space"], facts["action_space"]
-        if facts["can_render_large"]:
-            self.render_large = partial(self._call, "render_large")
-        return facts
+        """Attributes of the environment; see `Lane.facts`."""
+        return self._lane.facts
+
+    @property
+    def observation_space(self) -> Any:  # type: ignore[override]
+        """The environment's own."""
+        return self.facts["observation_space"]
+
+    @property
+    def action_space(self) -> Any:  # type: ignore[override]
+        """The environment's own."""
+        return self.facts["action_space"]
+
+    @property
+    def metadata(self) -> dict[str, Any]:  # type: ignore[override]
+        """The environment's own."""
+        return self.facts["metadata"]  # type: ignore[no-any-return]
+
+    @property
+    def render_large(self) -> Callable[[int], Any]:
+        """See the environment's own `render_large`, where it has one."""
+        if not self.facts["can_render_large"]:
+            raise AttributeError("the environment draws no larger pictures")
+        return partial(self._call, "render_large")
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         """See the environment's own `reset`."""
@@ -281,16 +302,12 @@ class GuardedEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         self._lane.close()
 
     def _call(self, method: str, *arguments: Any, **named: Any) -> Any:
+        """The result of a method; after a fault the environment is made anew before the fault is raised."""
         self._lane.ask(method, *arguments, **named)
-        return self._guarded(lambda _: self._lane.answer(), None)
-
-    def _guarded(self, check: Callable[[Any], Any], value: Any) -> Any:
-        """The result of a check; after a fault the environment is made anew before the fault is raised."""
         try:
-            return check(value)
+            return self._lane.answer()
         except EnvironmentFault as fault:
             self._restarts.spend(fault)
-            _warn_of_restart(fault, self._restarts)
             self._lane.restart()
             raise
 
@@ -328,11 +345,3 @@ class _WithoutInfo(gymnasium.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.ndar
 
 def _derive_env_seed(seed: int | None, index: int) -> int | None:
     return None if seed is None else int(np.random.SeedSequence([seed, index]).generate_state(1)[0])
-
-
-def _warn_of_restart(fault: EnvironmentFault, restarts: Restarts) -> None:
-    warnings.warn(
-        f"{fault}: its episode is cut short, and it is made anew ({restarts.count} of {restarts.budget} restarts)",
-        RuntimeWarning,
-        stacklevel=4,
-    )

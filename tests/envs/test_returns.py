@@ -93,3 +93,12 @@ def test_environment_of_a_registered_suite_is_guarded(tmp_path, monkeypatch):
                 envs.step(ACTION[None] if make is make_vector_env else ACTION)
         for path in tmp_path.iterdir():
             path.unlink()
+
+
+@pytest.mark.parametrize("isolate", [False, True])
+def test_single_environment_needs_no_look_at_its_facts_first(isolate, make_lane):
+    env = GuardedEnv(make_lane("never", isolate), Restarts(0))
+    frame, info = env.reset(seed=5)
+    assert frame.shape == env.observation_space.shape and info == {"env_frames": 0}
+    assert env.action_space == OfSuite.action_space and env.metadata == OfSuite.metadata
+    assert not hasattr(env, "render_large")
