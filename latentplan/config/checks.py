@@ -42,10 +42,6 @@ class EnvironmentFault(UserError):
         if origin:
             self.add_note(origin)
 
-    def __reduce__(self) -> tuple[Any, ...]:
-        """Keeps the origin when the fault is sent to another process."""
-        return type(self), (str(self), self.origin)
-
 
 def cut(message: str) -> str:
     """A message without the middle of its long words; a message that is long all the same keeps 200 characters."""

@@ -101,16 +101,16 @@ def check_step(result: Any, shape: tuple[int, ...]) -> tuple[np.ndarray, float, 
     return check_picture(frame, shape), check_reward(reward), *ends, info
 
 
-def describe_failure(error: BaseException) -> EnvironmentFault:
+def describe_failure(error: BaseException) -> UserError:
     """The fault that an exception of an environment stands for, with the traceback of the environment's own code.
 
-    Raises:
-        UserError: The exception is a mistake of the user, such as a missing renderer, which no restart mends.
+    A mistake of the user, such as a missing renderer, is no fault, because no restart mends it: it is a plain
+    `UserError`.
     """
     if isinstance(error, EnvironmentFault):
         return error
     if isinstance(error, UserError):
-        raise UserError(str(error))
+        return UserError(str(error))
     own = error.__traceback__
     while own is not None and own.tb_next is not None and own.tb_frame.f_code.co_filename.startswith(_OWN_FOLDERS):
         own = own.tb_next

@@ -7,7 +7,6 @@ import multiprocessing
 import os
 import signal
 import threading
-import time
 from collections.abc import Callable
 from multiprocessing.connection import Connection, wait
 from typing import Any, Protocol
@@ -15,7 +14,6 @@ from typing import Any, Protocol
 import gymnasium
 from gymnasium.vector.utils import CloudpickleWrapper
 
-from latentplan.config import UserError
 from latentplan.config.checks import EnvironmentFault
 from latentplan.envs.faults import check_reset, check_step, describe_failure
 from latentplan.envs.threads import single_threaded_children
@@ -174,11 +172,9 @@ class ProcessLane:
             self._is_started = True
 
     def _receive(self, timeout_s: float) -> Any:
-        deadline = time.monotonic() + timeout_s
         try:
-            while not self._connection.poll(max(0.0, deadline - time.monotonic())):
-                if time.monotonic() >= deadline:
-                    raise EnvironmentFault(f"the environment has not answered for {timeout_s:g} s")
+            if not self._connection.poll(timeout_s):
+                raise EnvironmentFault(f"the environment has not answered for {timeout_s:g} s")
             kind, value = self._connection.recv()
         except (EOFError, OSError):
             self._process.join(CLOSING_SECONDS)
@@ -191,8 +187,8 @@ class ProcessLane:
 
 def read_facts(env: gymnasium.Env[Any, Any]) -> dict[str, Any]:
     """The attributes of an environment in `ATTRIBUTES`, also of the environment inside its wrappers."""
-    facts = {name: getattr(env, name, getattr(env.unwrapped, name, None)) for name in ATTRIBUTES}
-    return {**facts, "can_render_large": hasattr(env.unwrapped, "render_large")}
+    facts = {name: env.get_wrapper_attr(name) if env.has_wrapper_attr(name) else None for name in ATTRIBUTES}
+    return {**facts, "can_render_large": env.has_wrapper_attr("render_large")}
 
 
 def _run(env: gymnasium.Env[Any, Any], method: str, arguments: tuple[Any, ...], named: dict[str, Any]) -> Any:
@@ -213,7 +209,7 @@ def _serve(connection: Connection, factory: CloudpickleWrapper) -> None:
         env = factory()
         answer = "ok", read_facts(env)
     except BaseException as error:
-        answer = "failed", _describe(error)
+        answer = "failed", describe_failure(error)
     while True:
         try:
             _send(connection, answer)
@@ -223,7 +219,7 @@ def _serve(connection: Connection, factory: CloudpickleWrapper) -> None:
         try:
             answer = "ok", _run(env, *request)
         except BaseException as error:  # also SystemExit: the environment may call sys.exit()
-            answer = "failed", _describe(error)
+            answer = "failed", describe_failure(error)
         if request[0] == "close":
             return
 
@@ -235,15 +231,7 @@ def _send(connection: Connection, answer: tuple[str, Any]) -> None:
     except (OSError, EnvironmentFault):
         raise
     except Exception as error:
-        connection.send(("failed", _describe(error)))
-
-
-def _describe(error: BaseException) -> UserError:
-    """The fault or the mistake of the user that an exception stands for."""
-    try:
-        return describe_failure(error)
-    except UserError as mistake:
-        return mistake
+        connection.send(("failed", describe_failure(error)))
 
 
 def _end_with_parent() -> None:

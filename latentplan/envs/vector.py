@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import multiprocessing
-import signal
 import time
 import warnings
 from dataclasses import dataclass
@@ -15,7 +13,7 @@ import numpy as np
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.wrappers import TimeLimit
 
-from latentplan.config import EnvConfig, derive_seed
+from latentplan.config import CollectionConfig, EnvConfig, derive_seed
 from latentplan.config.checks import EnvironmentFault
 from latentplan.envs.process import CLOSING_SECONDS, Lane, LocalLane, ProcessLane
 from latentplan.envs.registry import make_env
@@ -23,8 +21,6 @@ from latentplan.envs.user import make_from
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
-
-STEP_TIMEOUT_S = 60.0
 
 
 def make_vector_env(
@@ -35,7 +31,7 @@ def make_vector_env(
     episode_decisions: int | None = None,
     restarts: Restarts | None = None,
     isolate: bool = False,
-    step_timeout_s: float = STEP_TIMEOUT_S,
+    step_timeout_s: float = CollectionConfig.step_timeout_s,
 ) -> GuardedVectorEnv:
     """Several environments behind one `step`; two or more environments run in separate processes.
 
@@ -63,7 +59,7 @@ def make_vector_env(
     """
     lanes: list[Lane] = []
     for index in range(num_envs):
-        factory = EnvFactory(config, _derive_env_seed(seed, index), make_env, episode_decisions)
+        factory = _EnvFactory(config, _derive_env_seed(seed, index), make_env, episode_decisions)
         lanes.append(ProcessLane(factory, step_timeout_s) if isolate or num_envs > 1 else LocalLane(factory))
     return GuardedVectorEnv(lanes, restarts or Restarts(0))
 
@@ -73,7 +69,7 @@ def make_guarded_env(
     restarts: Restarts,
     make_env: Callable[[], gymnasium.Env[Any, Any]] | None = None,
     isolate: bool = False,
-    step_timeout_s: float = STEP_TIMEOUT_S,
+    step_timeout_s: float = CollectionConfig.step_timeout_s,
 ) -> GuardedEnv:
     """One environment that can be made anew after a fault, for evaluations.
 
@@ -84,7 +80,7 @@ def make_guarded_env(
         isolate: See `make_vector_env`.
         step_timeout_s: See `make_vector_env`.
     """
-    factory = EnvFactory(config, 0, make_env, None)
+    factory = _EnvFactory(config, 0, make_env, None)
     return GuardedEnv(ProcessLane(factory, step_timeout_s) if isolate else LocalLane(factory), restarts)
 
 
@@ -127,7 +123,6 @@ class GuardedVectorEnv(VectorEnv[np.ndarray, np.ndarray, Any]):
 
     Attributes:
         restarts: Counts how often environments were made anew.
-        facts: Attributes of the first environment; see `Lane.facts`.
 
     Args:
         lanes: The environments.
@@ -142,12 +137,12 @@ class GuardedVectorEnv(VectorEnv[np.ndarray, np.ndarray, Any]):
     def __init__(self, lanes: list[Lane], restarts: Restarts) -> None:
         self.lanes, self.restarts, self.num_envs = lanes, restarts, len(lanes)
         try:
-            self.facts = [lane.facts for lane in lanes][0]
+            facts = [lane.facts for lane in lanes][0]
         except BaseException:
             self.close_extras(timeout=0.0)
             raise
-        self.single_observation_space = self.facts["observation_space"]
-        self.single_action_space = self.facts["action_space"]
+        self.single_observation_space = facts["observation_space"]
+        self.single_action_space = facts["action_space"]
         self.observation_space = gymnasium.vector.utils.batch_space(self.single_observation_space, self.num_envs)
         self.action_space = gymnasium.vector.utils.batch_space(self.single_action_space, self.num_envs)
         shape = self.single_observation_space.shape or ()
@@ -313,7 +308,7 @@ class GuardedEnv(gymnasium.Env[np.ndarray, np.ndarray]):
 
 
 @dataclass(frozen=True)
-class EnvFactory:
+class _EnvFactory:
     """Builds one environment in the process that calls it; picklable where the user's factory is."""
 
     config: EnvConfig
@@ -322,9 +317,6 @@ class EnvFactory:
     episode_decisions: int | None
 
     def __call__(self) -> gymnasium.Env[np.ndarray, np.ndarray]:
-        """The environment, which ignores Ctrl-C where it is in a process of its own."""
-        if multiprocessing.parent_process() is not None:
-            signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches all processes; the parent handles it
         build = make_env if self.factory is None else make_from(self.factory)
         env: gymnasium.Env[np.ndarray, np.ndarray] = build(self.config, self.seed)
         env = env if self.factory is None else _WithoutInfo(env)
