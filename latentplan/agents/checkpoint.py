@@ -13,7 +13,7 @@ from safetensors import SafetensorError
 from safetensors.torch import load, save
 
 from latentplan.agents.base import Agent
-from latentplan.agents.files import is_checkpoint, read_files, seal, write_files
+from latentplan.agents.files import INFO, WEIGHTS, is_checkpoint, read_files, seal, write_files
 from latentplan.agents.modes import MODES, make_agent
 from latentplan.config import Config, PlannerConfig, UserError, from_dict, to_dict
 from latentplan.config.checks import cut, nearest, shown
@@ -25,10 +25,7 @@ from latentplan.models import WorldModel
 from latentplan.models.fast import accelerate
 from latentplan.replay.memory import free_memory
 
-WEIGHTS = "weights.safetensors"
-INFO = "info.json"
 MOST_NAMES = 5  # known names in an error message
-LARGEST_INFO = 2**24  # bytes; a description with the metrics of a long run has some hundred thousand
 LARGEST_COUNT = 10**15  # of frames, updates and minutes; larger numbers are damage
 LARGEST_SIZE = 4096  # of actions, labels and goals
 
@@ -127,8 +124,6 @@ def read_info(path: str | Path) -> dict[str, Any]:
 
 def _parse_info(folder: Path, content: bytes) -> dict[str, Any]:
     """The description of a checkpoint, checked."""
-    if len(content) > LARGEST_INFO:
-        raise UserError(f"cannot read {folder / INFO}: it has more than {LARGEST_INFO:,} bytes")
     info = parse_json(content.decode(errors="replace"), folder / INFO)
     missing = [key for key in REQUIRED_KEYS if not isinstance(info, dict) or key not in info]
     if missing:

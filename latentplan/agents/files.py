@@ -15,7 +15,12 @@ from pathlib import Path
 
 from latentplan.config import UserError
 from latentplan.config.commit import MANIFEST, PART, DamageError, Manifest, read_manifest, sync, write_manifest
+from latentplan.config.reading import read_bytes
 
+WEIGHTS = "weights.safetensors"
+INFO = "info.json"
+LARGEST_FILE = 2**32  # bytes; weights of the shipped agents have some millions
+LARGEST = {INFO: 2**24, WEIGHTS: LARGEST_FILE}  # bytes; a description with the metrics of a long run has some 2**19
 KIND, FORMAT = "agent", 1
 TRIES, PAUSE_SECONDS = 5, 0.1  # while another process replaces the checkpoint
 
@@ -97,9 +102,4 @@ def _finish_renaming(folder: Path) -> None:
 
 
 def _read(path: Path) -> bytes:
-    try:
-        if path.exists() and not path.is_file():
-            raise UserError(f"{path} cannot be read: it is not a regular file")
-        return path.read_bytes()
-    except OSError as error:
-        raise UserError(f"{path} cannot be read: {error.strerror}") from None
+    return read_bytes(path, LARGEST.get(path.name.removesuffix(PART), LARGEST_FILE))

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 from latentplan.commands.flags import overrides
-from latentplan.commands.shell import LearningRequest, name_folder, saved_config, search_settings
+from latentplan.commands.shell import LearningRequest, check_search, name_folder, saved_config, search_settings
 from latentplan.config import DistillConfig, PlannerConfig
 
 
@@ -33,8 +32,13 @@ class Request(LearningRequest):
 
 def resolve(request: Request) -> dict[str, Any]:
     """The fields of the request, with every setting of the distillation and of the search that labels."""
+    from latentplan.agents.checkpoint import read_info
+
     asked = {**vars(request), "settings": DistillConfig(**request.settings)}
-    return asked if request.checkpoint is None else {**asked, "planner": _search_settings(request, request.checkpoint)}
+    if request.checkpoint is None:
+        return asked
+    saved = saved_config(request.checkpoint, read_info(request.checkpoint))
+    return {**asked, "planner": search_settings(saved, request.planner)}
 
 
 def run(request: Request) -> int:
@@ -44,7 +48,9 @@ def run(request: Request) -> int:
     info = {} if request.checkpoint is None else read_info(request.checkpoint)
     planner = None
     if request.planner and request.checkpoint is not None:
-        planner = _search_settings(request, request.checkpoint)
+        saved = saved_config(request.checkpoint, info)
+        planner = search_settings(saved, request.planner)
+        check_search(planner, saved.model)
     device = request.use_device()
     from latentplan.training import distill, resume_distillation
 
@@ -54,9 +60,3 @@ def run(request: Request) -> int:
     out = request.out or name_folder("distilled", info)
     settings = DistillConfig(**request.settings)
     return distill(request.checkpoint, out, settings, planner=planner, device=device).exit_code
-
-
-def _search_settings(request: Request, checkpoint: Path) -> PlannerConfig:
-    from latentplan.agents.checkpoint import read_info
-
-    return search_settings(saved_config(checkpoint, read_info(checkpoint)), request.planner)

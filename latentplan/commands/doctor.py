@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import importlib.metadata
-import os
 import platform
 import shutil
 import sys
@@ -14,6 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from latentplan.config import RENDER_QUALITIES, EnvConfig, UserError
+from latentplan.config.estimates import count_cores
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
@@ -118,8 +118,7 @@ def _versions() -> Iterator[Finding]:
 
 
 def _device() -> Iterator[Finding]:
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
-    yield Finding("processor", f"{_processor_name()}, {cores} cores")
+    yield Finding("processor", f"{_processor_name()}, {count_cores()} cores")
     import torch
 
     if torch.cuda.is_available():

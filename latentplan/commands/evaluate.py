@@ -15,9 +15,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from latentplan.commands.flags import overrides
-from latentplan.commands.shell import ComputeRequest, saved_config, search_settings
+from latentplan.commands.shell import ComputeRequest, check_search, saved_config, search_settings
 from latentplan.config import EnvConfig, PlannerConfig, UserError, to_dict
-from latentplan.config.checks import MAX_EPISODES, above_zero, at_least, between, one_of, within
+from latentplan.config.checks import MAX_EPISODES, above_zero, at_least, one_of, within
 from latentplan.config.parsing import option
 
 if TYPE_CHECKING:
@@ -64,7 +64,7 @@ class Request(ComputeRequest):
     def __post_init__(self) -> None:
         super().__post_init__()
         at_least(self, seed=0)
-        between(self, episodes=(1, MAX_EPISODES))
+        within(self, episodes=(1, MAX_EPISODES))
         one_of(self, mode=list_modes())
         above_zero(self, "control_hz")
         if self.planner and self.mode not in planning_modes():
@@ -122,6 +122,8 @@ def run(request: Request) -> int:
     info = read_info(request.checkpoint)
     config = saved_config(request.checkpoint, info)
     planner = search_settings(config, request.planner)
+    if request.planner:
+        check_search(planner, config.model)
     changes = {name: getattr(planner, name) for name in request.planner}
     if request.planning_budget is not None:
         changes["planning_budget"] = request.planning_budget

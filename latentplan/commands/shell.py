@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import errno
 import os
 import signal
 import sys
@@ -14,7 +13,7 @@ from datetime import datetime
 from pathlib import Path
 from typing import Any
 
-from latentplan.config import MAX_THREADS, Config, Device, PlannerConfig, UserError, from_dict, to_dict
+from latentplan.config import MAX_THREADS, Config, Device, ModelConfig, PlannerConfig, UserError, from_dict, to_dict
 from latentplan.config.checks import EnvironmentFault, cut, shown, within
 from latentplan.config.estimates import check_parts, estimate_search
 from latentplan.config.extras import describe_missing, extra_of
@@ -59,8 +58,6 @@ def run_guarded(command: Callable[[Sequence[str]], int], argv: Sequence[str]) ->
     except OSError as error:
         if error.strerror is None:
             raise
-        if error.errno == errno.ENAMETOOLONG:
-            return _refuse(f"a file name is too long: {str(error.filename)[:80]}...")
         name = "" if error.filename is None else f": {shown(str(error.filename))}"
         return _refuse(f"the system refused a file or a process{name}: {error.strerror}")
 
@@ -125,14 +122,24 @@ def search_settings(saved: Config, given: Mapping[str, Any]) -> PlannerConfig:
         given: Settings of the search that were given, by name.
 
     Raises:
-        UserError: A given value is not allowed beside the saved ones, or this machine cannot serve the search.
+        UserError: A given value is not allowed beside the saved ones.
+    """
+    return build_config({"planner": override_planner(to_dict(saved.planner), given)}).planner
+
+
+def check_search(planner: PlannerConfig, model: ModelConfig) -> None:
+    """Refuses a search that this machine cannot serve, before torch is imported.
+
+    Args:
+        planner: Settings of the search.
+        model: Sizes of the model.
+
+    Raises:
+        UserError: The search does not fit into the free memory, or a decision would take minutes.
     """
     from latentplan.replay.memory import free_memory
 
-    settings = build_config({"planner": override_planner(to_dict(saved.planner), given)}).planner
-    if given:
-        check_parts([estimate_search(settings, saved.model, has_cuda())], free_memory())
-    return settings
+    check_parts([estimate_search(planner, model, has_cuda())], free_memory())
 
 
 @dataclass(frozen=True, kw_only=True)

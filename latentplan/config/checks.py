@@ -21,7 +21,8 @@ LONGEST_LINE = 1000  # a longer message repeats input, and is cut to `LONGEST_WO
 class UserError(ValueError):
     """A mistake of the user; the message is one line that says what to give instead.
 
-    A message repeats at most 200 characters of each path or value; see `cut`.
+    A message has at most 1,000 characters, and no word in it more than 200: of a longer word, such as a path without
+    spaces, and of a longer message the beginning and the end are kept, 200 characters in all; see `cut`.
     """
 
     def __init__(self, message: object = "") -> None:
@@ -40,10 +41,6 @@ class EnvironmentFault(UserError):
         self.origin = origin
         if origin:
             self.add_note(origin)
-
-    def __reduce__(self) -> tuple[Any, ...]:
-        """Keeps the origin when the fault is sent to another process."""
-        return type(self), (str(self), self.origin)
 
 
 def cut(message: str) -> str:
@@ -146,18 +143,11 @@ def within(config: Any, **bounds: tuple[float, float]) -> None:
         _require(config, name, low <= getattr(config, name) <= high, f"in [{low}, {high}]")
 
 
-def between(config: Any, **bounds: tuple[float, float]) -> None:
-    """Require fields to be at least the first bound and at most the second."""
-    for name, (low, high) in bounds.items():
-        value = getattr(config, name)
-        _require(config, name, value >= low, f"at least {low}")
-        _require(config, name, value <= high, f"at most {high}")
-
-
 def one_of(config: Any, **choices: tuple[str | None, ...]) -> None:
     """Require fields to be one of the values allowed."""
     for name, allowed in choices.items():
-        _require(config, name, getattr(config, name) in allowed, f"one of {', '.join(map(str, allowed))}")
+        words = ", ".join("null" if choice is None else choice for choice in allowed)
+        _require(config, name, getattr(config, name) in allowed, f"one of {words}")
 
 
 def _require(config: Any, name: str, holds: bool, allowed: str) -> None:

@@ -19,7 +19,7 @@ from latentplan.config.parsing import Setting, list_settings, raise_unknown, rea
 from latentplan.config.reading import read_yaml
 from latentplan.config.removed import drop_removed
 from latentplan.config.settings import Config
-from latentplan.config.suites import DEFAULT_SUITE, SUITES, check_task, find_suite
+from latentplan.config.suites import DEFAULT_SUITE, SUITES, find_suite
 
 Layer = dict[str, dict[str, Any]]
 
@@ -42,7 +42,6 @@ def compose(config_file: Layer, flags: Layer, preset: str = "auto") -> Config:
         raise_unknown("domain", domain, domains)
     domain_layer = _read_optional(domain)
     task = chosen["env"].get("task") or domain_layer.get("env", {}).get("task")
-    check_task(chosen["env"].get("suite", DEFAULT_SUITE), domain, task)
     if preset == "auto":
         preset = "gpu" if chosen.get("run", {}).get("device") != "cpu" and has_cuda() else "cpu"
     preset_layer = read_layer(config_folder() / f"{preset}.yaml")

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal, get_args
 
-from latentplan.config.checks import MAX_EPISODES, above_zero, at_least, between, one_of, within
+from latentplan.config.checks import MAX_EPISODES, above_zero, at_least, one_of, within
 from latentplan.config.parsing import option
 
 Behaviour = Literal["planner", "actor", "both"]
@@ -85,7 +85,7 @@ class LearningConfig:
         at_least(self, reconstruction_scale=0.0, dynamics_scale=0.0, representation_scale=0.0, free_nats=0.0)
         at_least(self, overshooting_scale=0.0, reward_scale=0.0, replay_value_scale=0.0, entropy_scale=0.0)
         at_least(self, curriculum_frames=0)
-        between(self, random_shift=(0, 64))
+        within(self, random_shift=(0, 64))
         above_zero(
             self, "model_learning_rate", "behaviour_learning_rate", "max_grad_norm", "target_rate", "average_rate"
         )
@@ -180,8 +180,8 @@ class DistillConfig:
 
     def __post_init__(self) -> None:
         at_least(self, planner_rounds=0, seed=0)
-        between(self, rounds=(1, MAX_EPISODES), episodes=(1, MAX_EPISODES), evaluation_episodes=(2, MAX_EPISODES))
-        between(self, updates=(1, MAX_UPDATES), batch_size=(1, MAX_ROWS), plan_batch=(1, MAX_ROWS))
+        within(self, rounds=(1, MAX_EPISODES), episodes=(1, MAX_EPISODES), evaluation_episodes=(2, MAX_EPISODES))
+        within(self, updates=(1, MAX_UPDATES), batch_size=(1, MAX_ROWS), plan_batch=(1, MAX_ROWS))
         above_zero(self, "minutes", "learning_rate")
         within(self, relabel_share=(0.0, 1.0))
 
@@ -214,6 +214,6 @@ class GoalsConfig:
 
     def __post_init__(self) -> None:
         at_least(self, seed=0, entropy_scale=0.0)
-        between(self, updates=(1, MAX_UPDATES), starts=(1, MAX_ROWS), play_decisions=(1, MAX_ROWS))
-        between(self, horizon=(1, 10_000), hidden_dim=(1, 16_384))
+        within(self, updates=(1, MAX_UPDATES), starts=(1, MAX_ROWS), play_decisions=(1, MAX_ROWS))
+        within(self, horizon=(1, 10_000), hidden_dim=(1, 16_384))
         above_zero(self, "minutes", "learning_rate")

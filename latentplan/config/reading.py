@@ -18,6 +18,7 @@ from latentplan.config.checks import UserError
 LARGEST_SETTINGS = 2**20  # bytes of a file of settings
 LARGEST_DATA = 2**26  # bytes of a file of measurements
 DEEPEST = 32  # levels of nested lists and dictionaries
+_BLOCK = 2**22  # bytes of one read
 
 
 def read_text(path: Path, largest: int = LARGEST_SETTINGS) -> str:
@@ -29,6 +30,22 @@ def read_text(path: Path, largest: int = LARGEST_SETTINGS) -> str:
 
     Raises:
         UserError: The file is missing, is no regular file, is too large, or holds no text.
+    """
+    try:
+        return read_bytes(path, largest).decode()
+    except UnicodeDecodeError:
+        raise UserError(f"cannot read {path}: not a text file") from None
+
+
+def read_bytes(path: Path, largest: int) -> bytes:
+    """The content of a regular file.
+
+    Args:
+        path: The file; a link is followed.
+        largest: Largest size in bytes.
+
+    Raises:
+        UserError: The file is missing, is no regular file, or is too large.
     """
     try:
         opened = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)  # a pipe without a writer would block
@@ -43,10 +60,7 @@ def read_text(path: Path, largest: int = LARGEST_SETTINGS) -> str:
         raise UserError(f"cannot read {path}: it is {'a folder' if stat.S_ISDIR(mode) else 'not a regular file'}")
     if len(content) > largest:
         raise UserError(f"cannot read {path}: it has more than {largest:,} bytes")
-    try:
-        return content.decode()
-    except UnicodeDecodeError:
-        raise UserError(f"cannot read {path}: not a text file") from None
+    return content
 
 
 def read_yaml(path: Path) -> Any:
@@ -94,7 +108,7 @@ def parse_json(text: str, path: Path | str) -> Any:
 
 def _read_parts(opened: int, size: int) -> Iterator[bytes]:
     """The first bytes of an open file."""
-    while size > 0 and (part := os.read(opened, size)):
+    while size > 0 and (part := os.read(opened, min(size, _BLOCK))):  # memory is taken for all that is asked for
         size -= len(part)
         yield part
 

@@ -9,7 +9,7 @@ import dataclasses
 from dataclasses import dataclass, field
 from typing import Any, Literal, get_args
 
-from latentplan.config.checks import MAX_EPISODES, MAX_THREADS, UserError, above_zero, at_least, between, one_of, within
+from latentplan.config.checks import MAX_EPISODES, MAX_THREADS, UserError, above_zero, at_least, one_of, within
 from latentplan.config.learning import CollectionConfig, LearningConfig
 from latentplan.config.planner import PlannerConfig
 from latentplan.config.removed import drop_removed
@@ -57,7 +57,7 @@ class EnvConfig:
     suite: str = "dm_control"
 
     def __post_init__(self) -> None:
-        between(self, action_repeat=(1, MAX_REPEAT), num_envs=(1, MAX_ENVS), camera=(-1, MAX_CAMERA))
+        within(self, action_repeat=(1, MAX_REPEAT), num_envs=(1, MAX_ENVS), camera=(-1, MAX_CAMERA))
         one_of(self, render_quality=RENDER_QUALITIES, floor=FLOORS)
 
 
@@ -128,7 +128,7 @@ class EvaluationConfig:
 
     def __post_init__(self) -> None:
         at_least(self, every_frames=1)
-        between(self, episodes=(1, MAX_EPISODES), final_episodes=(1, MAX_EPISODES))
+        within(self, episodes=(1, MAX_EPISODES), final_episodes=(1, MAX_EPISODES))
 
 
 @dataclass(frozen=True)

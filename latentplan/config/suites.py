@@ -1,4 +1,4 @@
-"""The environment suites by name: the factory and the domains of each.
+"""The environment suites by name: the factory, the domains and the tasks of each.
 
 The table needs the standard library only, so that the domain of a run is checked before a simulator is imported.
 A new suite is a file with its factory and one entry in `SUITES`; `latentplan.envs.registry` describes the factory.
@@ -6,11 +6,10 @@ A new suite is a file with its factory and one entry in `SUITES`; `latentplan.en
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
 
-from latentplan.config.checks import UserError, shown
-from latentplan.config.parsing import raise_unknown
+from latentplan.config.checks import UserError, nearest, shown
 
 DEFAULT_SUITE = "dm_control"
 
@@ -21,52 +20,29 @@ class Suite:
 
     Attributes:
         factory: The callable that makes an environment, as "module:name"; the module is imported at the first use.
-        tasks: The usual task of each domain of the suite. No two suites share the name of a domain: files of settings
-            (`configs/<domain>.yaml`) and named quantities are found by it.
-        names: Every task of each domain, so that an unknown task is refused before a simulator is imported. The tasks
-            of a domain that is missing here are checked by the factory.
+        tasks: The tasks of each domain of the suite, the usual one first; an unknown task is refused before a simulator
+            is imported. No two suites share the name of a domain: files of settings (`configs/<domain>.yaml`) and named
+            quantities are found by it.
     """
 
     factory: str
-    tasks: Mapping[str, str]
-    names: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+    tasks: Mapping[str, tuple[str, ...]]
 
 
 SUITES: dict[str, Suite] = {
     "dm_control": Suite(
         "latentplan.envs.suite:SuiteEnv",
         {
-            "acrobot": "swingup",
-            "ball_in_cup": "catch",
-            "cartpole": "swingup",
-            "cheetah": "run",
-            "dog": "walk",
-            "finger": "spin",
-            "fish": "swim",
-            "hopper": "hop",
-            "humanoid": "walk",
-            "humanoid_CMU": "run",
-            "lqr": "lqr_2_1",
-            "manipulator": "bring_ball",
-            "pendulum": "swingup",
-            "point_mass": "easy",
-            "quadruped": "walk",
-            "reacher": "easy",
-            "stacker": "stack_2",
-            "swimmer": "swimmer6",
-            "walker": "walk",
-        },
-        {
             "acrobot": ("swingup", "swingup_sparse"),
             "ball_in_cup": ("catch",),
-            "cartpole": ("balance", "balance_sparse", "swingup", "swingup_sparse", "two_poles", "three_poles"),
+            "cartpole": ("swingup", "balance", "balance_sparse", "swingup_sparse", "two_poles", "three_poles"),
             "cheetah": ("run",),
-            "dog": ("stand", "walk", "trot", "run", "fetch"),
+            "dog": ("walk", "stand", "trot", "run", "fetch"),
             "finger": ("spin", "turn_easy", "turn_hard"),
-            "fish": ("upright", "swim"),
-            "hopper": ("stand", "hop"),
-            "humanoid": ("stand", "walk", "run", "run_pure_state"),
-            "humanoid_CMU": ("stand", "walk", "run"),
+            "fish": ("swim", "upright"),
+            "hopper": ("hop", "stand"),
+            "humanoid": ("walk", "stand", "run", "run_pure_state"),
+            "humanoid_CMU": ("run", "stand", "walk"),
             "lqr": ("lqr_2_1", "lqr_6_2"),
             "manipulator": ("bring_ball", "bring_peg", "insert_ball", "insert_peg"),
             "pendulum": ("swingup",),
@@ -75,7 +51,7 @@ SUITES: dict[str, Suite] = {
             "reacher": ("easy", "hard"),
             "stacker": ("stack_2", "stack_4"),
             "swimmer": ("swimmer6", "swimmer15"),
-            "walker": ("stand", "walk", "run"),
+            "walker": ("walk", "stand", "run"),
         },
     ),
 }
@@ -92,8 +68,8 @@ def find_suite(name: str) -> Suite:
     return SUITES[name]
 
 
-def check_task(suite: str, domain: str, task: object) -> None:
-    """Refuses a task that the suite does not have, from the table alone.
+def check_task(suite: str, domain: str, task: object = None) -> tuple[str, ...]:
+    """The tasks of a domain, the usual one first; refuses names that the suite does not have, from the table alone.
 
     Args:
         suite: Name of the suite.
@@ -101,8 +77,19 @@ def check_task(suite: str, domain: str, task: object) -> None:
         task: Name of the task; None stands for the usual task of the domain.
 
     Raises:
-        UserError: There is no such suite, or the domain has no such task.
+        UserError: There is no such suite, or it has no such domain, or the domain has no such task.
     """
-    names = find_suite(suite).names.get(domain)
-    if task is not None and names is not None and task not in names:
-        raise_unknown(f"task of {domain}", str(task), names)
+    domains = find_suite(suite).tasks
+    if domain not in tuple(domains):  # settings that are made in Python may hold a value that is no text
+        raise UserError(_describe_unknown("domain", domain, domains))
+    tasks = domains[domain]
+    if task is not None and task not in tasks:
+        raise UserError(_describe_unknown(f"task of {domain}", task, tasks))
+    return tasks
+
+
+def _describe_unknown(kind: str, name: object, available: Iterable[str]) -> str:
+    """An error message for an unknown name, with all available names and the nearest name."""
+    choices = sorted(available)
+    similar = nearest(name, choices, cutoff=0.0)
+    return f"unknown {kind} {shown(name)}; available: {', '.join(choices)}. Did you mean {similar!r}?"

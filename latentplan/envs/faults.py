@@ -60,16 +60,57 @@ def check_reward(reward: Any) -> float:
     return value
 
 
-def describe_failure(error: BaseException) -> EnvironmentFault:
-    """The fault that an exception of an environment stands for, with the traceback of the environment's own code.
+def check_reset(result: Any, shape: tuple[int, ...]) -> tuple[np.ndarray, dict[str, Any]]:
+    """The first frame and the info of an episode, as a reset of an environment has to return them.
+
+    Args:
+        result: What the environment returned.
+        shape: Shape of a frame.
 
     Raises:
-        UserError: The exception is a mistake of the user, such as a missing renderer, which no restart mends.
+        EnvironmentFault: The result is something else.
+    """
+    try:
+        frame, info = result
+        info = dict(info)
+    except (TypeError, ValueError):
+        wanted = "the environment's reset must return a frame and an info"
+        raise EnvironmentFault(f"{wanted}, got {shown(result)}") from None
+    return check_picture(frame, shape), info
+
+
+def check_step(result: Any, shape: tuple[int, ...]) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
+    """Frame, reward, terminated, truncated and info, as a step of an environment has to return them.
+
+    Args:
+        result: What the environment returned.
+        shape: Shape of a frame.
+
+    Raises:
+        EnvironmentFault: The result is something else.
+    """
+    try:
+        frame, reward, terminated, truncated, info = result
+        ends = bool(terminated), bool(truncated)
+        info = {**info, "env_frames": int(info["env_frames"])}
+    except (KeyError, TypeError, ValueError):
+        raise EnvironmentFault(
+            "the environment's step must return a frame, a reward, terminated, truncated and an info with a number "
+            f"env_frames, got {shown(result)}"
+        ) from None
+    return check_picture(frame, shape), check_reward(reward), *ends, info
+
+
+def describe_failure(error: BaseException) -> UserError:
+    """The fault that an exception of an environment stands for, with the traceback of the environment's own code.
+
+    A mistake of the user, such as a missing renderer, is no fault, because no restart mends it: it is a plain
+    `UserError`.
     """
     if isinstance(error, EnvironmentFault):
         return error
     if isinstance(error, UserError):
-        raise UserError(str(error))
+        return UserError(str(error))
     own = error.__traceback__
     while own is not None and own.tb_next is not None and own.tb_frame.f_code.co_filename.startswith(_OWN_FOLDERS):
         own = own.tb_next

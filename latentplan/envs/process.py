@@ -7,7 +7,6 @@ import multiprocessing
 import os
 import signal
 import threading
-import time
 from collections.abc import Callable
 from multiprocessing.connection import Connection, wait
 from typing import Any, Protocol
@@ -15,9 +14,8 @@ from typing import Any, Protocol
 import gymnasium
 from gymnasium.vector.utils import CloudpickleWrapper
 
-from latentplan.config import UserError
 from latentplan.config.checks import EnvironmentFault
-from latentplan.envs.faults import describe_failure
+from latentplan.envs.faults import check_reset, check_step, describe_failure
 from latentplan.envs.threads import single_threaded_children
 
 START_SECONDS = 300.0  # for the imports and the first objects of an environment
@@ -118,8 +116,9 @@ class ProcessLane:
 
     @property
     def facts(self) -> dict[str, Any]:
-        """See `Lane.facts`; waits for the process."""
-        self._await_start()
+        """See `Lane.facts`; the first look waits for the process."""
+        if self._facts is None:
+            self._await_start()
         assert self._facts is not None
         return self._facts
 
@@ -173,11 +172,9 @@ class ProcessLane:
             self._is_started = True
 
     def _receive(self, timeout_s: float) -> Any:
-        deadline = time.monotonic() + timeout_s
         try:
-            while not self._connection.poll(max(0.0, deadline - time.monotonic())):
-                if time.monotonic() >= deadline:
-                    raise EnvironmentFault(f"the environment has not answered for {timeout_s:g} s")
+            if not self._connection.poll(timeout_s):
+                raise EnvironmentFault(f"the environment has not answered for {timeout_s:g} s")
             kind, value = self._connection.recv()
         except (EOFError, OSError):
             self._process.join(CLOSING_SECONDS)
@@ -190,12 +187,15 @@ class ProcessLane:
 
 def read_facts(env: gymnasium.Env[Any, Any]) -> dict[str, Any]:
     """The attributes of an environment in `ATTRIBUTES`, also of the environment inside its wrappers."""
-    facts = {name: getattr(env, name, getattr(env.unwrapped, name, None)) for name in ATTRIBUTES}
-    return {**facts, "can_render_large": hasattr(env.unwrapped, "render_large")}
+    facts = {name: env.get_wrapper_attr(name) if env.has_wrapper_attr(name) else None for name in ATTRIBUTES}
+    return {**facts, "can_render_large": env.has_wrapper_attr("render_large")}
 
 
 def _run(env: gymnasium.Env[Any, Any], method: str, arguments: tuple[Any, ...], named: dict[str, Any]) -> Any:
-    return env.get_wrapper_attr(method)(*arguments, **named)
+    """The result of a method of an environment; that of `reset` and `step` is checked."""
+    result = env.get_wrapper_attr(method)(*arguments, **named)
+    check = {"reset": check_reset, "step": check_step}.get(method)
+    return result if check is None else check(result, env.observation_space.shape or ())
 
 
 def _serve(connection: Connection, factory: CloudpickleWrapper) -> None:
@@ -209,7 +209,7 @@ def _serve(connection: Connection, factory: CloudpickleWrapper) -> None:
         env = factory()
         answer = "ok", read_facts(env)
     except BaseException as error:
-        answer = "failed", _describe(error)
+        answer = "failed", describe_failure(error)
     while True:
         try:
             _send(connection, answer)
@@ -219,7 +219,7 @@ def _serve(connection: Connection, factory: CloudpickleWrapper) -> None:
         try:
             answer = "ok", _run(env, *request)
         except BaseException as error:  # also SystemExit: the environment may call sys.exit()
-            answer = "failed", _describe(error)
+            answer = "failed", describe_failure(error)
         if request[0] == "close":
             return
 
@@ -231,15 +231,7 @@ def _send(connection: Connection, answer: tuple[str, Any]) -> None:
     except (OSError, EnvironmentFault):
         raise
     except Exception as error:
-        connection.send(("failed", _describe(error)))
-
-
-def _describe(error: BaseException) -> UserError:
-    """The fault or the mistake of the user that an exception stands for."""
-    try:
-        return describe_failure(error)
-    except UserError as mistake:
-        return mistake
+        connection.send(("failed", describe_failure(error)))
 
 
 def _end_with_parent() -> None:

@@ -23,12 +23,10 @@ optional; each of them enables one feature:
 from __future__ import annotations
 
 import importlib
-from collections.abc import Iterable
 from typing import Any
 
 from latentplan.config import USER_DOMAIN, EnvConfig, UserError
-from latentplan.config.checks import nearest, shown
-from latentplan.config.suites import DEFAULT_SUITE, find_suite
+from latentplan.config.suites import DEFAULT_SUITE, check_task, find_suite
 
 
 def make_env(config: EnvConfig, seed: int | None = None) -> Any:
@@ -46,6 +44,7 @@ def make_env(config: EnvConfig, seed: int | None = None) -> Any:
             "this agent learned in an environment of your own, which a command cannot make: play it from Python, "
             "agent = load_agent(DIR)"
         )
+    check_task(config.suite, config.domain, config.task)
     module, name = find_suite(config.suite).factory.split(":")
     return getattr(importlib.import_module(module), name)(config, seed)
 
@@ -56,14 +55,4 @@ def default_task(domain: str, suite: str = DEFAULT_SUITE) -> str:
     Raises:
         UserError: The suite or the domain is unknown.
     """
-    tasks = find_suite(suite).tasks
-    if domain not in tasks:
-        raise UserError(describe_unknown_name("domain", domain, tasks))
-    return tasks[domain]
-
-
-def describe_unknown_name(kind: str, name: str, available: Iterable[str]) -> str:
-    """An error message for an unknown name, with all available names and the nearest name."""
-    choices = sorted(available)
-    similar = nearest(name, choices, cutoff=0.0)
-    return f"unknown {kind} {shown(name)}; available: {', '.join(choices)}. Did you mean {similar!r}?"
+    return check_task(suite, domain)[0]

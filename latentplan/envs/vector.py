@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import multiprocessing
-import signal
 import time
 import warnings
 from dataclasses import dataclass
-from functools import cached_property, partial
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import gymnasium
@@ -15,17 +13,14 @@ import numpy as np
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.wrappers import TimeLimit
 
-from latentplan.config import EnvConfig, derive_seed
+from latentplan.config import CollectionConfig, EnvConfig, derive_seed
 from latentplan.config.checks import EnvironmentFault
-from latentplan.envs.faults import check_picture, check_reward
 from latentplan.envs.process import CLOSING_SECONDS, Lane, LocalLane, ProcessLane
 from latentplan.envs.registry import make_env
 from latentplan.envs.user import make_from
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
-
-STEP_TIMEOUT_S = 60.0
 
 
 def make_vector_env(
@@ -36,7 +31,7 @@ def make_vector_env(
     episode_decisions: int | None = None,
     restarts: Restarts | None = None,
     isolate: bool = False,
-    step_timeout_s: float = STEP_TIMEOUT_S,
+    step_timeout_s: float = CollectionConfig.step_timeout_s,
 ) -> GuardedVectorEnv:
     """Several environments behind one `step`; two or more environments run in separate processes.
 
@@ -64,7 +59,7 @@ def make_vector_env(
     """
     lanes: list[Lane] = []
     for index in range(num_envs):
-        factory = EnvFactory(config, _derive_env_seed(seed, index), make_env, episode_decisions)
+        factory = _EnvFactory(config, _derive_env_seed(seed, index), make_env, episode_decisions)
         lanes.append(ProcessLane(factory, step_timeout_s) if isolate or num_envs > 1 else LocalLane(factory))
     return GuardedVectorEnv(lanes, restarts or Restarts(0))
 
@@ -74,7 +69,7 @@ def make_guarded_env(
     restarts: Restarts,
     make_env: Callable[[], gymnasium.Env[Any, Any]] | None = None,
     isolate: bool = False,
-    step_timeout_s: float = STEP_TIMEOUT_S,
+    step_timeout_s: float = CollectionConfig.step_timeout_s,
 ) -> GuardedEnv:
     """One environment that can be made anew after a fault, for evaluations.
 
@@ -85,7 +80,7 @@ def make_guarded_env(
         isolate: See `make_vector_env`.
         step_timeout_s: See `make_vector_env`.
     """
-    factory = EnvFactory(config, 0, make_env, None)
+    factory = _EnvFactory(config, 0, make_env, None)
     return GuardedEnv(ProcessLane(factory, step_timeout_s) if isolate else LocalLane(factory), restarts)
 
 
@@ -103,7 +98,7 @@ class Restarts:
         self.budget, self.count = budget, 0
 
     def spend(self, fault: EnvironmentFault) -> None:
-        """Allow one restart because of a fault.
+        """Allow one restart because of a fault, and warn of it.
 
         Raises:
             EnvironmentFault: The budget is spent; the fault has the origin of the one given.
@@ -112,6 +107,11 @@ class Restarts:
             often = f"after {self.count} restarts (collection.max_restarts {self.budget})"
             raise EnvironmentFault(f"{fault} {often}", fault.origin)
         self.count += 1
+        warnings.warn(
+            f"{fault}: its episode is cut short, and it is made anew ({self.count} of {self.budget} restarts)",
+            RuntimeWarning,
+            stacklevel=4,
+        )
 
 
 class GuardedVectorEnv(VectorEnv[np.ndarray, np.ndarray, Any]):
@@ -123,7 +123,6 @@ class GuardedVectorEnv(VectorEnv[np.ndarray, np.ndarray, Any]):
 
     Attributes:
         restarts: Counts how often environments were made anew.
-        facts: Attributes of the first environment; see `Lane.facts`.
 
     Args:
         lanes: The environments.
@@ -138,12 +137,12 @@ class GuardedVectorEnv(VectorEnv[np.ndarray, np.ndarray, Any]):
     def __init__(self, lanes: list[Lane], restarts: Restarts) -> None:
         self.lanes, self.restarts, self.num_envs = lanes, restarts, len(lanes)
         try:
-            self.facts = [lane.facts for lane in lanes][0]
+            facts = [lane.facts for lane in lanes][0]
         except BaseException:
             self.close_extras(timeout=0.0)
             raise
-        self.single_observation_space = self.facts["observation_space"]
-        self.single_action_space = self.facts["action_space"]
+        self.single_observation_space = facts["observation_space"]
+        self.single_action_space = facts["action_space"]
         self.observation_space = gymnasium.vector.utils.batch_space(self.single_observation_space, self.num_envs)
         self.action_space = gymnasium.vector.utils.batch_space(self.single_action_space, self.num_envs)
         shape = self.single_observation_space.shape or ()
@@ -196,8 +195,7 @@ class GuardedVectorEnv(VectorEnv[np.ndarray, np.ndarray, Any]):
         given_up: EnvironmentFault | None = None
         for index, lane in enumerate(self.lanes):  # every answer is taken, also after a fault of another environment
             try:
-                frame, reward, terminated[index], truncated[index], info = lane.answer()
-                rewards[index] = check_reward(reward)
+                frame, rewards[index], terminated[index], truncated[index], info = lane.answer()
                 self._keep(index, frame, info)
                 env_frames[index] = info["env_frames"]
             except EnvironmentFault as fault:
@@ -227,12 +225,11 @@ class GuardedVectorEnv(VectorEnv[np.ndarray, np.ndarray, Any]):
 
     def _restart(self, index: int, fault: EnvironmentFault) -> None:
         self.restarts.spend(fault)
-        _warn_of_restart(fault, self.restarts)
         self._is_renewed[index] = True
         self.lanes[index].restart()
 
     def _keep(self, index: int, frame: Any, info: dict[str, Any]) -> None:
-        self._frames[index] = check_picture(frame, self._frames.shape[1:])
+        self._frames[index] = frame
         self._labels[index] = info.get("labels")
 
     def _info(self, env_frames: np.ndarray, failed: np.ndarray) -> dict[str, Any]:
@@ -245,7 +242,7 @@ class GuardedVectorEnv(VectorEnv[np.ndarray, np.ndarray, Any]):
 class GuardedEnv(gymnasium.Env[np.ndarray, np.ndarray]):
     """One environment whose faults are raised as `EnvironmentFault`, and that is then made anew.
 
-    Spaces and metadata are known once `facts` was read.
+    The first look at its spaces, metadata or `facts` waits for the environment's process.
 
     Args:
         lane: The environment.
@@ -255,25 +252,40 @@ class GuardedEnv(gymnasium.Env[np.ndarray, np.ndarray]):
     def __init__(self, lane: Lane, restarts: Restarts) -> None:
         self._lane, self._restarts = lane, restarts
 
-    @cached_property
+    @property
     def facts(self) -> dict[str, Any]:
-        """Attributes of the environment; see `Lane.facts`. The first look waits for the environment's process."""
-        facts = self._lane.facts
-        self.metadata = facts["metadata"]
-        self.observation_space, self.action_space = facts["observation_space"], facts["action_space"]
-        if facts["can_render_large"]:
-            self.render_large = partial(self._call, "render_large")
-        return facts
+        """Attributes of the environment; see `Lane.facts`."""
+        return self._lane.facts
+
+    @property
+    def observation_space(self) -> Any:  # type: ignore[override]
+        """The environment's own."""
+        return self.facts["observation_space"]
+
+    @property
+    def action_space(self) -> Any:  # type: ignore[override]
+        """The environment's own."""
+        return self.facts["action_space"]
+
+    @property
+    def metadata(self) -> dict[str, Any]:  # type: ignore[override]
+        """The environment's own."""
+        return self.facts["metadata"]  # type: ignore[no-any-return]
+
+    @property
+    def render_large(self) -> Callable[[int], Any]:
+        """See the environment's own `render_large`, where it has one."""
+        if not self.facts["can_render_large"]:
+            raise AttributeError("the environment draws no larger pictures")
+        return partial(self._call, "render_large")
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         """See the environment's own `reset`."""
-        frame, info = self._call("reset", seed=seed, options=options)
-        return self._checked(frame), info
+        return self._call("reset", seed=seed, options=options)  # type: ignore[no-any-return]
 
     def step(self, action: np.ndarray) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         """See the environment's own `step`."""
-        frame, reward, terminated, truncated, info = self._call("step", action)
-        return self._checked(frame), self._guarded(check_reward, reward), terminated, truncated, info
+        return self._call("step", action)  # type: ignore[no-any-return]
 
     def render(self) -> Any:
         """See the environment's own `render`."""
@@ -284,26 +296,19 @@ class GuardedEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         self._lane.ask_to_close()
         self._lane.close()
 
-    def _checked(self, frame: Any) -> np.ndarray:
-        return self._guarded(partial(check_picture, shape=self.observation_space.shape or ()), frame)
-
     def _call(self, method: str, *arguments: Any, **named: Any) -> Any:
+        """The result of a method; after a fault the environment is made anew before the fault is raised."""
         self._lane.ask(method, *arguments, **named)
-        return self._guarded(lambda _: self._lane.answer(), None)
-
-    def _guarded(self, check: Callable[[Any], Any], value: Any) -> Any:
-        """The result of a check; after a fault the environment is made anew before the fault is raised."""
         try:
-            return check(value)
+            return self._lane.answer()
         except EnvironmentFault as fault:
             self._restarts.spend(fault)
-            _warn_of_restart(fault, self._restarts)
             self._lane.restart()
             raise
 
 
 @dataclass(frozen=True)
-class EnvFactory:
+class _EnvFactory:
     """Builds one environment in the process that calls it; picklable where the user's factory is."""
 
     config: EnvConfig
@@ -312,9 +317,6 @@ class EnvFactory:
     episode_decisions: int | None
 
     def __call__(self) -> gymnasium.Env[np.ndarray, np.ndarray]:
-        """The environment, which ignores Ctrl-C where it is in a process of its own."""
-        if multiprocessing.parent_process() is not None:
-            signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches all processes; the parent handles it
         build = make_env if self.factory is None else make_from(self.factory)
         env: gymnasium.Env[np.ndarray, np.ndarray] = build(self.config, self.seed)
         env = env if self.factory is None else _WithoutInfo(env)
@@ -335,11 +337,3 @@ class _WithoutInfo(gymnasium.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.ndar
 
 def _derive_env_seed(seed: int | None, index: int) -> int | None:
     return None if seed is None else int(np.random.SeedSequence([seed, index]).generate_state(1)[0])
-
-
-def _warn_of_restart(fault: EnvironmentFault, restarts: Restarts) -> None:
-    warnings.warn(
-        f"{fault}: its episode is cut short, and it is made anew ({restarts.count} of {restarts.budget} restarts)",
-        RuntimeWarning,
-        stacklevel=4,
-    )

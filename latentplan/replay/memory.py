@@ -7,13 +7,12 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from latentplan.config import UserError
+from latentplan.config.estimates import Part, check_parts
 
 if TYPE_CHECKING:
     import torch
 
 FRAME_BYTES = 64 * 64 * 3
-MEMORY_SHARE = 0.9
 MEMORY_FACTS = Path("/proc/meminfo")
 LIMIT_FACTS = Path("/sys/fs/cgroup")
 
@@ -21,6 +20,11 @@ LIMIT_FACTS = Path("/sys/fs/cgroup")
 def count_replay_bytes(num_rows: int, action_dim: int, deter_dim: int, num_labels: int = 0) -> int:
     """Memory that a replay of `num_rows` rows takes, in bytes."""
     return num_rows * (FRAME_BYTES + 2 * deter_dim + 4 * (action_dim + num_labels) + 4 + 4 + 8 + 1)
+
+
+def describe_replay(num_bytes: int) -> Part:
+    """A replay of a size as a part of what a run takes."""
+    return Part("the replay", num_bytes, 0.0, "--replay.capacity or --frames")
 
 
 def check_memory(num_bytes: int, device: torch.device) -> None:
@@ -39,11 +43,7 @@ def check_memory(num_bytes: int, device: torch.device) -> None:
         free = torch.cuda.mem_get_info(device)[0]
     else:
         free = free_memory()
-    if num_bytes > MEMORY_SHARE * free:
-        raise UserError(
-            f"the replay takes {num_bytes / 2**30:.1f} GiB but {device.type} has {free / 2**30:.1f} GiB free: "
-            "lower --replay.capacity or --frames"
-        )
+    check_parts([describe_replay(num_bytes)], free, device.type)
 
 
 def free_memory() -> int:

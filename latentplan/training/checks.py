@@ -25,8 +25,9 @@ def check_settings(config: Config) -> None:
     if config.run.run_dir is not None:
         check_folder(config.run.run_dir)
     env, learning = config.env, config.learning
-    if env.suite == DEFAULT_SUITE and env.domain != USER_DOMAIN:
+    if env.domain != USER_DOMAIN:
         check_task(env.suite, env.domain, env.task)
+    if env.suite == DEFAULT_SUITE and env.domain != USER_DOMAIN:
         known = scales(env.domain)
         if env.objective is not None:
             parse_reward(env.objective, known, "env.objective")

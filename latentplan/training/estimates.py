@@ -5,7 +5,7 @@ from __future__ import annotations
 from latentplan.config import Config
 from latentplan.config.estimates import Part, check_parts, estimate_model, estimate_search
 from latentplan.config.files import has_cuda
-from latentplan.replay.memory import FRAME_BYTES, count_replay_bytes, free_memory
+from latentplan.replay.memory import FRAME_BYTES, count_replay_bytes, describe_replay, free_memory
 
 UNKNOWN_LENGTH_CAPACITY = 200_000
 LEARNING_COPIES = 6  # weights, gradients, two moments, the average, the acting model
@@ -85,5 +85,4 @@ def _estimate_rounds(config: Config) -> Part:
 
 
 def _estimate_replay(config: Config) -> Part:
-    num_bytes = count_replay_bytes(count_replay_rows(config), 1, config.model.deter_dim)
-    return Part("the replay", num_bytes, 0.0, "--replay.capacity or --frames")
+    return describe_replay(count_replay_bytes(count_replay_rows(config), 1, config.model.deter_dim))

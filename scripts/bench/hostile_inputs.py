@@ -34,10 +34,10 @@ SETTINGS: dict[str, str | bytes] = {
     "new": f"env: !!python/object/new:os.system ['{TOUCH}']",
     "name": "env: !!python/name:os.system ''",
     "module": "env: !!python/module:os ''",
-    "tag": "env: !shell 'ls'",
+    "tag": f"env: !shell '{TOUCH}'",
     "binary": bytes(range(256)) * 4,
     "zeros": bytes(1000),
-    "pickle": b"cposix\nsystem\n(S'ls'\ntR.",
+    "pickle": f"cposix\nsystem\n(S'{TOUCH}'\ntR.".encode(),
     "utf16": "env: {domain: walker}".encode("utf-16"),
     "large": "# " + "x" * 2_000_000,
     "quote": 'env: {domain: "walker}',
@@ -57,7 +57,7 @@ SETTINGS: dict[str, str | bytes] = {
     "domain-list": "env: {domain: [walker]}",
     "domain-path": "env: {domain: ../../../etc/passwd}",
     "task-path": "env: {domain: walker, task: ../../walk}",
-    "suite-code": "env: {suite: 'os:system', domain: 'ls'}",
+    "suite-code": f"env: {{suite: 'os:system', domain: '{TOUCH}'}}",
     "digits": f"run: {{frames: {DIGITS}}}",
     "hexadecimal": f"run: {{frames: 0x{'f' * 100_000}}}",
     "octal": f"run: {{seed: 0{'7' * 100_000}}}",
@@ -72,7 +72,7 @@ SETTINGS: dict[str, str | bytes] = {
     "null-byte": 'env: {domain: walker, task: "wa\\0lk"}',
     "base64": "env: {domain: !!binary aGVsbG8=}",
     "channels": f"model: {{encoder_channels: [{', '.join(['8'] * 10_000)}]}}",
-    "goals": 'collection: {goals: [\'__import__("os").system("ls")\'], goal_share: 0.5}',
+    "goals": f'collection: {{goals: [\'__import__("os").system("{TOUCH}")\'], goal_share: 0.5}}',
 }
 PLANNER = {
     "num_samples": ("1e9", "1e10", "1e17", "1e18", "-1", "nan", "0x10", DIGITS),
@@ -106,8 +106,8 @@ FLAGS = {
     "--frames": ("1e15", "-1", "0", "many", LONG),
     "--minutes": ("inf", "-1", "0"),
     "--seed": ("-1", DIGITS),
-    "--domain": ("wlaker", LONG, "$(ls)", "\x1b[31mred\x1b[0m", "a\nb", "{0.__class__}", "%s%n"),
-    "--task": ("fly", LONG, "../walk", "`ls`"),
+    "--domain": ("wlaker", LONG, f"$({TOUCH})", "\x1b[31mred\x1b[0m", "a\nb", "{0.__class__}", "%s%n"),
+    "--task": ("fly", LONG, "../walk", f"`{TOUCH}`"),
     "--device": ("cuda:99", "meta"),
     "--preset": ("../gpu",),
     "--threads": ("1e9",),
@@ -233,8 +233,7 @@ def write_files(folder: Path, agent: Path) -> None:
     (folder / "pipe-link").symlink_to(folder / "pipe")
     (folder / "loop").symlink_to(folder / "loop")
     for name, content in SETTINGS.items():
-        text = content if isinstance(content, bytes) else content.replace("{folder}", str(folder)).encode()
-        (folder / f"{name}.yaml").write_bytes(text)
+        (folder / f"{name}.yaml").write_bytes(_filled(content, folder))
     info = json.loads((agent / "info.json").read_text())
     infos: dict[str, str | bytes] = {
         "info-brackets": "[" * 100_000,
@@ -256,7 +255,8 @@ def write_files(folder: Path, agent: Path) -> None:
     }
     for name in CHECKPOINTS:
         if name not in ("nothing", "file") and not name.startswith("/"):
-            _damage(folder / name, agent, infos.get(name), weights.get(name))
+            given = _filled(weights[name], folder) if name in weights else None
+            _damage(folder / name, agent, infos.get(name), given)
 
 
 def _damage(copy: Path, agent: Path, info: str | bytes | None, weights: bytes | None) -> None:
@@ -270,6 +270,12 @@ def _damage(copy: Path, agent: Path, info: str | bytes | None, weights: bytes | 
         if copy.name == part:
             path.unlink()
             os.mkfifo(path)
+
+
+def _filled(content: str | bytes, folder: Path) -> bytes:
+    """The content of a file, with the folder in the place of `{folder}`."""
+    content = content if isinstance(content, bytes) else content.encode()
+    return content.replace(b"{folder}", os.fsencode(folder))
 
 
 def _changed(info: dict[str, Any], section: str, **values: Any) -> dict[str, Any]:

@@ -17,7 +17,7 @@ from bench.ablation_arms import check_checkpoint
 from bench.report import format_interval, format_number, format_table, write_json
 from bench.workers import run_in_order
 from latentplan.commands.flags import overrides
-from latentplan.commands.shell import ComputeRequest, search_settings
+from latentplan.commands.shell import ComputeRequest, check_search, search_settings
 from latentplan.config import EnvConfig, PlannerConfig, UserError, to_dict
 from latentplan.config.checks import above_zero, at_least
 from latentplan.config.parsing import option, raise_unknown
@@ -118,6 +118,8 @@ def run(request: Request) -> int:
         if domain != info["domain"]:
             raise UserError(f"--trained {trained_for!r} controls {domain}, --checkpoint {info['domain']}")
     planner = search_settings(trained, request.planner)
+    if request.planner:
+        check_search(planner, trained.model)
     changes = {name: getattr(planner, name) for name in request.planner}
     device = request.use_device()
     from latentplan.evaluation.episodes import episode_seed

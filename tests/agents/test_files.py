@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 
+from latentplan.agents import files
 from latentplan.agents.checkpoint import load_model, read_info, save_checkpoint, seal_checkpoint
 from latentplan.agents.files import read_files, write_files
 from latentplan.config import UserError
@@ -98,6 +99,28 @@ def test_load_model_notices_every_flipped_bit(agent, tmp_path, monkeypatch):
             assert "\n" not in str(caught.value)
         path.write_bytes(content)
     load_model(folder)
+
+
+@pytest.mark.parametrize("is_sealed", [True, False])
+@pytest.mark.parametrize("name", ["info.json", "weights.safetensors"])
+def test_files_are_read_up_to_a_size_only(agent, tmp_path, name, is_sealed, monkeypatch):
+    monkeypatch.setattr("latentplan.agents.files.PAUSE_SECONDS", 0.0)
+    folder = shutil.copytree(agent, tmp_path / "agent")
+    if not is_sealed:
+        unseal(folder)
+    size = (folder / name).stat().st_size
+    monkeypatch.setitem(files.LARGEST, name, size)
+    load_model(folder)
+    monkeypatch.setitem(files.LARGEST, name, size - 1)
+    assert_refused(lambda: load_model(folder), name, f"more than {size - 1:,} bytes")
+
+
+def test_files_of_a_checkpoint_are_regular_files(agent, tmp_path, monkeypatch):
+    monkeypatch.setattr("latentplan.agents.files.PAUSE_SECONDS", 0.0)
+    folder = tmp_path / "folder"
+    folder.mkdir()
+    os.mkfifo(folder / "pipe")
+    assert_refused(lambda: read_files(folder, ("pipe",)), "pipe", "not a regular file")
 
 
 def test_load_model_says_what_to_do_after_a_deliberate_change(agent, tmp_path):

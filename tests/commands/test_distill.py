@@ -39,7 +39,7 @@ def test_distill_refuses_settings_of_another_version(checkpoint, tmp_path, asser
     [
         ((), ("--checkpoint",)),
         (("--checkpoint", "{checkpoint}", "--rouns", "3"), ("--rouns", "--rounds")),
-        (("--checkpoint", "{checkpoint}", "--rounds", "0"), ("--rounds", "at least 1")),
+        (("--checkpoint", "{checkpoint}", "--rounds", "0"), ("--rounds must be in [1, 1000000], got 0",)),
         (("--checkpoint", "{checkpoint}", "--rounds", "1.5"), ("--rounds", "whole number", "'1.5'")),
         (("--checkpoint", "{checkpoint}", "--minutes", "nan"), ("--minutes", "number", "'nan'")),
         (("--checkpoint", "{checkpoint}", "--minutes", "-1"), ("--minutes", "above 0")),

@@ -98,7 +98,7 @@ def test_evaluate_agent_repeats_with_the_same_seed():
         (("--device", "cud"), ("'cud'", "'cuda'")),
         (("--planner.horizn", "3"), ("--planner.horizn", "--planner.horizon")),
         (("--episods", "3"), ("--episods", "--episodes")),
-        (("--episodes", "0"), ("--episodes", "at least 1", "got 0")),
+        (("--episodes", "0"), ("--episodes must be in [1, 1000000], got 0",)),
         (("--episodes", "ten"), ("--episodes", "whole number", "'ten'")),
         (("--seed", "-1"), ("--seed", "at least 0")),
         (("--planner.deadline_ms", "0"), ("planner.deadline_ms", "above 0")),

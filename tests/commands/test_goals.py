@@ -9,7 +9,7 @@ import pytest
         ((), ("--checkpoint",)),
         (("--checkpoint", "nothing"), ("nothing",)),
         (("--checkpoint", "nothing", "--updats", "3"), ("--updats", "--updates")),
-        (("--checkpoint", "nothing", "--updates", "0"), ("--updates", "at least 1")),
+        (("--checkpoint", "nothing", "--updates", "0"), ("--updates must be in [1, 1000000000], got 0",)),
         (("--checkpoint", "nothing", "--updates", "1.5"), ("--updates", "whole number", "'1.5'")),
         (("--checkpoint", "nothing", "--minutes", "nan"), ("--minutes", "number", "'nan'")),
         (("--checkpoint", "nothing", "--minutes", "-1"), ("--minutes", "above 0")),

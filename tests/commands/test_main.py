@@ -87,7 +87,7 @@ def test_package_runs_as_a_module_under_the_name_of_the_program(run_python):
     assert result.stdout.startswith("usage: latentplan export --checkpoint DIR --out FILE [--name value ...]")
 
 
-def test_print_config_prints_the_resolved_settings_and_does_nothing_else(capsys, tmp_path, monkeypatch):
+def test_print_config_prints_the_resolved_settings_and_does_nothing_else(checkpoint, capsys, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     assert main(["train", "--domain", "cartpole", "--planner.horizon", "3", "--preset", "cpu", "--print-config"]) == 0
     printed = yaml.safe_load(capsys.readouterr().out)
@@ -96,6 +96,10 @@ def test_print_config_prints_the_resolved_settings_and_does_nothing_else(capsys,
     printed = yaml.safe_load(capsys.readouterr().out)
     assert (printed["resume"], printed["settings"]["rounds"]) == ("x", 3)
     assert printed["settings"]["updates"] == DistillConfig().updates
+    for command in ("eval", "distill"):  # settings that this machine cannot serve can still be printed
+        words = [command, "--checkpoint", str(checkpoint), "--planner.num_samples", "1e12", "--print-config"]
+        assert main(words) == 0
+        assert yaml.safe_load(capsys.readouterr().out)["planner"]["num_samples"] == 10**12
     assert list(tmp_path.iterdir()) == []
 
 

@@ -26,7 +26,7 @@ LOWER = "lower the sizes that were asked for, or end other programs"
             2,
             "error: the gradient is not finite at update 1\n",
         ),
-        (OSError(errno.ENAMETOOLONG, "too long", "a" * 300), 2, f"error: a file name is too long: {'a' * 80}...\n"),
+        (OSError(errno.ENAMETOOLONG, "too long", "a" * 300), 2, f"{REFUSED}: '{'a' * 59}...: too long\n"),
         (OSError(errno.ENOSPC, "No space left", "runs/a"), 2, f"{REFUSED}: 'runs/a': No space left\n"),
         (MemoryError(), 2, f"error: not enough memory: {LOWER}\n"),
         (RuntimeError("[enforce fail] DefaultCPUAllocator: can't allocate memory"), 2, f"{ALLOCATOR}: {LOWER}\n"),

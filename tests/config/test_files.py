@@ -200,8 +200,14 @@ def test_tasks_are_those_of_the_suite(run_python):
     result = run_python("-c", f"import os; os.environ['MUJOCO_GL'] = 'disable'; {code}")
     known = ast.literal_eval(result.stdout)
     assert {domain: sorted(tasks) for domain, tasks in known.items()} == {
-        domain: sorted(tasks) for domain, tasks in SUITES[DEFAULT_SUITE].names.items()
+        domain: sorted(tasks) for domain, tasks in SUITES[DEFAULT_SUITE].tasks.items()
     }
+
+
+def test_usual_task_of_a_domain_comes_first():
+    usual = {domain: tasks[0] for domain, tasks in SUITES[DEFAULT_SUITE].tasks.items()}
+    domains = ("walker", "cartpole", "hopper", "humanoid", "dog", "fish", "humanoid_CMU")
+    assert [usual[domain] for domain in domains] == ["walk", "swingup", "hop", "walk", "walk", "swim", "run"]
 
 
 def test_domains_are_those_of_the_suite(run_python):

@@ -46,3 +46,8 @@ def test_planner_config_checks_num_elites_only_if_the_method_uses_the_value():
     for settings in ({"num_samples": 8}, {"method": "mppi", "num_samples": 8, "num_elites": 9}):
         with pytest.raises(ValueError, match="num_elites .* must not exceed num_samples"):
             PlannerConfig(num_policy_samples=4, **settings)
+
+
+def test_error_names_the_word_null_as_settings_spell_it():
+    with pytest.raises(ValueError, match="^action_spline must be one of null, zero, linear, cubic, got 'wave'$"):
+        PlannerConfig(action_spline="wave")

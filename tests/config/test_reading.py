@@ -7,7 +7,7 @@ import pytest
 
 from latentplan.config import EnvironmentFault, UserError
 from latentplan.config.checks import cut, nearest, shown
-from latentplan.config.reading import DEEPEST, is_shallow, parse_json, read_text, read_yaml
+from latentplan.config.reading import DEEPEST, is_shallow, parse_json, read_bytes, read_text, read_yaml
 
 
 def test_read_text_follows_links_to_regular_files_up_to_a_size(tmp_path):
@@ -16,6 +16,11 @@ def test_read_text_follows_links_to_regular_files_up_to_a_size(tmp_path):
     assert read_text(tmp_path / "link", largest=20) == "é" * 10
     with pytest.raises(UserError, match="more than 19 bytes"):
         read_text(tmp_path / "file", largest=19)
+
+
+def test_read_bytes_allocates_what_a_file_holds_not_what_it_may_hold(tmp_path):
+    (tmp_path / "file").write_bytes(bytes(range(256)) * 10_000)
+    assert read_bytes(tmp_path / "file", largest=2**60) == bytes(range(256)) * 10_000
 
 
 @pytest.mark.parametrize(
@@ -58,16 +63,21 @@ def test_deep_texts_are_noticed_without_recursion(text):
         parse_json(text, "file")
 
 
-@pytest.mark.parametrize("text", ["[1, 2]", "a: b: c", "'", "\0", "*alias"])
-def test_short_texts_are_shallow_or_no_yaml(text):
-    assert is_shallow(text) or "alias" in text
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [("[1, 2]", True), ("a: b: c", True), ("'", True), ("\0", True), ("*alias", False), ("a: &a 1\nb: *a", False)],
+)
+def test_short_texts_are_shallow_or_no_yaml_unless_they_have_aliases(text, expected):
+    assert is_shallow(text) == expected
 
 
 def test_cut_shortens_long_words_and_long_messages():
     assert cut("as it is") == "as it is"
     words = cut(f"cannot read {'a' * 5000}: no such file")
     assert words.startswith("cannot read aaa") and words.endswith("aaa: no such file") and len(words) < 240
-    assert len(cut("a b " * 10**6)) <= 200 and len(str(UserError("x" * 10**6))) <= 200
+    assert cut("a b " * 250) == "a b " * 250  # a text of 1,000 characters with spaces stays
+    assert len(cut("a b " * 250 + "a")) <= 200 and len(cut("a b " * 10**6)) <= 200
+    assert len(str(UserError("x" * 10**6))) <= 200
 
 
 VALUES = {

@@ -94,3 +94,39 @@ FAULTS = {
     "rewards": with_reward(np.ones(3)),
 }
 CRASHES = ("exit", "sys.exit", "hang")  # only noticed in a process of its own
+
+
+class OfSuite(Faulty):
+    """The same as a suite's factory makes it, with nothing between it and the trainer; `kind` is a name in `RETURNS`.
+
+    A kind in `RESETS` fails at the second reset instead.
+    """
+
+    def reset(self, *, seed=None, options=None):
+        picture, _ = super().reset(seed=seed)
+        result = picture, {"env_frames": 0}
+        self.resets = getattr(self, "resets", 0) + 1
+        return RESETS[self.kind](result) if self.kind in RESETS and self.resets == 2 and self.is_due() else result
+
+    def step(self, action):
+        self.steps += 1
+        result = self.picture(), 1.0, False, self.steps == 10, {"env_frames": 1}
+        return RETURNS[self.kind](result) if self.kind in RETURNS and self.steps == 3 and self.is_due() else result
+
+
+RETURNS = {
+    **{kind: FAULTS[kind] for kind in ("exception", "nothing", "no frame", "float frame", "nan reward", "no reward")},
+    "four values": lambda result: result[:4],
+    "old style": lambda result: (*result[:2], result[2], result[4]),
+    "number": lambda result: 3,
+    "no info": lambda result: (*result[:4], None),
+    "info without frames": lambda result: (*result[:4], {}),
+    "frames of text": lambda result: (*result[:4], {"env_frames": "many"}),
+    "several ends": lambda result: (*result[:2], np.zeros(2, bool), *result[3:]),
+}
+RESETS = {
+    "reset of nothing": lambda result: None,
+    "reset without info": lambda result: result[0],
+    "reset of text": lambda result: ("a picture", result[1]),
+    "reset with wrong info": lambda result: (result[0], 3),
+}

@@ -22,18 +22,19 @@ from latentplan.config import (
 )
 from latentplan.config.files import compose
 from latentplan.config.suites import SUITES, Suite
-from latentplan.envs import default_task, make_env
+from latentplan.envs import default_task, make_env, registry
 from latentplan.evaluation.clock import Latency, VirtualClock
 from latentplan.evaluation.goals import read_goals, score_env
 from latentplan.evaluation.timed import iterate_timed_episodes
 from latentplan.training import train
+from latentplan.training.checks import check_settings
 
 LAMP = EnvConfig(suite="lamps", domain="lamp", action_repeat=2)
 
 
 @pytest.fixture(autouse=True)
 def lamps(monkeypatch):
-    monkeypatch.setitem(SUITES, "lamps", Suite("tests.envs.lamp_suite:make", {"lamp": "bright"}))
+    monkeypatch.setitem(SUITES, "lamps", Suite("tests.envs.lamp_suite:make", {"lamp": ("bright",)}))
 
 
 def test_make_env_calls_the_factory_of_the_suite():
@@ -58,6 +59,27 @@ def test_make_env_calls_the_factory_of_the_suite():
 def test_compose_refuses_unknown_suites_and_domains(config, message):
     with pytest.raises(UserError, match=message):
         compose({"env": config}, {}, "cpu")
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"task": "dark"}, "unknown task of lamp 'dark'; available: bright. Did you mean 'bright'"),
+        ({"task": ["bright"]}, r"unknown task of lamp \['bright'\]"),
+        ({"domain": "lam"}, "unknown domain 'lam'; available: lamp. Did you mean 'lamp'"),
+        ({"domain": ["lamp"]}, r"unknown domain \['lamp'\]"),
+    ],
+)
+def test_make_env_refuses_unknown_names_before_the_factory_is_imported(changes, words, monkeypatch):
+    monkeypatch.setattr(registry, "importlib", None)
+    with pytest.raises(UserError, match=words):
+        make_env(replace(LAMP, **changes))
+
+
+@pytest.mark.parametrize("changes", [{"task": "dark"}, {"domain": "lam"}])
+def test_check_settings_refuses_unknown_names_of_every_suite(changes):
+    with pytest.raises(UserError, match="unknown"):
+        check_settings(replace(Config(), env=replace(LAMP, **changes)))
 
 
 def test_optional_features_are_refused_when_the_environment_lacks_them():

@@ -144,7 +144,7 @@ def test_draw_takes_an_episode_of_exactly_the_sequence_length():
 def test_replay_refuses_more_than_nine_tenths_of_the_free_memory(monkeypatch):
     monkeypatch.setattr(memory, "free_memory", lambda: count_replay_bytes(100, 1, 2, 2))
     make_replay(capacity=90)
-    with pytest.raises(UserError, match=r"lower --replay\.capacity"):
+    with pytest.raises(UserError, match=r"^the replay takes about .* but cpu has .* free: lower --replay\.capacity"):
         make_replay(capacity=91)
 
 

@@ -1,7 +1,9 @@
 """The audit fails for a known vulnerability alone, and says where nothing could be checked."""
 
+import importlib.util
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 
@@ -31,6 +33,23 @@ def test_describe_says_how_many_packages_the_index_does_not_know(audit):
     report = {"dependencies": [{"name": "a", "skip_reason": "not found"}, {"name": "b", "version": "1", "vulns": []}]}
     lines, code = audit.describe(report)
     assert code == 0 and lines[0] == "audit: 1 of 2 packages not checked, because the index does not know them"
+
+
+def test_describe_leaves_out_the_editable_install_of_the_project_itself(audit):
+    own = {"name": "latentplan", "skip_reason": audit.EDITABLE}
+    lines, code = audit.describe({"dependencies": [own, {"name": "b", "version": "1", "vulns": []}]})
+    assert code == 0 and lines == ["audit: 1 packages checked, 0 with a known vulnerability"]
+
+
+def test_describe_names_the_editable_install_as_pip_audit_does(audit):
+    source = importlib.util.find_spec("pip_audit._dependency_source.pip")
+    assert f'"{audit.EDITABLE}"' in Path(source.origin).read_text()
+
+
+def test_main_fails_where_pip_audit_is_missing(audit, monkeypatch, capsys):
+    monkeypatch.setattr(audit.importlib.util, "find_spec", lambda name: None)
+    assert audit.main() == 1
+    assert capsys.readouterr().out == "audit: not done, because pip-audit is not installed: pip install pip-audit\n"
 
 
 @pytest.mark.parametrize(
