@@ -21,12 +21,12 @@ class Suite:
     Attributes:
         factory: The callable that makes an environment, as "module:name"; the module is imported at the first use.
         tasks: The tasks of each domain of the suite, the usual one first; an unknown task is refused before a simulator
-            is imported. No two suites share the name of a domain: files of settings (`configs/<domain>.yaml`) and named
+            is imported. A text alone is the usual task, and leaves other names to the factory. No two suites share the name of a domain: files of settings (`configs/<domain>.yaml`) and named
             quantities are found by it.
     """
 
     factory: str
-    tasks: Mapping[str, tuple[str, ...]]
+    tasks: Mapping[str, tuple[str, ...] | str]
 
 
 SUITES: dict[str, Suite] = {
@@ -83,6 +83,8 @@ def check_task(suite: str, domain: str, task: object = None) -> tuple[str, ...]:
     if domain not in tuple(domains):  # settings that are made in Python may hold a value that is no text
         raise UserError(_describe_unknown("domain", domain, domains))
     tasks = domains[domain]
+    if isinstance(tasks, str):
+        return (tasks,)
     if task is not None and task not in tasks:
         raise UserError(_describe_unknown(f"task of {domain}", task, tasks))
     return tasks

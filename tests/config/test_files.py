@@ -17,7 +17,7 @@ from latentplan.config.files import (
     read_config,
     read_layer,
 )
-from latentplan.config.suites import DEFAULT_SUITE, SUITES
+from latentplan.config.suites import DEFAULT_SUITE, SUITES, Suite, check_task
 
 CONFIG_FILES = sorted(path.stem for path in config_folder().glob("*.yaml"))
 TASKS = {
@@ -214,3 +214,8 @@ def test_domains_are_those_of_the_suite(run_python):
     code = "from dm_control import suite; print(*sorted(suite._DOMAINS))"
     result = run_python("-c", f"import os; os.environ['MUJOCO_GL'] = 'disable'; {code}")
     assert result.stdout.split() == sorted(files.DOMAINS), result.stderr
+
+
+def test_suite_with_a_usual_task_alone_leaves_other_tasks_to_its_factory(monkeypatch):
+    monkeypatch.setitem(SUITES, "lamps", Suite("nowhere:Lamp", {"lamp": "bright"}))
+    assert check_task("lamps", "lamp") == check_task("lamps", "lamp", "dim") == ("bright",)
