@@ -21,8 +21,8 @@ class Suite:
     Attributes:
         factory: The callable that makes an environment, as "module:name"; the module is imported at the first use.
         tasks: The tasks of each domain of the suite, the usual one first; an unknown task is refused before a simulator
-            is imported. A text alone is the usual task, and leaves other names to the factory. No two suites share the name of a domain: files of settings (`configs/<domain>.yaml`) and named
-            quantities are found by it.
+            is imported. A text alone is the usual task, and leaves other names to the factory. No two suites share the
+            name of a domain: files of settings (`configs/<domain>.yaml`) and named quantities are found by it.
     """
 
     factory: str
