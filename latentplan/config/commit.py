@@ -245,11 +245,11 @@ class Log:
                     rest, row = rest[count * self.row_bytes :], row + count
             sync(self.folder / LOGS)
         except BaseException:
+            touched = list(self._extents)
             self._extents, self._hasher = before, None
-            for path in (self.folder / LOGS).glob(f"{self.name}-*"):  # a full disk needs the room
-                extent = before.get(int(path.name.rpartition("-")[2]))
+            for first in touched:  # a full disk needs the room; other files may belong to the save before
                 with contextlib.suppress(OSError):
-                    os.truncate(path, extent.bytes if extent else 0)
+                    os.truncate(self.path(first), before[first].bytes if first in before else 0)
             raise
 
     def drop_before(self, row: int) -> None:

@@ -201,6 +201,26 @@ def test_commit_that_fails_leaves_nothing(folder):
     assert sorted(folder.rglob("*")) == before
 
 
+def test_append_that_fails_keeps_dropped_files_that_the_save_before_names(folder, monkeypatch):
+    diary, before = Diary(folder), {path: path.read_bytes() for path in (folder / "logs").iterdir()}
+    diary.log.drop_before(4)
+    calls = iter(range(10**6))
+
+    def fill_up(descriptor):
+        if next(calls) == 2:
+            raise OSError(28, "No space left on device")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "fsync", fill_up)
+        with pytest.raises(OSError, match="No space left"):
+            diary.log.append(5, iter([bytes([row]) * ROW for row in range(5, 9)]))
+    left = {path: path.read_bytes() for path in (folder / "logs").iterdir() if path.stat().st_size}
+    assert len(before) == 2 and left == before  # and the rows of the append are gone
+    assert Diary(folder).problems == [] and Diary(folder).rows() == list(range(5))
+    shutil.rmtree(folder / "save-000005")
+    assert Diary(folder).count == 4 and Diary(folder).rows() == list(range(4))
+
+
 def test_find_returns_the_newest_whole_copy_of_a_file(folder):
     saves = Saves(folder, "diary", 1)
     assert saves.find("count").read_text() == "5"
