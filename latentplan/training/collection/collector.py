@@ -177,6 +177,9 @@ class Collector:
 
         Returns:
             The round; where the environments fail too often, its beginning and the fault.
+
+        Raises:
+            EnvironmentFault: The environments failed too often before the first decision of the round.
         """
         agent = self._random if weights is None else self._agents[behaviour if goal is None else "goal"]
         if weights is not None:
@@ -198,6 +201,8 @@ class Collector:
                 self._step(agent, log)
                 taken += 1
         except EnvironmentFault as error:
+            if taken == 0:
+                raise
             fault = error
         decisions, memory = taken * len(self._has_ended), self._copy_memory()
         return Collected(log.rows(), log.env_frames, decisions, log.returns, memory, self.restarts.count, fault)

@@ -60,6 +60,33 @@ def test_round_that_fails_too_often_returns_what_it_collected(collect):
     assert "the lamp is out after 1 restarts (collection.max_restarts 1)" in str(collected.fault)
 
 
+class Late(Faulty):
+    """Fails from its first step or reset on, but not at the reset with seed 0, with which a run times the pictures."""
+
+    def reset(self, *, seed=None, options=None):
+        if self.kind == "reset" and seed == 0:
+            self.steps, self.start = 0, 0
+            return self.picture(), {}
+        return super().reset(seed=seed, options=options)
+
+    def step(self, action):
+        if self.kind != "reset" and self.is_due():
+            raise ZeroDivisionError("no step")
+        return super().step(action)
+
+
+@pytest.mark.parametrize(("kind", "overlap"), [("reset", False), ("reset", True), ("step", False)])
+def test_run_that_fails_before_its_first_decision_says_why_and_can_be_resumed(kind, overlap, tiny, dot, tmp_path):
+    config = tiny(tmp_path / "run", collection={"max_restarts": 0 if kind == "step" else 1, "overlap": overlap})
+    (tmp_path / "faults").mkdir()
+    with pytest.raises(EnvironmentFault, match=r"no (start|step) after \d restarts .*; the run is saved in") as fault:
+        train(config, partial(Late, kind, tmp_path / "faults", 99))
+    assert fault.value.origin.splitlines()[-1].startswith("ZeroDivisionError: no ")
+    saved = read_state(tmp_path / "run")
+    assert saved["run"]["rounds"] == 0 and saved["requests"]["collect"]["counter"] == 0  # asked for again
+    assert resume(tmp_path / "run", make_env=dot).exit_code == 0
+
+
 def test_evaluation_plays_an_episode_again_when_its_environment_fails(collect, tiny, tmp_path):
     collector, _ = collect("never", times=0)
     expected = collector.evaluate(2)
