@@ -204,6 +204,7 @@ class Collector:
             if taken == 0:
                 raise
             fault = error
+            self._has_ended[:] = True  # the last decision has no result, so no episode can go on
         decisions, memory = taken * len(self._has_ended), self._copy_memory()
         return Collected(log.rows(), log.env_frames, decisions, log.returns, memory, self.restarts.count, fault)
 

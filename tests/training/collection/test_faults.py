@@ -87,6 +87,19 @@ def test_run_that_fails_before_its_first_decision_says_why_and_can_be_resumed(ki
     assert resume(tmp_path / "run", make_env=dot).exit_code == 0
 
 
+def test_round_that_fails_too_often_ends_its_episodes(tiny, faulty, recwarn):
+    collector = Collector(tiny("", collection={"max_restarts": 0}), faulty("exception", times=1), "cpu")
+    weights = {name: value.numpy().copy() for name, value in collector.model.state_dict().items()}
+    collected = collector.collect(weights, "actor", 20, 0)
+    assert collected.fault is not None and collected.memory["has_ended"].all()
+    other = Collector(tiny(""), faulty("never", times=0), "cpu")
+    other.restore(collected.memory)
+    (rows,) = other.collect(weights, "actor", 5, 1).rows
+    collector.close(), other.close()
+    assert rows.is_first.tolist() == [True, *[False] * 4] and (rows.deter[0] == 0.0).all()
+    assert not [warning for warning in recwarn if "did not repeat" in str(warning.message)]
+
+
 def test_evaluation_plays_an_episode_again_when_its_environment_fails(collect, tiny, tmp_path):
     collector, _ = collect("never", times=0)
     expected = collector.evaluate(2)
