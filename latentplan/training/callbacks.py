@@ -54,7 +54,6 @@ class Collect(lightning.Callback):
         memory: State of the collector after the last round that was stored.
         is_epoch_over: Whether the epoch that ended last was complete.
         evaluated_weights: Weights that the latest evaluation measured.
-        env_restarts: Environments that were made anew after a fault, since the run was started or resumed.
     """
 
     def __init__(
@@ -71,7 +70,6 @@ class Collect(lightning.Callback):
         self.requests: dict[str, Any] = requests or {"collect": None, "evaluate": None, "weights": None}
         self.memory = memory
         self.is_epoch_over = False
-        self.env_restarts = 0
         self.evaluated_weights: dict[str, np.ndarray] = {}
         self._is_continued = requests is not None
 
@@ -100,6 +98,11 @@ class Collect(lightning.Callback):
         if state.in_epoch and (is_complete or not state.interrupted):
             state.learned_rounds, state.in_epoch, state.epoch_updates = state.rounds, False, 0
             self.is_epoch_over = True
+
+    @property
+    def env_restarts(self) -> int:
+        """Environments that were made anew after a fault, over the run until its last round that was stored."""
+        return 0 if self.memory is None else int(self.memory["restarts"])
 
     def has_requests(self) -> bool:
         """Whether the worker was asked for something and has not answered."""
@@ -252,7 +255,7 @@ class Collect(lightning.Callback):
         self.state.decisions += collected.decisions
         self.state.rounds += 1
         self.state.episode_returns.extend(collected.episode_returns)
-        self.memory, self.env_restarts = collected.memory, collected.restarts
+        self.memory = collected.memory
         return collected.fault
 
 

@@ -51,7 +51,6 @@ class Collected:
         decisions: Actions chosen in this round, over all environments.
         episode_returns: Returns of the episodes that ended in this round.
         memory: State of the collector after this round, from which `Collector.restore` continues.
-        restarts: Environments that were made anew after a fault so far, over all rounds and evaluations.
         fault: The fault after which no restart was left, and which ended the round early; None in a whole round.
     """
 
@@ -60,7 +59,6 @@ class Collected:
     decisions: int
     episode_returns: list[float]
     memory: dict[str, Any] | None
-    restarts: int = 0
     fault: EnvironmentFault | None = None
 
 
@@ -206,7 +204,7 @@ class Collector:
             fault = error
             self._has_ended[:] = True  # the last decision has no result, so no episode can go on
         decisions, memory = taken * len(self._has_ended), self._copy_memory()
-        return Collected(log.rows(), log.env_frames, decisions, log.returns, memory, self.restarts.count, fault)
+        return Collected(log.rows(), log.env_frames, decisions, log.returns, memory, fault)
 
     def restore(self, memory: dict[str, Any]) -> None:
         """Continues after a round of another collector: plays its running episodes again, action by action.
@@ -217,6 +215,7 @@ class Collector:
             memory: `Collected.memory` of that round.
         """
         memory = to_tensors(memory)
+        self.restarts.count = memory["restarts"]
         frames, labels, is_same = self._episodes.replay(memory["episodes"])
         self._frames, self._returns = frames, memory["returns"].numpy().copy()
         if self.labels:
@@ -240,6 +239,7 @@ class Collector:
             "episodes": self._episodes.memory(self._frames, self._has_ended),
             "returns": self._returns.copy(),
             "has_ended": self._has_ended.copy(),
+            "restarts": self.restarts.count,
         }
         return to_arrays(memory)  # type: ignore[no-any-return]
 

@@ -50,7 +50,7 @@ def test_replay_holds_no_transition_of_a_step_that_failed(collect):
     assert rows.rewards.tolist() == [1, 1, 0, *[1] * 10, 0, *[1] * 7]
     assert rows.actions[[2, 13]].tolist() == [[0.0], [0.0]] and (rows.continues == 1.0).all()
     assert np.isfinite(rows.rewards).all() and np.isfinite(rows.actions).all()
-    assert (collected.restarts, collected.fault, collected.env_frames) == (1, None, 19)
+    assert (collected.memory["restarts"], collected.fault, collected.env_frames) == (1, None, 19)
     assert collected.episode_returns == [10.0]  # the episode that was cut short does not count
 
 
@@ -123,6 +123,19 @@ def test_run_goes_on_after_faults_and_counts_them_in_its_metrics(kind, tiny, fau
     assert read_metrics(result.run_dir)[-1]["env_restarts"] == "3"
     state = torch.load(list_saves(result.run_dir)[-1] / "rows.pt", weights_only=True)
     assert torch.isfinite(state["rewards"]).all()
+
+
+def test_restarts_count_over_the_life_of_a_run(collect, tiny, faulty, dot, tmp_path):
+    _, collected = collect("exception", times=1, max_restarts=1)
+    assert collected.memory["restarts"] == 1
+    other = Collector(tiny("", collection={"max_restarts": 1}), partial(Faulty, "grey", tmp_path / "faults", 2), "cpu")
+    with pytest.raises(EnvironmentFault, match=r"after 1 restarts \(collection.max_restarts 1\)"):
+        other.restore(collected.memory)  # the running episode has seven steps, and the third fails
+    other.close()
+    result = train(tiny(tmp_path / "run"), faulty("text", times=3))
+    assert read_metrics(result.run_dir)[-1]["env_restarts"] == "1"  # the third failure after those above
+    resume(result.run_dir, frames=105, make_env=dot)
+    assert read_metrics(result.run_dir)[-1]["env_restarts"] == "1"
 
 
 @pytest.mark.parametrize("kind", ["exit", "hang"])
