@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from latentplan.training.console import Progress
     from latentplan.training.learner.module import Learner
 
-WORKER_RESTARTS = 20  # collection processes that may end within a run before the run does
+WORKER_RESTARTS = 20  # collection processes that may end between two starts of a run before the run does
 CLOCKS = ("env_frames", "decisions", "updates", "minutes")
 COLUMNS = (*CLOCKS, "episode_return", "planner_return", "actor_return", "planner_minus_actor")  # the losses follow
 
@@ -72,6 +72,7 @@ class Collect(lightning.Callback):
         self.is_epoch_over = False
         self.evaluated_weights: dict[str, np.ndarray] = {}
         self._is_continued = requests is not None
+        self._earlier_restarts = state.worker_restarts
 
     def on_train_epoch_start(self, trainer: lightning.Trainer, learner: Learner) -> None:  # type: ignore[override]
         """Store the results that were requested one epoch ago, and request the next round and evaluation."""
@@ -195,14 +196,15 @@ class Collect(lightning.Callback):
         """Start a new collection process in place of one that ended, and repeat the requests.
 
         Raises:
-            WorkerEnded: Too many processes have ended.
+            WorkerEnded: Too many processes have ended since the run was started or resumed.
         """
         state = self.state
-        while isinstance(self.worker, RemoteWorker) and state.worker_restarts < WORKER_RESTARTS:
+        limit = self._earlier_restarts + WORKER_RESTARTS
+        while isinstance(self.worker, RemoteWorker) and state.worker_restarts < limit:
             state.worker_restarts += 1
+            count = state.worker_restarts - self._earlier_restarts
             warnings.warn(
-                f"{error}: it is started again ({state.worker_restarts} of {WORKER_RESTARTS} times), and repeats its "
-                "round",
+                f"{error}: it is started again ({count} of {WORKER_RESTARTS} times), and repeats its round",
                 RuntimeWarning,
                 stacklevel=2,
             )

@@ -138,23 +138,24 @@ def test_store_results_keeps_requests_of_a_worker_that_ended_with_an_interrupted
     assert collect.requests["collect"] == {"counter": 3}  # the resumed run asks again
 
 
+class Mortal(RemoteWorker):
+    """A worker whose first three processes end while they are prepared."""
+
+    def __init__(self):
+        self.starts, self.asked = 0, []
+
+    def restart(self):
+        self.starts += 1
+
+    def submit(self, *words):
+        self.asked.append(words[0])
+
+    def result(self):
+        if self.starts < 3:
+            raise WorkerEnded("the collection process ended unexpectedly (exit code -9)")
+
+
 def test_replace_worker_starts_another_process_when_the_new_one_ends_too(tiny, tmp_path):
-    class Mortal(RemoteWorker):
-        """A worker whose first three processes end while they are prepared."""
-
-        def __init__(self):
-            self.starts, self.asked = 0, []
-
-        def restart(self):
-            self.starts += 1
-
-        def submit(self, *words):
-            self.asked.append(words[0])
-
-        def result(self):
-            if self.starts < 3:
-                raise WorkerEnded("the collection process ended unexpectedly (exit code -9)")
-
     state, requests = RunState(), {"collect": {"counter": 3}, "evaluate": None, "weights": None}
     collect = Collect(tiny(tmp_path), None, state, Mortal(), tmp_path, requests, memory={"agent": "random"})
     with pytest.warns(RuntimeWarning, match="started again"):
@@ -163,3 +164,11 @@ def test_replace_worker_starts_another_process_when_the_new_one_ends_too(tiny, t
     state.worker_restarts = 20
     with pytest.raises(WorkerEnded, match="too often"):
         collect.replace_worker(WorkerEnded("too often"))
+
+
+def test_replace_worker_counts_from_the_start_of_the_process(tiny, tmp_path):
+    state, requests = RunState(worker_restarts=19), {"collect": None, "evaluate": None, "weights": None}
+    collect = Collect(tiny(tmp_path), None, state, Mortal(), tmp_path, requests, memory={"agent": "random"})
+    with pytest.warns(RuntimeWarning, match=r"\(3 of 20 times\)"):
+        collect.replace_worker(WorkerEnded("ended"))
+    assert state.worker_restarts == 22
