@@ -18,7 +18,8 @@ import torch
 from lightning.pytorch.loggers import TensorBoardLogger
 from lightning.pytorch.utilities.exceptions import SIGTERMException
 
-from latentplan.agents.checkpoint import load_model
+from latentplan.agents.checkpoint import INFO, load_model
+from latentplan.agents.files import is_checkpoint
 from latentplan.config import USER_DOMAIN, Config, Device, EnvironmentFault, UserError, derive_seed
 from latentplan.config.commit import Save
 from latentplan.config.files import dump_config, read_config
@@ -352,7 +353,7 @@ class _Run:
         The highest mean of many short evaluations is partly chance, so the final starts decide between best and last.
         """
         folder = self.folder / "checkpoints" / "best"
-        if not (folder / "info.json").exists():
+        if not is_checkpoint(folder, (INFO,)):
             return float("-inf")
         try:
             model, _, info = load_model(folder, str(self.device))

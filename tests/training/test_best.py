@@ -110,6 +110,15 @@ def test_best_agent_is_replaced_when_the_last_agent_beats_it_on_the_final_starts
     assert read_frames(folder) == {"best": 90, "last": 90}
 
 
+def test_best_agent_counts_when_its_last_commit_was_cut_off(compared, dot, tmp_path, monkeypatch):
+    folder = shutil.copytree(compared[0].run_dir, tmp_path / "run")
+    info = folder / "checkpoints" / "best" / "info.json"
+    info.rename(info.with_name("info.json.part"))  # as after a crash between two renamings
+    monkeypatch.setattr(Collector, "evaluate", make_evaluate(iter([5.0, 7.0]), []))
+    assert resume(folder, make_env=dot).summary["planner"] == 5.0
+    assert read_frames(folder) == {"best": 45, "last": 90}
+
+
 def test_best_agent_is_evaluated_with_the_planner_only(compared):
     _, calls = compared
     assert calls == [True, True, False]  # an evaluation during the run, the last agent, the best agent
