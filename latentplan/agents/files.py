@@ -52,13 +52,14 @@ def read_files(folder: Path, names: Sequence[str]) -> dict[str, bytes]:
         UserError: A file cannot be read, or differs from what the manifest says of it.
     """
     for attempt in range(TRIES):
+        has_manifest = (folder / MANIFEST).exists()
         try:
-            if not (folder / MANIFEST).exists():
+            if not has_manifest:
                 return {name: _read(folder / name) for name in names}
             manifest = read_manifest(folder, KIND, FORMAT)
             return {name: _find(folder, name, manifest)[1] for name in names}
-        except UserError:
-            if attempt == TRIES - 1:
+        except DamageError:
+            if not has_manifest or attempt == TRIES - 1:
                 raise
             time.sleep(PAUSE_SECONDS)
     raise AssertionError("the last attempt returns or raises")
@@ -102,4 +103,5 @@ def _read(path: Path) -> bytes:
             raise UserError(f"{path} cannot be read: it is not a regular file")
         return path.read_bytes()
     except OSError as error:
-        raise UserError(f"{path} cannot be read: {error.strerror}") from None
+        kind = DamageError if isinstance(error, FileNotFoundError) else UserError  # a renaming may have come between
+        raise kind(f"{path} cannot be read: {error.strerror}") from None
