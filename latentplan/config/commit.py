@@ -351,6 +351,8 @@ def read_manifest(folder: Path, kind: str, version: int) -> Manifest:
     try:
         if path.stat().st_size > LARGEST_MANIFEST:
             raise ValueError("it is too large")
+        if not path.is_file():
+            raise ValueError("it is not a regular file")
         text = path.read_text()
         values = json.loads(text)
         if not isinstance(values, dict) or set(values) != _KEYS:

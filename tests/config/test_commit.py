@@ -181,6 +181,14 @@ def test_read_manifest_refuses_depth_and_bytes_in_one_line(folder):
         assert "\n" not in str(caught.value) and len(str(caught.value)) < 400
 
 
+def test_read_manifest_does_not_wait_for_a_pipe(folder):
+    path = folder / "save-000005" / MANIFEST
+    path.unlink()
+    os.mkfifo(path)
+    with pytest.raises(DamageError, match="not a regular file"):
+        read_manifest(path.parent, "diary", 1)
+
+
 def test_newest_refuses_another_format_and_skips_another_kind(folder, tmp_path):
     with pytest.raises(UserError, match="has format 1, this version of latentplan reads format 2"):
         Saves(folder, "diary", 2).newest()
