@@ -104,7 +104,6 @@ class Save(lightning.Callback):
 
     def save_run(self, trainer: lightning.Trainer, learner: Learner) -> None:
         """Save the state from which the run resumes."""
-        learner.catch_up()
         saved = SavedRun(
             self.state,
             {
