@@ -6,6 +6,7 @@ import contextlib
 import errno
 import json
 import logging
+import math
 import warnings
 from dataclasses import dataclass, replace
 from datetime import datetime
@@ -30,16 +31,17 @@ from latentplan.models.fast import accelerate
 from latentplan.replay.buffer import Replay
 from latentplan.replay.disk import ReplayFiles, count_saved
 from latentplan.training.callbacks import Collect, Record, copy_weights
-from latentplan.training.checks import check_settings
+from latentplan.training.checks import check_folder, check_settings
 from latentplan.training.collection.collector import Description, EnvFactory
 from latentplan.training.collection.episodes import Stopped, to_arrays
 from latentplan.training.collection.process import Worker, WorkerEnded, make_worker
 from latentplan.training.console import Progress
+from latentplan.training.estimates import count_replay_rows
 from latentplan.training.learner.batches import ReplayBatches, ReplayData
 from latentplan.training.learner.curriculum import Curriculum
 from latentplan.training.learner.graphed import make_learner
 from latentplan.training.learner.skips import NotFiniteError
-from latentplan.training.resources import choose_device, choose_replay_capacity, choose_threads, set_up_torch
+from latentplan.training.resources import choose_device, choose_threads, set_up_torch
 from latentplan.training.saving import Guard, Restore, Stop
 from latentplan.training.saving import Save as SaveRun
 from latentplan.training.signals import Signals, exit_code
@@ -106,8 +108,7 @@ def train(config: Config, make_env: EnvFactory | None = None) -> Result:
         stamp = datetime.now().strftime("%Y%m%d-%H%M%S")
         name = f"{config.env.domain}-{config.env.task}-seed{config.run.seed}-{stamp}"
         config = replace(config, run=replace(config.run, run_dir=str(Path("runs") / name)))
-    if config.run.run_dir == "":
-        raise UserError("--run-dir must name a folder, got an empty text")
+    check_folder(str(config.run.run_dir))
     folder = Path(str(config.run.run_dir))
     refuse_used(folder, "run", "--run-dir")
     return _start(config, folder, make_env, resume=False)
@@ -219,7 +220,7 @@ class _Run:
         accelerate(model)
         replay_device = self.device if config.replay.on_device else torch.device("cpu")
         self.replay = Replay(
-            choose_replay_capacity(config, (0, 0) if save is None else count_saved(save)),
+            count_replay_rows(config, 0 if save is None else math.prod(count_saved(save))),
             model.action_dim,
             config.model.deter_dim,
             config.env.num_envs,
