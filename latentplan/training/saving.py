@@ -110,7 +110,6 @@ class Save(lightning.Callback):
                 "weights": learner.state_dict(),
                 "updates": learner.updates,
                 "metrics": {name: float(value) for name, value in learner.metrics.items()},
-                "skips": [half.to_list() for half in learner.skips],
             },
             [optimizer.state_dict() for optimizer in trainer.optimizers] or self._loaded_optimizers,
             to_tensors(self.collect.requests),
