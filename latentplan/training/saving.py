@@ -212,7 +212,7 @@ class Guard(lightning.Callback):
             path,
         )
         warnings.warn(
-            f"the loss or gradient of the {name} was not finite at update {learner.updates}: the step was skipped, and "
+            f"the loss or gradient of the {name} was not finite by update {learner.updates}: a step was skipped, and "
             f"its batch is kept in {path}",
             RuntimeWarning,
             stacklevel=2,

@@ -26,7 +26,7 @@ def poison(monkeypatch, is_poisoned):
 
 def test_run_skips_counts_and_keeps_a_batch_that_is_not_finite(tiny, dot, tmp_path, monkeypatch):
     poison(monkeypatch, lambda count: count in (3, 8))
-    with pytest.warns(RuntimeWarning, match=r"at update \d+: the step was skipped, and its batch is kept in"):
+    with pytest.warns(RuntimeWarning, match=r"by update \d+: a step was skipped, and its batch is kept in"):
         run = train(tiny(tmp_path / "run"), dot)
     assert run.exit_code == 0
     state = read_state(run.run_dir)
