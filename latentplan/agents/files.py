@@ -57,13 +57,14 @@ def read_files(folder: Path, names: Sequence[str]) -> dict[str, bytes]:
         UserError: A file cannot be read, or differs from what the manifest says of it.
     """
     for attempt in range(TRIES):
+        has_manifest = (folder / MANIFEST).exists()
         try:
-            if not (folder / MANIFEST).exists():
+            if not has_manifest:
                 return {name: _read(folder / name) for name in names}
             manifest = read_manifest(folder, KIND, FORMAT)
             return {name: _find(folder, name, manifest)[1] for name in names}
-        except UserError:
-            if attempt == TRIES - 1:
+        except DamageError:
+            if not has_manifest or attempt == TRIES - 1:
                 raise
             time.sleep(PAUSE_SECONDS)
     raise AssertionError("the last attempt returns or raises")
@@ -102,4 +103,9 @@ def _finish_renaming(folder: Path) -> None:
 
 
 def _read(path: Path) -> bytes:
-    return read_bytes(path, LARGEST.get(path.name.removesuffix(PART), LARGEST_FILE))
+    try:
+        return read_bytes(path, LARGEST.get(path.name.removesuffix(PART), LARGEST_FILE))
+    except UserError as error:
+        if isinstance(error.__context__, FileNotFoundError):  # a renaming may have come between
+            raise DamageError(str(error)) from None
+        raise

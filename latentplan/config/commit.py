@@ -245,11 +245,11 @@ class Log:
                     rest, row = rest[count * self.row_bytes :], row + count
             sync(self.folder / LOGS)
         except BaseException:
+            touched = list(self._extents)
             self._extents, self._hasher = before, None
-            for path in (self.folder / LOGS).glob(f"{self.name}-*"):  # a full disk needs the room
-                extent = before.get(int(path.name.rpartition("-")[2]))
+            for first in touched:  # a full disk needs the room; other files may belong to the save before
                 with contextlib.suppress(OSError):
-                    os.truncate(path, extent.bytes if extent else 0)
+                    os.truncate(self.path(first), before[first].bytes if first in before else 0)
             raise
 
     def drop_before(self, row: int) -> None:
@@ -351,6 +351,8 @@ def read_manifest(folder: Path, kind: str, version: int) -> Manifest:
     try:
         if path.stat().st_size > LARGEST_MANIFEST:
             raise ValueError("it is too large")
+        if not path.is_file():
+            raise ValueError("it is not a regular file")
         text = path.read_text()
         values = json.loads(text)
         if not isinstance(values, dict) or set(values) != _KEYS:

@@ -202,7 +202,7 @@ def _serve(connection: Connection, factory: CloudpickleWrapper) -> None:
     """Makes an environment and runs its methods as they are asked for, until the connection closes."""
     for number in (signal.SIGINT, signal.SIGHUP):  # they reach the whole process group; the parent handles them
         signal.signal(number, signal.SIG_IGN)
-    threading.Thread(target=_end_with_parent, daemon=True).start()
+    threading.Thread(target=end_with_parent, daemon=True).start()
     env: Any = None
     answer: tuple[str, Any]
     try:
@@ -234,9 +234,11 @@ def _send(connection: Connection, answer: tuple[str, Any]) -> None:
         connection.send(("failed", describe_failure(error)))
 
 
-def _end_with_parent() -> None:
-    """Ends this process when the process that started it has ended, even if the environment never returns."""
+def end_with_parent() -> None:
+    """Ends this process and its children when the process that started it has ended, even if other threads hang."""
     parent = multiprocessing.parent_process()
     if parent is not None:
         wait([parent.sentinel])
+        for child in multiprocessing.active_children():
+            child.kill()
         os._exit(0)

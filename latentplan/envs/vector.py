@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import time
 import warnings
 from dataclasses import dataclass
@@ -119,7 +120,8 @@ class GuardedVectorEnv(VectorEnv[np.ndarray, np.ndarray, Any]):
 
     A fault is an exception, a crash, no answer within a time, or a frame or reward that is not as declared. The step
     that failed truncates the episode: `info["failed"]`, bool (env,), marks the environments, whose frames are those
-    before the step and whose rewards are 0. A reset that fails is repeated.
+    before the step and whose rewards are 0. A reset that fails is repeated with another seed, which derives from its
+    seed, because an environment may fail with one seed alone.
 
     Attributes:
         restarts: Counts how often environments were made anew.
@@ -172,14 +174,14 @@ class GuardedVectorEnv(VectorEnv[np.ndarray, np.ndarray, Any]):
         for index in begun:
             self._ask_for_reset(index, seeds)
         for index in begun:
-            while True:
+            for attempt in itertools.count(1):  # the budget of restarts ends it
                 try:
                     frame, info = self.lanes[index].answer()
                     self._keep(index, frame, info)
                     break
                 except EnvironmentFault as fault:
                     self._restart(index, fault)
-                    self._ask_for_reset(index, seeds)
+                    self._ask_for_reset(index, seeds, attempt)
         return self._frames.copy(), self._info(np.zeros(self.num_envs, np.int64), np.zeros(self.num_envs, bool))
 
     def step(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
@@ -216,10 +218,12 @@ class GuardedVectorEnv(VectorEnv[np.ndarray, np.ndarray, Any]):
         for lane in self.lanes:
             lane.close(max(0.0, end - time.monotonic()))
 
-    def _ask_for_reset(self, index: int, seeds: Sequence[int | None] | None) -> None:
+    def _ask_for_reset(self, index: int, seeds: Sequence[int | None] | None, attempt: int = 0) -> None:
         seed = None if seeds is None else seeds[index]
         if seed is None and self._is_renewed[index]:
             seed = derive_seed(self.restarts.count, "restart", index)
+        elif seed is not None and attempt > 0:
+            seed = derive_seed(seed, "reset", attempt)
         self._is_renewed[index] = False
         self.lanes[index].ask("reset", seed=seed)
 

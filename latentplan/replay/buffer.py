@@ -222,19 +222,18 @@ class Replay:
         raise UserError(f"{too_short}: lower --learning.sequence_length")
 
 
-def read_saved(path: Path, device: torch.device | str = "cpu", keys: Sequence[str] = ()) -> Any:
-    """The object that `torch.save` wrote to a file.
+def read_saved(path: Path, keys: Sequence[str] = ()) -> Any:
+    """The object that `torch.save` wrote to a file, with its tensors on the CPU.
 
     Args:
         path: The file.
-        device: Device of the tensors.
         keys: If any are given, the object must be a dictionary with these keys.
 
     Raises:
         UserError: The file is damaged, or lacks one of the keys.
     """
     try:
-        saved = torch.load(path, map_location=device, weights_only=True)
+        saved = torch.load(path, map_location="cpu", weights_only=True)
         if keys and not (isinstance(saved, dict) and set(keys) <= set(saved)):
             raise ValueError(f"it does not hold {', '.join(keys)}")
         return saved

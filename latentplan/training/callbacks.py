@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from latentplan.training.console import Progress
     from latentplan.training.learner.module import Learner
 
-WORKER_RESTARTS = 20  # collection processes that may end within a run before the run does
+WORKER_RESTARTS = 20  # collection processes that may end between two starts of a run before the run does
 CLOCKS = ("env_frames", "decisions", "updates", "minutes")
 COLUMNS = (*CLOCKS, "episode_return", "planner_return", "actor_return", "planner_minus_actor")  # the losses follow
 
@@ -54,7 +54,6 @@ class Collect(lightning.Callback):
         memory: State of the collector after the last round that was stored.
         is_epoch_over: Whether the epoch that ended last was complete.
         evaluated_weights: Weights that the latest evaluation measured.
-        env_restarts: Environments that were made anew after a fault, since the run was started or resumed.
     """
 
     def __init__(
@@ -71,9 +70,9 @@ class Collect(lightning.Callback):
         self.requests: dict[str, Any] = requests or {"collect": None, "evaluate": None, "weights": None}
         self.memory = memory
         self.is_epoch_over = False
-        self.env_restarts = 0
         self.evaluated_weights: dict[str, np.ndarray] = {}
         self._is_continued = requests is not None
+        self._earlier_restarts = state.worker_restarts
 
     def on_train_epoch_start(self, trainer: lightning.Trainer, learner: Learner) -> None:  # type: ignore[override]
         """Store the results that were requested one epoch ago, and request the next round and evaluation."""
@@ -100,6 +99,11 @@ class Collect(lightning.Callback):
         if state.in_epoch and (is_complete or not state.interrupted):
             state.learned_rounds, state.in_epoch, state.epoch_updates = state.rounds, False, 0
             self.is_epoch_over = True
+
+    @property
+    def env_restarts(self) -> int:
+        """Environments that were made anew after a fault, over the run until its last round that was stored."""
+        return 0 if self.memory is None else int(self.memory["restarts"])
 
     def has_requests(self) -> bool:
         """Whether the worker was asked for something and has not answered."""
@@ -192,14 +196,15 @@ class Collect(lightning.Callback):
         """Start a new collection process in place of one that ended, and repeat the requests.
 
         Raises:
-            WorkerEnded: Too many processes have ended.
+            WorkerEnded: Too many processes have ended since the run was started or resumed.
         """
         state = self.state
-        while isinstance(self.worker, RemoteWorker) and state.worker_restarts < WORKER_RESTARTS:
+        limit = self._earlier_restarts + WORKER_RESTARTS
+        while isinstance(self.worker, RemoteWorker) and state.worker_restarts < limit:
             state.worker_restarts += 1
+            count = state.worker_restarts - self._earlier_restarts
             warnings.warn(
-                f"{error}: it is started again ({state.worker_restarts} of {WORKER_RESTARTS} times), and repeats its "
-                "round",
+                f"{error}: it is started again ({count} of {WORKER_RESTARTS} times), and repeats its round",
                 RuntimeWarning,
                 stacklevel=2,
             )
@@ -252,7 +257,7 @@ class Collect(lightning.Callback):
         self.state.decisions += collected.decisions
         self.state.rounds += 1
         self.state.episode_returns.extend(collected.episode_returns)
-        self.memory, self.env_restarts = collected.memory, collected.restarts
+        self.memory = collected.memory
         return collected.fault
 
 

@@ -1,12 +1,11 @@
-"""Resources of a run: device, threads and the size of the replay."""
+"""Resources of a run: device and threads."""
 
 from __future__ import annotations
 
 import torch
 
-from latentplan.config import Config, RunConfig, UserError
+from latentplan.config import RunConfig, UserError
 from latentplan.config.estimates import count_cores
-from latentplan.training.estimates import count_replay_rows
 
 COLLECTOR_THREADS = 4  # an upper limit, because runs often share a machine
 
@@ -42,14 +41,3 @@ def set_up_torch(threads: int, device: torch.device) -> None:
     torch.set_num_threads(threads)
     if device.type == "cuda":
         torch.set_float32_matmul_precision("high")  # TF32, which has three more bits than bfloat16
-
-
-def choose_replay_capacity(config: Config, saved: tuple[int, int]) -> int:
-    """Rows of the replay: `replay.capacity`, or else enough for everything that the run collects.
-
-    Args:
-        config: Settings of the run.
-        saved: Environments of the saved replay, and the largest number of rows that one of them holds. Without
-            `replay.capacity` all saved rows fit.
-    """
-    return count_replay_rows(config, saved[0] * saved[1])

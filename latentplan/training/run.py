@@ -6,6 +6,7 @@ import contextlib
 import errno
 import json
 import logging
+import math
 import warnings
 from dataclasses import dataclass, replace
 from datetime import datetime
@@ -18,7 +19,8 @@ import torch
 from lightning.pytorch.loggers import TensorBoardLogger
 from lightning.pytorch.utilities.exceptions import SIGTERMException
 
-from latentplan.agents.checkpoint import load_model
+from latentplan.agents.checkpoint import INFO, load_model
+from latentplan.agents.files import is_checkpoint
 from latentplan.config import USER_DOMAIN, Config, Device, EnvironmentFault, UserError, derive_seed
 from latentplan.config.commit import Save
 from latentplan.config.files import dump_config, read_config
@@ -29,16 +31,17 @@ from latentplan.models.fast import accelerate
 from latentplan.replay.buffer import Replay
 from latentplan.replay.disk import ReplayFiles, count_saved
 from latentplan.training.callbacks import Collect, Record, copy_weights
-from latentplan.training.checks import check_settings
+from latentplan.training.checks import check_folder, check_settings
 from latentplan.training.collection.collector import Description, EnvFactory
 from latentplan.training.collection.episodes import Stopped, to_arrays
 from latentplan.training.collection.process import Worker, WorkerEnded, make_worker
 from latentplan.training.console import Progress
+from latentplan.training.estimates import count_replay_rows
 from latentplan.training.learner.batches import ReplayBatches, ReplayData
 from latentplan.training.learner.curriculum import Curriculum
 from latentplan.training.learner.graphed import make_learner
 from latentplan.training.learner.skips import NotFiniteError
-from latentplan.training.resources import choose_device, choose_replay_capacity, choose_threads, set_up_torch
+from latentplan.training.resources import choose_device, choose_threads, set_up_torch
 from latentplan.training.saving import Guard, Restore, Stop
 from latentplan.training.saving import Save as SaveRun
 from latentplan.training.signals import Signals, exit_code
@@ -105,8 +108,7 @@ def train(config: Config, make_env: EnvFactory | None = None) -> Result:
         stamp = datetime.now().strftime("%Y%m%d-%H%M%S")
         name = f"{config.env.domain}-{config.env.task}-seed{config.run.seed}-{stamp}"
         config = replace(config, run=replace(config.run, run_dir=str(Path("runs") / name)))
-    if config.run.run_dir == "":
-        raise UserError("--run-dir must name a folder, got an empty text")
+    check_folder(str(config.run.run_dir))
     folder = Path(str(config.run.run_dir))
     refuse_used(folder, "run", "--run-dir")
     return _start(config, folder, make_env, resume=False)
@@ -218,7 +220,7 @@ class _Run:
         accelerate(model)
         replay_device = self.device if config.replay.on_device else torch.device("cpu")
         self.replay = Replay(
-            choose_replay_capacity(config, (0, 0) if save is None else count_saved(save)),
+            count_replay_rows(config, 0 if save is None else math.prod(count_saved(save))),
             model.action_dim,
             config.model.deter_dim,
             config.env.num_envs,
@@ -352,7 +354,7 @@ class _Run:
         The highest mean of many short evaluations is partly chance, so the final starts decide between best and last.
         """
         folder = self.folder / "checkpoints" / "best"
-        if not (folder / "info.json").exists():
+        if not is_checkpoint(folder, (INFO,)):
             return float("-inf")
         try:
             model, _, info = load_model(folder, str(self.device))

@@ -104,14 +104,12 @@ class Save(lightning.Callback):
 
     def save_run(self, trainer: lightning.Trainer, learner: Learner) -> None:
         """Save the state from which the run resumes."""
-        learner.catch_up()
         saved = SavedRun(
             self.state,
             {
                 "weights": learner.state_dict(),
                 "updates": learner.updates,
                 "metrics": {name: float(value) for name, value in learner.metrics.items()},
-                "skips": [half.to_list() for half in learner.skips],
             },
             [optimizer.state_dict() for optimizer in trainer.optimizers] or self._loaded_optimizers,
             to_tensors(self.collect.requests),
@@ -214,7 +212,7 @@ class Guard(lightning.Callback):
             path,
         )
         warnings.warn(
-            f"the loss or gradient of the {name} was not finite at update {learner.updates}: the step was skipped, and "
+            f"the loss or gradient of the {name} was not finite by update {learner.updates}: a step was skipped, and "
             f"its batch is kept in {path}",
             RuntimeWarning,
             stacklevel=2,

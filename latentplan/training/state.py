@@ -89,7 +89,7 @@ class SavedRun:
 
     Attributes:
         state: Clocks and evaluations.
-        learner: The learner's `weights`, number of `updates`, latest `metrics` and counts of skipped steps, `skips`.
+        learner: The learner's `weights` (with its counts of skipped steps), number of `updates` and latest `metrics`.
         optimizers: One state per optimizer; empty before the first update.
         requests: What the worker was asked for and has not answered; see `Collect`.
         memory: State of the collector after the last round that was stored; None before the first.
@@ -183,8 +183,6 @@ def restore_learner(learner: Learner, saved: dict[str, Any], folder: Path) -> No
         raise UserError(f"the saved weights in {folder} do not fit the settings in its config.yaml: {reason}") from None
     learner.updates = saved["updates"]
     learner.metrics = {name: torch.tensor(value) for name, value in saved["metrics"].items()}
-    for half, counts in zip(learner.skips, saved["skips"], strict=True):
-        half.load(counts)
 
 
 def restore_metrics(save: Save, folder: Path) -> None:

@@ -27,7 +27,7 @@ from pathlib import Path
 from typing import Any
 
 from bench.report import format_table, write_json
-from bench.toy import EVERY_FRAMES, ROUND_FRAMES
+from bench.toy import EVERY_FRAMES, ROUND_FRAMES, find_worker, flip_bit
 from latentplan.config.checks import above_zero
 from latentplan.config.parsing import option
 
@@ -197,16 +197,6 @@ class Trainer:
                 self.start()
             time.sleep(0.2)
 
-    def worker(self) -> int | None:
-        """The collection process."""
-        assert self.process is not None
-        pid = self.process.pid
-        for task in Path(f"/proc/{pid}/task").iterdir():
-            for child in (task / "children").read_text().split():
-                if "spawn_main" in Path(f"/proc/{child}/cmdline").read_text():
-                    return int(child)
-        return None
-
     def check(self) -> dict[str, bool]:
         """What the finished folder holds."""
         from latentplan.agents.checkpoint import load_agent
@@ -270,9 +260,10 @@ def terminate(trainer: Trainer, rng: random.Random) -> None:
 
 def kill_worker(trainer: Trainer, rng: random.Random) -> None:
     """Kill -9 of the collection process."""
+    assert trainer.process is not None
     with contextlib.suppress(OSError):
-        if (pid := trainer.worker()) is not None:
-            os.kill(pid, signal.SIGKILL)
+        if (worker := find_worker(trainer.process.pid)) is not None:
+            os.kill(worker, signal.SIGKILL)
 
 
 def corrupt(trainer: Trainer, rng: random.Random) -> None:
@@ -280,9 +271,7 @@ def corrupt(trainer: Trainer, rng: random.Random) -> None:
     trainer.stop(signal.SIGKILL)
     newest = max((trainer.folder / "resume").glob("save-*[0-9]"))
     path = rng.choice(sorted(newest.iterdir()))
-    content = bytearray(path.read_bytes())
-    content[rng.randrange(len(content))] ^= 1 << rng.randrange(8)
-    path.write_bytes(content)
+    flip_bit(path, rng)
     trainer.say(f"flipped a bit of {newest.name}/{path.name}")
 
 

@@ -16,6 +16,7 @@ from latentplan.commands.shell import run_guarded
 from latentplan.config import ReplayConfig
 
 SAVE_MINUTES = 0.25
+MAX_RESTARTS = 10**6  # environments fail as long as the run is disturbed
 CAPACITY = 2000  # so that rows are overwritten and the disk stays small
 
 
@@ -37,7 +38,8 @@ def main(folder: Path, frames: int, triggers: Path) -> int:
     if (folder / "config.yaml").exists():
         return resume(folder, frames=frames, make_env=make_env).exit_code
     config = toy_config(folder, frames, overlap=True)
-    return train(replace(config, replay=ReplayConfig(capacity=CAPACITY)), make_env).exit_code
+    collection = replace(config.collection, max_restarts=MAX_RESTARTS)
+    return train(replace(config, collection=collection, replay=ReplayConfig(capacity=CAPACITY)), make_env).exit_code
 
 
 if __name__ == "__main__":

@@ -5,6 +5,7 @@ A word may hold `{folder}`, the folder of the files, and `{agent}`, the checkpoi
 
 from __future__ import annotations
 
+import hashlib
 import json
 import os
 import shutil
@@ -191,6 +192,9 @@ CHECKPOINTS = (
     "weights-pickle",
     "weights-header",
     "weights-pipe",
+    "weights-sealed",
+    "manifest-brackets",
+    "manifest-pipe",
     "/dev/zero",
     "nothing",
     "file",
@@ -252,7 +256,10 @@ def write_files(folder: Path, agent: Path) -> None:
         "weights-cut": (agent / "weights.safetensors").read_bytes()[:1000],
         "weights-pickle": SETTINGS["pickle"] if isinstance(SETTINGS["pickle"], bytes) else b"",
         "weights-header": struct.pack("<Q", 2**62) + b"{}",
+        "weights-sealed": b"",
     }
+    for name in ("weights-cut", "weights-pickle", "weights-header"):  # so that the weights themselves are refused
+        infos[name] = json.dumps(info | {"sha256": hashlib.sha256(weights[name]).hexdigest()})
     for name in CHECKPOINTS:
         if name not in ("nothing", "file") and not name.startswith("/"):
             given = _filled(weights[name], folder) if name in weights else None
@@ -260,16 +267,22 @@ def write_files(folder: Path, agent: Path) -> None:
 
 
 def _damage(copy: Path, agent: Path, info: str | bytes | None, weights: bytes | None) -> None:
+    """Copies an agent and damages the copy; without its manifest, so that the damage itself has to be noticed."""
     shutil.copytree(agent, copy)
+    manifest = copy / "manifest.json"
+    if copy.name != "weights-sealed":
+        manifest.unlink(missing_ok=True)
+    if copy.name == "manifest-brackets":
+        manifest.write_text("[" * 100_000)
     for path, content in ((copy / "info.json", info), (copy / "weights.safetensors", weights)):
         if content is not None:
             path.write_bytes(content if isinstance(content, bytes) else content.encode())
     if copy.name == "no-info":
         (copy / "info.json").unlink()
-    for part, path in (("info-pipe", copy / "info.json"), ("weights-pipe", copy / "weights.safetensors")):
-        if copy.name == part:
-            path.unlink()
-            os.mkfifo(path)
+    for name in ("info.json", "weights.safetensors", "manifest.json"):
+        if copy.name == f"{Path(name).stem}-pipe":
+            (copy / name).unlink(missing_ok=True)
+            os.mkfifo(copy / name)
 
 
 def _filled(content: str | bytes, folder: Path) -> bytes:

@@ -23,7 +23,7 @@ from pathlib import Path
 from typing import Any
 
 from bench.report import format_table, write_json
-from bench.toy import Dot, toy_config
+from bench.toy import Dot, find_worker, flip_bit, toy_config
 from latentplan.config.checks import at_least
 from latentplan.config.parsing import option
 
@@ -115,8 +115,9 @@ def kill_runs(
             _await_save(own / "resume", process)
             if _has_ended(process, rng.uniform(0.0, seconds)):
                 break
-            target = _child_of(process) if is_worker else process
+            target = find_worker(process) if is_worker else process
             if target is None:
+                time.sleep(0.01)
                 continue
             with contextlib.suppress(ProcessLookupError):
                 os.kill(target, signal.SIGKILL)
@@ -182,10 +183,7 @@ def flip_bits(run: Path, tries: int, rng: random.Random) -> dict[str, Any]:
     noticed = 0
     for count in range(tries):
         path = paths[count % len(paths)]
-        before = path.read_bytes()
-        content = bytearray(before)
-        content[rng.randrange(len(content))] ^= 1 << rng.randrange(8)
-        path.write_bytes(content)
+        before = flip_bit(path, rng)
         if is_noticed(run, path):
             noticed += 1
         else:
@@ -367,14 +365,3 @@ def _await_save(folder: Path, process: int) -> None:
     """Wait for the first save of a process that has not ended."""
     while not list(folder.glob("save-*[0-9]")) and not _has_ended(process):
         time.sleep(0.002)
-
-
-def _child_of(process: int) -> int | None:
-    """The collection process of a trainer."""
-    with contextlib.suppress(OSError):
-        for task in Path(f"/proc/{process}/task").iterdir():
-            for child in (task / "children").read_text().split():
-                if "spawn_main" in Path(f"/proc/{child}/cmdline").read_text():
-                    return int(child)
-    time.sleep(0.01)
-    return None

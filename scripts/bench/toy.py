@@ -5,6 +5,8 @@ A dot in a picture is pushed sideways by actions; the reward is 1 in the middle 
 
 from __future__ import annotations
 
+import contextlib
+import random
 import time
 from pathlib import Path
 from typing import Any, ClassVar
@@ -104,3 +106,30 @@ def toy_config(folder: Path, frames: int, *, overlap: bool, every_frames: int = 
         evaluation=EvaluationConfig(every_frames=every_frames, episodes=1, final_episodes=2, video=False),
         run=RunConfig(frames=frames, device="cpu", threads=1, run_dir=str(folder)),
     )
+
+
+def list_children(process: int) -> list[int]:
+    """The processes that a process has started; none if it has ended."""
+    try:
+        tasks = list(Path(f"/proc/{process}/task").iterdir())
+        return [int(child) for task in tasks for child in (task / "children").read_text().split()]
+    except OSError:
+        return []
+
+
+def find_worker(process: int) -> int | None:
+    """The collection process of a trainer; None while there is none."""
+    for child in list_children(process):
+        with contextlib.suppress(OSError):
+            if "spawn_main" in Path(f"/proc/{child}/cmdline").read_text():
+                return child
+    return None
+
+
+def flip_bit(path: Path, rng: random.Random) -> bytes:
+    """Flips one bit anywhere in a file, and returns what the file held before."""
+    before = path.read_bytes()
+    content = bytearray(before)
+    content[rng.randrange(len(content))] ^= 1 << rng.randrange(8)
+    path.write_bytes(content)
+    return before

@@ -78,6 +78,43 @@ def test_read_files_finds_one_whole_pair_wherever_writing_is_killed(tmp_path, ha
     assert is_finished and call > 5
 
 
+@pytest.mark.parametrize(("has_manifest", "pauses"), [(True, 4), (False, 0)])
+def test_read_files_waits_only_for_a_checkpoint_that_may_be_replaced(tmp_path, monkeypatch, has_manifest, pauses):
+    slept = []
+    monkeypatch.setattr("latentplan.agents.files.time.sleep", slept.append)
+    with pytest.raises(UserError, match="cannot be read"):
+        read_files(tmp_path / "missing", NAMES)
+    write_files(tmp_path, {name: b"content" for name in NAMES})
+    (tmp_path / "first").unlink()
+    if not has_manifest:
+        (tmp_path / "manifest.json").unlink()
+    with pytest.raises(UserError, match="first"):
+        read_files(tmp_path, NAMES)
+    assert len(slept) == pauses
+
+
+def test_read_files_finds_a_file_that_is_renamed_while_it_is_read(tmp_path, monkeypatch):
+    write_files(tmp_path, {name: b"content" for name in NAMES})
+    (tmp_path / "first").rename(tmp_path / "first.part")
+    read = Path.read_bytes
+
+    def rename_first(path):
+        if path.name == "first.part":
+            path.rename(tmp_path / "first")
+        return read(path)
+
+    monkeypatch.setattr(Path, "read_bytes", rename_first)
+    assert read_files(tmp_path, NAMES)["first"] == b"content"
+
+
+def test_read_files_does_not_wait_for_another_format(tmp_path, monkeypatch):
+    monkeypatch.setattr("latentplan.agents.files.time.sleep", pytest.fail)
+    write_files(tmp_path, {name: b"content" for name in NAMES})
+    monkeypatch.setattr("latentplan.agents.files.FORMAT", 2)
+    with pytest.raises(UserError, match="has format 1"):
+        read_files(tmp_path, NAMES)
+
+
 @pytest.fixture(scope="module")
 def agent(tmp_path_factory):
     folder = tmp_path_factory.mktemp("agent") / "agent"

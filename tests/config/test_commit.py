@@ -181,6 +181,14 @@ def test_read_manifest_refuses_depth_and_bytes_in_one_line(folder):
         assert "\n" not in str(caught.value) and len(str(caught.value)) < 400
 
 
+def test_read_manifest_does_not_wait_for_a_pipe(folder):
+    path = folder / "save-000005" / MANIFEST
+    path.unlink()
+    os.mkfifo(path)
+    with pytest.raises(DamageError, match="not a regular file"):
+        read_manifest(path.parent, "diary", 1)
+
+
 def test_newest_refuses_another_format_and_skips_another_kind(folder, tmp_path):
     with pytest.raises(UserError, match="has format 1, this version of latentplan reads format 2"):
         Saves(folder, "diary", 2).newest()
@@ -199,6 +207,26 @@ def test_commit_that_fails_leaves_nothing(folder):
     with pytest.raises(OSError, match="No space left"):
         diary.saves.commit(fail, {})
     assert sorted(folder.rglob("*")) == before
+
+
+def test_append_that_fails_keeps_dropped_files_that_the_save_before_names(folder, monkeypatch):
+    diary, before = Diary(folder), {path: path.read_bytes() for path in (folder / "logs").iterdir()}
+    diary.log.drop_before(4)
+    calls = iter(range(10**6))
+
+    def fill_up(descriptor):
+        if next(calls) == 2:
+            raise OSError(28, "No space left on device")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "fsync", fill_up)
+        with pytest.raises(OSError, match="No space left"):
+            diary.log.append(5, iter([bytes([row]) * ROW for row in range(5, 9)]))
+    left = {path: path.read_bytes() for path in (folder / "logs").iterdir() if path.stat().st_size}
+    assert len(before) == 2 and left == before  # and the rows of the append are gone
+    assert Diary(folder).problems == [] and Diary(folder).rows() == list(range(5))
+    shutil.rmtree(folder / "save-000005")
+    assert Diary(folder).count == 4 and Diary(folder).rows() == list(range(4))
 
 
 def test_find_returns_the_newest_whole_copy_of_a_file(folder):

@@ -78,12 +78,31 @@ def test_fault_of_one_environment_leaves_the_others_alone(make):
     assert rewards.tolist() == [1.0, 1.0] and not info["failed"].any()
 
 
-def test_reset_that_fails_is_repeated_with_its_seed(make):
+def test_reset_that_fails_is_repeated_with_a_seed_that_its_seed_determines(make, tmp_path):
     envs, plain = make("reset", times=2), make("never")
     with pytest.warns(RuntimeWarning, match="no start"):
         frames, _ = envs.reset(seed=5)
     assert envs.restarts.count == 2
-    assert np.array_equal(frames, plain.reset(seed=5)[0])
+    assert not np.array_equal(frames, plain.reset(seed=5)[0])
+    for count in ("0", "1"):
+        (tmp_path / "reset" / count).unlink()
+    envs.restarts.budget = 4
+    with pytest.warns(RuntimeWarning, match="no start"):
+        assert np.array_equal(envs.reset(seed=5)[0], frames)
+
+
+def test_reset_that_fails_with_one_seed_alone_is_survived(tmp_path):
+    class Picky(Faulty):
+        def reset(self, *, seed=None, options=None):
+            if seed == 5:
+                raise ZeroDivisionError("no start with this seed")
+            return super().reset(seed=seed, options=options)
+
+    envs = make_vector_env(CONFIG, 1, 0, partial(Picky, "never", tmp_path), restarts=Restarts(1))
+    with pytest.warns(RuntimeWarning, match="no start with this seed"):
+        envs.reset(seed=5)
+    assert envs.restarts.count == 1
+    envs.close()
 
 
 def test_environment_that_was_made_anew_does_not_repeat_its_first_episode(make):

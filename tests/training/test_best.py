@@ -110,6 +110,15 @@ def test_best_agent_is_replaced_when_the_last_agent_beats_it_on_the_final_starts
     assert read_frames(folder) == {"best": 90, "last": 90}
 
 
+def test_best_agent_counts_when_its_last_commit_was_cut_off(compared, dot, tmp_path, monkeypatch):
+    folder = shutil.copytree(compared[0].run_dir, tmp_path / "run")
+    info = folder / "checkpoints" / "best" / "info.json"
+    info.rename(info.with_name("info.json.part"))  # as after a crash between two renamings
+    monkeypatch.setattr(Collector, "evaluate", make_evaluate(iter([5.0, 7.0]), []))
+    assert resume(folder, make_env=dot).summary["planner"] == 5.0
+    assert read_frames(folder) == {"best": 45, "last": 90}
+
+
 def test_best_agent_is_evaluated_with_the_planner_only(compared):
     _, calls = compared
     assert calls == [True, True, False]  # an evaluation during the run, the last agent, the best agent
@@ -138,23 +147,24 @@ def test_store_results_keeps_requests_of_a_worker_that_ended_with_an_interrupted
     assert collect.requests["collect"] == {"counter": 3}  # the resumed run asks again
 
 
+class Mortal(RemoteWorker):
+    """A worker whose first three processes end while they are prepared."""
+
+    def __init__(self):
+        self.starts, self.asked = 0, []
+
+    def restart(self):
+        self.starts += 1
+
+    def submit(self, *words):
+        self.asked.append(words[0])
+
+    def result(self):
+        if self.starts < 3:
+            raise WorkerEnded("the collection process ended unexpectedly (exit code -9)")
+
+
 def test_replace_worker_starts_another_process_when_the_new_one_ends_too(tiny, tmp_path):
-    class Mortal(RemoteWorker):
-        """A worker whose first three processes end while they are prepared."""
-
-        def __init__(self):
-            self.starts, self.asked = 0, []
-
-        def restart(self):
-            self.starts += 1
-
-        def submit(self, *words):
-            self.asked.append(words[0])
-
-        def result(self):
-            if self.starts < 3:
-                raise WorkerEnded("the collection process ended unexpectedly (exit code -9)")
-
     state, requests = RunState(), {"collect": {"counter": 3}, "evaluate": None, "weights": None}
     collect = Collect(tiny(tmp_path), None, state, Mortal(), tmp_path, requests, memory={"agent": "random"})
     with pytest.warns(RuntimeWarning, match="started again"):
@@ -163,3 +173,11 @@ def test_replace_worker_starts_another_process_when_the_new_one_ends_too(tiny, t
     state.worker_restarts = 20
     with pytest.raises(WorkerEnded, match="too often"):
         collect.replace_worker(WorkerEnded("too often"))
+
+
+def test_replace_worker_counts_from_the_start_of_the_process(tiny, tmp_path):
+    state, requests = RunState(worker_restarts=19), {"collect": None, "evaluate": None, "weights": None}
+    collect = Collect(tiny(tmp_path), None, state, Mortal(), tmp_path, requests, memory={"agent": "random"})
+    with pytest.warns(RuntimeWarning, match=r"\(3 of 20 times\)"):
+        collect.replace_worker(WorkerEnded("ended"))
+    assert state.worker_restarts == 22

@@ -26,11 +26,12 @@ def poison(monkeypatch, is_poisoned):
 
 def test_run_skips_counts_and_keeps_a_batch_that_is_not_finite(tiny, dot, tmp_path, monkeypatch):
     poison(monkeypatch, lambda count: count in (3, 8))
-    with pytest.warns(RuntimeWarning, match=r"at update \d+: the step was skipped, and its batch is kept in"):
+    with pytest.warns(RuntimeWarning, match=r"by update \d+: a step was skipped, and its batch is kept in"):
         run = train(tiny(tmp_path / "run"), dot)
     assert run.exit_code == 0
     state = read_state(run.run_dir)
-    assert [half[0] for half in state["learner"]["skips"]] == [2, 2] and state["learner"]["updates"] == 24
+    weights = state["learner"]["weights"]
+    assert [int(weights[f"skips.{half}.total"]) for half in (0, 1)] == [2, 2] and state["learner"]["updates"] == 24
     assert all(value.isfinite().all() for value in state["learner"]["weights"].values())
     kept = sorted((run.run_dir / "skipped").iterdir())
     assert sorted(path.name.partition("-")[0] for path in kept) == ["behaviour"] * 2 + ["model"] * 2
@@ -78,5 +79,5 @@ def test_run_learns_from_the_rest_when_one_row_of_replay_is_not_finite(tiny, dot
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         run = train(tiny(tmp_path / "run"), dot)
-    skipped = read_state(run.run_dir)["learner"]["skips"][0][0]
+    skipped = int(read_state(run.run_dir)["learner"]["weights"]["skips.0.total"])
     assert run.exit_code == 0 and 0 < skipped < 24

@@ -19,6 +19,16 @@ FRAMES = 120
 
 
 @pytest.fixture(scope="module")
+def toy(root):
+    """The module of the toy runs that benchmarks disturb."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.syspath_prepend(str(root / "scripts"))
+        from bench import toy
+
+        return toy
+
+
+@pytest.fixture(scope="module")
 def whole(tiny, dot, tmp_path_factory):
     """The fingerprint of a run that nothing disturbed, and the seconds that it took."""
     folder, started = tmp_path_factory.mktemp("whole") / "run", time.monotonic()
@@ -119,13 +129,10 @@ def test_run_whose_collection_process_is_killed_equals_a_run_without(tiny, dot, 
     assert {row.get("worker_restarts") for row in read_rows(tmp_path / "run")} >= {"1", "2"}
 
 
-def test_resume_warns_and_goes_on_when_the_newest_save_is_damaged(whole, dot, tmp_path):
+def test_resume_warns_and_goes_on_when_the_newest_save_is_damaged(whole, dot, toy, tmp_path):
     reference, _ = whole
     shutil.copytree(reference, tmp_path / "run")
-    path = list_saves(tmp_path / "run")[-1] / "rows.pt"
-    content = bytearray(path.read_bytes())
-    content[len(content) // 2] ^= 8
-    path.write_bytes(content)
+    toy.flip_bit(list_saves(tmp_path / "run")[-1] / "rows.pt", random.Random(0))
     with pytest.warns(RuntimeWarning, match=r"rows\.pt is damaged.*\(env frames \d+, .*is lost, and is done again"):
         resume(tmp_path / "run", make_env=dot)
     states = [read_state(folder)["learner"]["weights"] for folder in (reference, tmp_path / "run")]
@@ -163,12 +170,13 @@ def test_second_signal_ends_the_process_at_once(tmp_path, root):
 
 
 @pytest.mark.slow
-def test_collection_process_ends_quietly_with_a_trainer_that_was_killed(tiny, dot, tmp_path):
+def test_collection_process_ends_quietly_with_a_trainer_that_was_killed(tiny, dot, toy, tmp_path):
     folder = tmp_path / "run"
     child = start(tiny, dot, folder, collection={"overlap": True}, env={"num_envs": 2})
     deadline, workers = time.monotonic() + 60.0, []
     while (not list_saves(folder) or not workers) and time.monotonic() < deadline:
-        workers = descendants(child)
+        workers = toy.list_children(child)
+        workers += [other for worker in workers for other in toy.list_children(worker)]
         time.sleep(0.05)
     os.kill(child, signal.SIGKILL)
     end(child)
@@ -177,15 +185,3 @@ def test_collection_process_ends_quietly_with_a_trainer_that_was_killed(tiny, do
         time.sleep(0.05)
     assert workers and not any(os.path.exists(f"/proc/{worker}") for worker in workers)
     assert "Traceback" not in (tmp_path / "run.log").read_text()
-
-
-def descendants(process):
-    """Processes that a process has started, and theirs."""
-    try:
-        tasks = os.listdir(f"/proc/{process}/task")
-        children = [
-            int(child) for task in tasks for child in open(f"/proc/{process}/task/{task}/children").read().split()
-        ]
-    except OSError:
-        return []
-    return children + [other for child in children for other in descendants(child)]

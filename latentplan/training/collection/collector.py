@@ -19,7 +19,7 @@ from latentplan.agents.base import ModelAgent
 from latentplan.agents.modes import make_agent
 from latentplan.agents.planning import PlanningAgent
 from latentplan.agents.random import RandomAgent
-from latentplan.config import Config, EnvironmentFault, UserError, derive_seed
+from latentplan.config import Config, EnvironmentFault, derive_seed
 from latentplan.config.suites import DEFAULT_SUITE
 from latentplan.envs import make_vector_env, render_info
 from latentplan.envs.faults import FrameCheck
@@ -51,7 +51,6 @@ class Collected:
         decisions: Actions chosen in this round, over all environments.
         episode_returns: Returns of the episodes that ended in this round.
         memory: State of the collector after this round, from which `Collector.restore` continues.
-        restarts: Environments that were made anew after a fault so far, over all rounds and evaluations.
         fault: The fault after which no restart was left, and which ended the round early; None in a whole round.
     """
 
@@ -60,7 +59,6 @@ class Collected:
     decisions: int
     episode_returns: list[float]
     memory: dict[str, Any] | None
-    restarts: int = 0
     fault: EnvironmentFault | None = None
 
 
@@ -177,6 +175,9 @@ class Collector:
 
         Returns:
             The round; where the environments fail too often, its beginning and the fault.
+
+        Raises:
+            EnvironmentFault: The environments failed too often before the first decision of the round.
         """
         agent = self._random if weights is None else self._agents[behaviour if goal is None else "goal"]
         if weights is not None:
@@ -198,9 +199,12 @@ class Collector:
                 self._step(agent, log)
                 taken += 1
         except EnvironmentFault as error:
+            if taken == 0:
+                raise
             fault = error
+            self._has_ended[:] = True  # the last decision has no result, so no episode can go on
         decisions, memory = taken * len(self._has_ended), self._copy_memory()
-        return Collected(log.rows(), log.env_frames, decisions, log.returns, memory, self.restarts.count, fault)
+        return Collected(log.rows(), log.env_frames, decisions, log.returns, memory, fault)
 
     def restore(self, memory: dict[str, Any]) -> None:
         """Continues after a round of another collector: plays its running episodes again, action by action.
@@ -211,12 +215,12 @@ class Collector:
             memory: `Collected.memory` of that round.
         """
         memory = to_tensors(memory)
+        self.restarts.count = memory["restarts"]
         frames, labels, is_same = self._episodes.replay(memory["episodes"])
         self._frames, self._returns = frames, memory["returns"].numpy().copy()
         if self.labels:
             self._labels = np.array(labels, np.float32)
         self._has_ended = memory["has_ended"].numpy() | ~is_same
-        self._check_rewards.set_memory(memory["rewards"])
         name = memory["agent"]
         agent = self._random if name == "random" else self._agents[name]
         if isinstance(agent, ModelAgent):
@@ -235,7 +239,7 @@ class Collector:
             "episodes": self._episodes.memory(self._frames, self._has_ended),
             "returns": self._returns.copy(),
             "has_ended": self._has_ended.copy(),
-            "rewards": self._check_rewards.memory(),
+            "restarts": self.restarts.count,
         }
         return to_arrays(memory)  # type: ignore[no-any-return]
 
@@ -385,7 +389,7 @@ def _stack(entries: list[tuple[Any, ...]]) -> Rows:
 
 
 class RewardCheck:
-    """Refuses rewards that are not finite, and warns once if discounted sums of rewards exceed the value head's range.
+    """Warns once if discounted sums of rewards exceed the value head's range.
 
     Args:
         num_envs: Number of environments.
@@ -397,28 +401,13 @@ class RewardCheck:
         self._sums = np.zeros(num_envs)
         self._has_warned = False
 
-    def memory(self) -> dict[str, Any]:
-        """What is known of the running episodes, for `set_memory`."""
-        return {"sums": self._sums.copy(), "has_warned": self._has_warned}
-
-    def set_memory(self, memory: dict[str, Any]) -> None:
-        """Continue with what another check knew of the running episodes; arrays are tensors now."""
-        self._sums, self._has_warned = memory["sums"].numpy().copy(), memory["has_warned"]
-
     def __call__(self, rewards: np.ndarray, is_first: np.ndarray) -> None:
         """Check one step's rewards.
 
         Args:
             rewards: Rewards of one step, (env,).
             is_first: Whether the step is the first of an episode, (env,).
-
-        Raises:
-            UserError: A reward is not finite in float32, in which replay stores it.
         """
-        with np.errstate(over="ignore"):
-            is_finite = np.isfinite(np.asarray(rewards, np.float32))
-        if not is_finite.all():
-            raise UserError(f"the environment returned rewards that are not finite: {rewards.tolist()}")
         self._sums = rewards + self.discount * np.where(is_first, 0.0, self._sums)
         largest = float(np.abs(self._sums).max())
         if largest > LARGEST_SCALAR and not self._has_warned:

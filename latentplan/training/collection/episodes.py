@@ -20,8 +20,9 @@ class Stopped(Exception):
 class Episodes:
     """Starts and steps several environments, and keeps a record of every running episode.
 
-    An episode's start depends only on the seed of the run, its environment and its number. Its seed and its actions
-    therefore bring another environment into the same state, if the environment depends on nothing else.
+    An episode's start depends only on the seed of the run, its environment, its number, and the resets that failed
+    before it. Its seed and its actions therefore bring another environment into the same state, if the environment
+    depends on nothing else.
 
     Args:
         envs: The environments.

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import multiprocessing
-import os
 import signal
 import sys
 import threading
@@ -12,7 +11,7 @@ from collections import deque
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from concurrent.futures import wait as wait_for
-from multiprocessing.connection import Connection, wait
+from multiprocessing.connection import Connection
 from typing import Any
 
 import torch
@@ -20,6 +19,7 @@ from gymnasium.vector.utils import CloudpickleWrapper
 
 from latentplan.config import Config, EnvironmentFault, UserError
 from latentplan.envs import single_threaded_children
+from latentplan.envs.process import end_with_parent
 from latentplan.training.collection.collector import CLOSING_SECONDS, Collector, EnvFactory
 from latentplan.training.collection.episodes import Stopped
 from latentplan.training.resources import choose_collector_threads
@@ -173,7 +173,7 @@ def _serve(connection: Connection, make_user_env: EnvFactory | None, config: Con
     # Ctrl-C and a closed terminal reach the whole process group, but only the learner reacts.
     for number in (signal.SIGINT, signal.SIGHUP):
         signal.signal(number, signal.SIG_IGN)
-    threading.Thread(target=_end_with_parent, daemon=True).start()
+    threading.Thread(target=end_with_parent, daemon=True).start()
     torch.set_num_threads(threads)
     collector: Collector | None = None
     while True:
@@ -193,13 +193,3 @@ def _serve(connection: Connection, make_user_env: EnvFactory | None, config: Con
             connection.send(answer)
         except OSError:  # the learner has ended
             return
-
-
-def _end_with_parent() -> None:
-    """Ends this process and its children at once when the process that started it has ended."""
-    parent = multiprocessing.parent_process()
-    if parent is not None:
-        wait([parent.sentinel])
-        for child in multiprocessing.active_children():
-            child.kill()
-        os._exit(0)

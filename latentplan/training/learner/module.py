@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+from collections.abc import Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from functools import cached_property
 
@@ -62,6 +63,7 @@ class Learner(lightning.LightningModule):
 
     return_range: Tensor
     averaged_updates: Tensor
+    skips: Sequence[Skips]
 
     def __init__(self, model: WorldModel, config: LearningConfig, discount: float, replay: Replay, seed: int) -> None:
         super().__init__()
@@ -75,7 +77,8 @@ class Learner(lightning.LightningModule):
         self.updates = 0
         self.metrics: dict[str, Tensor] = {}
         shape = config.batch_size, config.sequence_length + 1
-        self.skips = tuple(Skips(shape, model.device) for _ in (MODEL, BEHAVIOUR))
+        halves = nn.ModuleList(Skips(shape).to(model.device) for _ in (MODEL, BEHAVIOUR))
+        self.skips = halves  # type: ignore[assignment]
         self._thread = ThreadPoolExecutor(1, thread_name_prefix="behaviour")
         self._waiting: tuple[Learned, Batch, torch.Generator] | None = None
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 LONGEST_STREAK = 10
 
@@ -20,8 +20,10 @@ class NotFiniteError(FloatingPointError):
         self.update = update
 
 
-class Skips:
+class Skips(nn.Module):
     """Counts the skipped steps of one half of an update, in tensors that a CUDA graph can update.
+
+    The counts are part of the learner's state, but the rows of a batch are not.
 
     Attributes:
         total: Steps skipped so far, int64 scalar.
@@ -31,12 +33,18 @@ class Skips:
 
     Args:
         shape: Batch size and frames per sequence.
-        device: Device of the learner.
     """
 
-    def __init__(self, shape: tuple[int, int], device: torch.device) -> None:
-        self.total, self.streak, self.longest = (torch.zeros((), dtype=torch.long, device=device) for _ in range(3))
-        self.rows = torch.zeros(shape, dtype=torch.long, device=device)
+    total: Tensor
+    streak: Tensor
+    longest: Tensor
+    rows: Tensor
+
+    def __init__(self, shape: tuple[int, int]) -> None:
+        super().__init__()
+        for name in ("total", "streak", "longest"):
+            self.register_buffer(name, torch.zeros((), dtype=torch.long))
+        self.register_buffer("rows", torch.zeros(shape, dtype=torch.long), persistent=False)
 
     def record(self, norm: Tensor, rows: Tensor) -> None:
         """Count a step whose gradient had this norm: the step was skipped if the norm is not finite.
@@ -50,12 +58,3 @@ class Skips:
         self.streak.copy_(torch.where(is_skipped, self.streak + 1, 0))
         torch.maximum(self.longest, self.streak, out=self.longest)
         self.rows.copy_(torch.where(is_skipped, rows.to(self.rows.device), self.rows))
-
-    def to_list(self) -> list[int]:
-        """The counts as plain values, for `load`."""
-        return [int(self.total), int(self.streak), int(self.longest)]
-
-    def load(self, counts: list[int]) -> None:
-        """Continue from counts that `to_list` returned."""
-        for tensor, count in zip((self.total, self.streak, self.longest), counts, strict=True):
-            tensor.fill_(count)

@@ -50,7 +50,7 @@ def test_replay_holds_no_transition_of_a_step_that_failed(collect):
     assert rows.rewards.tolist() == [1, 1, 0, *[1] * 10, 0, *[1] * 7]
     assert rows.actions[[2, 13]].tolist() == [[0.0], [0.0]] and (rows.continues == 1.0).all()
     assert np.isfinite(rows.rewards).all() and np.isfinite(rows.actions).all()
-    assert (collected.restarts, collected.fault, collected.env_frames) == (1, None, 19)
+    assert (collected.memory["restarts"], collected.fault, collected.env_frames) == (1, None, 19)
     assert collected.episode_returns == [10.0]  # the episode that was cut short does not count
 
 
@@ -58,6 +58,46 @@ def test_round_that_fails_too_often_returns_what_it_collected(collect):
     _, collected = collect("exception", times=9, max_restarts=1)
     assert len(collected.rows[0].frames) == 5 and collected.decisions == 5
     assert "the lamp is out after 1 restarts (collection.max_restarts 1)" in str(collected.fault)
+
+
+class Late(Faulty):
+    """Fails from its first step or reset on, but not at the reset with seed 0, with which a run times the pictures."""
+
+    def reset(self, *, seed=None, options=None):
+        if self.kind == "reset" and seed == 0:
+            self.steps, self.start = 0, 0
+            return self.picture(), {}
+        return super().reset(seed=seed, options=options)
+
+    def step(self, action):
+        if self.kind != "reset" and self.is_due():
+            raise ZeroDivisionError("no step")
+        return super().step(action)
+
+
+@pytest.mark.parametrize(("kind", "overlap"), [("reset", False), ("reset", True), ("step", False)])
+def test_run_that_fails_before_its_first_decision_says_why_and_can_be_resumed(kind, overlap, tiny, dot, tmp_path):
+    config = tiny(tmp_path / "run", collection={"max_restarts": 0 if kind == "step" else 1, "overlap": overlap})
+    (tmp_path / "faults").mkdir()
+    with pytest.raises(EnvironmentFault, match=r"no (start|step) after \d restarts .*; the run is saved in") as fault:
+        train(config, partial(Late, kind, tmp_path / "faults", 99))
+    assert fault.value.origin.splitlines()[-1].startswith("ZeroDivisionError: no ")
+    saved = read_state(tmp_path / "run")
+    assert saved["run"]["rounds"] == 0 and saved["requests"]["collect"]["counter"] == 0  # asked for again
+    assert resume(tmp_path / "run", make_env=dot).exit_code == 0
+
+
+def test_round_that_fails_too_often_ends_its_episodes(tiny, faulty, recwarn):
+    collector = Collector(tiny("", collection={"max_restarts": 0}), faulty("exception", times=1), "cpu")
+    weights = {name: value.numpy().copy() for name, value in collector.model.state_dict().items()}
+    collected = collector.collect(weights, "actor", 20, 0)
+    assert collected.fault is not None and collected.memory["has_ended"].all()
+    other = Collector(tiny(""), faulty("never", times=0), "cpu")
+    other.restore(collected.memory)
+    (rows,) = other.collect(weights, "actor", 5, 1).rows
+    collector.close(), other.close()
+    assert rows.is_first.tolist() == [True, *[False] * 4] and (rows.deter[0] == 0.0).all()
+    assert not [warning for warning in recwarn if "did not repeat" in str(warning.message)]
 
 
 def test_evaluation_plays_an_episode_again_when_its_environment_fails(collect, tiny, tmp_path):
@@ -83,6 +123,19 @@ def test_run_goes_on_after_faults_and_counts_them_in_its_metrics(kind, tiny, fau
     assert read_metrics(result.run_dir)[-1]["env_restarts"] == "3"
     state = torch.load(list_saves(result.run_dir)[-1] / "rows.pt", weights_only=True)
     assert torch.isfinite(state["rewards"]).all()
+
+
+def test_restarts_count_over_the_life_of_a_run(collect, tiny, faulty, dot, tmp_path):
+    _, collected = collect("exception", times=1, max_restarts=1)
+    assert collected.memory["restarts"] == 1
+    other = Collector(tiny("", collection={"max_restarts": 1}), partial(Faulty, "grey", tmp_path / "faults", 2), "cpu")
+    with pytest.raises(EnvironmentFault, match=r"after 1 restarts \(collection.max_restarts 1\)"):
+        other.restore(collected.memory)  # the running episode has seven steps, and the third fails
+    other.close()
+    result = train(tiny(tmp_path / "run"), faulty("text", times=3))
+    assert read_metrics(result.run_dir)[-1]["env_restarts"] == "1"  # the third failure after those above
+    resume(result.run_dir, frames=105, make_env=dot)
+    assert read_metrics(result.run_dir)[-1]["env_restarts"] == "1"
 
 
 @pytest.mark.parametrize("kind", ["exit", "hang"])

@@ -1,20 +1,13 @@
-"""RewardCheck refuses rewards that are not finite, and warns of large ones."""
+"""RewardCheck warns of large rewards."""
 
 import warnings
 
 import numpy as np
 import pytest
 
-from latentplan.config import UserError
 from latentplan.training.collection.collector import RewardCheck
 
 NONE = np.array([False])
-
-
-@pytest.mark.parametrize("reward", [np.nan, np.inf, 1e39])
-def test_reward_check_refuses_rewards_that_are_not_finite_in_float32(reward):
-    with pytest.raises(UserError, match="not finite"):
-        RewardCheck(1, 0.9)(np.array([reward]), NONE)
 
 
 def test_reward_check_warns_once_when_discounted_rewards_leave_the_heads_range():

@@ -121,8 +121,13 @@ def test_restore_learner_restores_averages_and_counts(batch, tiny):
     learner, resumed = make_standalone(tiny), make_standalone(tiny)
     collect_averages(learner, batch, 12)
     metrics = {name: float(value) for name, value in learner.metrics.items()}
-    saved = {"weights": learner.state_dict(), "updates": 12, "metrics": metrics, "skips": [[3, 1, 2], [0, 0, 0]]}
+    skips = learner.skips[0]
+    for value, count in zip((skips.total, skips.streak, skips.longest), (3, 1, 2), strict=True):
+        value.fill_(count)
+    saved = {"weights": learner.state_dict(), "updates": 12, "metrics": metrics}
     restore_learner(resumed, saved, Path("run"))
+    skips = resumed.skips[0]
     kept = learner.averaged.state_dict()
     assert all(torch.equal(value, kept[name]) for name, value in resumed.averaged.state_dict().items())
-    assert [half.to_list() for half in resumed.skips] == saved["skips"]
+    assert [int(value) for value in (skips.total, skips.streak, skips.longest)] == [3, 1, 2]
+    assert int(resumed.skips[1].total) == 0 and not any("rows" in name for name in saved["weights"])
