@@ -82,7 +82,7 @@ def test_read_files_finds_one_whole_pair_wherever_writing_is_killed(tmp_path, ha
 def test_read_files_waits_only_for_a_checkpoint_that_may_be_replaced(tmp_path, monkeypatch, has_manifest, pauses):
     slept = []
     monkeypatch.setattr("latentplan.agents.files.time.sleep", slept.append)
-    with pytest.raises(UserError, match="cannot be read"):
+    with pytest.raises(UserError, match="cannot read"):
         read_files(tmp_path / "missing", NAMES)
     write_files(tmp_path, {name: b"content" for name in NAMES})
     (tmp_path / "first").unlink()

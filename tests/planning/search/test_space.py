@@ -179,7 +179,7 @@ def test_search_over_knots_starts_warm_and_keeps_elites(make_planner, seeded):
     [
         ({"num_knots": 3}, "num_knots .* needs action_spline"),
         ({"action_spline": "linear", "num_knots": 9}, "num_knots .9. must not exceed the horizon .6."),
-        ({"action_spline": "quintic"}, "action_spline must be one of None, zero, linear, cubic"),
+        ({"action_spline": "quintic"}, "action_spline must be one of null, zero, linear, cubic"),
         ({"action_spline": "zero", "num_knots": 0}, "num_knots must be a whole number"),
     ],
 )
