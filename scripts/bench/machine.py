@@ -10,6 +10,8 @@ from typing import Any
 import torch
 
 PRODUCT_SIZES = {"cpu": 2048, "cuda": 8192}
+SMALLEST_PRODUCT = 256
+SLOW_SECONDS = 0.1
 PRECISIONS = {"bfloat16": torch.bfloat16, "float32": torch.float32}
 
 
@@ -39,12 +41,17 @@ def product_limits(device: torch.device, size: int | None = None, repeats: int =
 
     Args:
         device: Device that computes the products.
-        size: Rows and columns; None takes a size that fills the device.
+        size: Most rows and columns; None takes a size that fills the device.
         repeats: Number of timed products, after one for warm-up.
     """
-    size = size or PRODUCT_SIZES[device.type]
-    limits = {}
-    for name, dtype in PRECISIONS.items():
+    largest = size or PRODUCT_SIZES[device.type]
+    return {name: _product_limit(device, dtype, largest, repeats) for name, dtype in PRECISIONS.items()}
+
+
+def _product_limit(device: torch.device, dtype: torch.dtype, largest: int, repeats: int) -> float:
+    """Peak FLOP/s in one precision; a precision that the device emulates gets smaller products."""
+    size = min(largest, SMALLEST_PRODUCT)
+    while True:
         left = torch.randn(size, size, device=device, dtype=dtype)
         right = torch.randn(size, size, device=device, dtype=dtype)
         seconds = []
@@ -52,8 +59,9 @@ def product_limits(device: torch.device, size: int | None = None, repeats: int =
             started = read_clock(device)
             torch.mm(left, right)
             seconds.append(read_clock(device) - started)
-        limits[name] = 2.0 * size**3 / min(seconds[1:])
-    return limits
+        if size == largest or min(seconds) > SLOW_SECONDS:
+            return 2.0 * size**3 / min(seconds[1:])
+        size = min(largest, 2 * size)
 
 
 def read_clock(device: torch.device) -> float:

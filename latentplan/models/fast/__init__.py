@@ -10,6 +10,7 @@ import torch
 
 from latentplan.models.backend import Backend
 from latentplan.models.fast.backends import CpuBackend, GpuBackend
+from latentplan.models.fast.library import find_fast_dtype
 from latentplan.models.world_model import WorldModel
 
 __all__ = ["CpuBackend", "GpuBackend", "accelerate"]
@@ -29,5 +30,5 @@ def accelerate(model: WorldModel) -> WorldModel:
     if fast is not None and fast.can_compute(model):
         model.backend = fast()
     else:
-        model.backend = Backend(torch.bfloat16 if kind == "cpu" else torch.float32)
+        model.backend = Backend(find_fast_dtype() if kind == "cpu" else torch.float32)
     return model

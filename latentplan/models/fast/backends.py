@@ -16,6 +16,7 @@ from latentplan.models.dynamics import Gaussian, Rssm, State
 from latentplan.models.fast import compiled, native, native_heads, native_pictures, native_unroll, pointwise, unroll
 from latentplan.models.fast import frames as sliced_frames
 from latentplan.models.fast import rollout as rollouts
+from latentplan.models.fast.library import find_fast_dtype
 from latentplan.models.fast.native_frame import NativeFrameFunctions
 from latentplan.models.fast.one_frame import TorchFrameFunctions
 from latentplan.models.heads import Mlp, ScalarHead
@@ -108,11 +109,12 @@ class _ConvertingBackend(Backend):
 class CpuBackend(_ConvertingBackend):
     """One compiled call for each rollout, step and value if the processor multiplies bfloat16; else calls of torch.
 
-    Augmented frames are copied slice by slice.
+    Products of torch are bfloat16 or float32, whichever the processor computes faster. Augmented frames are copied
+    slice by slice.
     """
 
     def __init__(self) -> None:
-        super().__init__(torch.bfloat16)
+        super().__init__(find_fast_dtype())
 
     def fast_step(self, model: WorldModel, state: State, action: Tensor) -> tuple[State, Tensor]:
         """See `Backend.fast_step`."""

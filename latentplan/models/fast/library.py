@@ -38,6 +38,7 @@ FLAGS = ("-O3", "-march=native", *ARITHMETIC, "-fopenmp", "-shared", "-fPIC")
 WIDE = "-mprefer-vector-width=512"  # only x86 compilers accept it
 LONGEST_ROW = 4096  # as in kernels.c
 COMPILE_SECONDS = 300  # of a busy machine; an idle one takes three
+BFLOAT16_FEATURES = {"avx512_bf16", "amx_bf16"}  # as Linux names them
 DTYPES = {torch.bfloat16: "bfloat16", torch.float32: "float32"}
 
 LOGGER = logging.getLogger("latentplan")
@@ -174,6 +175,16 @@ def _compile(names: Sequence[str], options: Sequence[str]) -> ctypes.CDLL:
     return load_cached(f"kernels-{key}.so", build)
 
 
+@functools.cache
+def find_fast_dtype() -> torch.dtype:
+    """The precision in which this processor multiplies matrices fastest.
+
+    Torch emulates bfloat16 on a processor without instructions for it, fifty times as slow as float32.
+    """
+    return torch.bfloat16 if BFLOAT16_FEATURES & set(_describe_processor().split()) else torch.float32
+
+
+@functools.cache
 def _describe_processor() -> str:
     """The features of this processor, on which compiled code depends."""
     try:
