@@ -1,12 +1,16 @@
-// Vectors of sixteen numbers for elementwise work that learns. The compiler splits them where registers are narrower.
-// `left` is how many numbers a row still has: beyond them, loads give zeros and stores write nothing.
+// Vectors for elementwise work that learns, as wide as the registers. `left` is how many numbers a row still has: beyond
+// them, loads give zeros and stores write nothing.
 
 #ifndef LATENTPLAN_WIDE_H
 #define LATENTPLAN_WIDE_H
 
 #include "products.h"
 
+#if PAIR == 2
 #define LANES 16
+#else
+#define LANES 8
+#endif
 
 typedef real wide __attribute__((vector_size(LANES * sizeof(real))));
 
@@ -47,12 +51,19 @@ static inline wide sigmoid_of(wide x) {
 
 static inline wide load(const real *from, long left) {
     wide values = {0};
-    memcpy(&values, from, left >= LANES ? sizeof values : (size_t)left * sizeof(real));
+    // A copy of constant size is one instruction; the compiler calls a function for any other.
+    if (left >= LANES)
+        memcpy(&values, from, sizeof values);
+    else
+        for (long i = 0; i < left; i++) values[i] = from[i];
     return values;
 }
 
 static inline void store(real *to, wide values, long left) {
-    memcpy(to, &values, left >= LANES ? sizeof values : (size_t)left * sizeof(real));
+    if (left >= LANES)
+        memcpy(to, &values, sizeof values);
+    else
+        for (long i = 0; i < left; i++) to[i] = values[i];
 }
 
 static inline wide load_half(const half *from, long left) { return load(from, left); }
