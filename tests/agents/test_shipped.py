@@ -21,7 +21,7 @@ FLOORS = {
     "finger-spin": (75, 60),  #        122        0
     "pendulum-swingup": (75, 100),  #  205        0
     "reacher-easy": (50, 100),  #      188        0
-    "walker-run": (75, 30),  #          57        7
+    "walker-run": (125, 50),  #         78        9
     "walker-stand": (75, 95),  #       150       39
     "walker-walk": (75, 55),  #        112        7
 }

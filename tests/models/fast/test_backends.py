@@ -158,18 +158,28 @@ def test_backend_equals_the_reference_in_float32(kind, path):
 def test_cpu_backend_is_as_near_to_float32_as_the_reference_in_bfloat16(call, path, monkeypatch):
     """Rounding to bfloat16 happens elsewhere in every path, so only the size of the error can be compared."""
     fast, rounded, exact = build(CpuBackend()), build(Backend(torch.bfloat16)), build(Backend())
+    fast.backend.trunk_dtype = torch.bfloat16  # also on a processor where float32 is faster
     with torch.no_grad():
         if path == "compiled" and fast.backend._packed(fast) is None:
             pytest.skip("no compiler, or a processor without bfloat16 products")
         if path != "compiled":
             monkeypatch.setattr(rollout.compiled, "pack", lambda *_: None)
             fast.backend = CpuBackend()
+            fast.backend.trunk_dtype = torch.bfloat16
         if path == "torch":
             monkeypatch.setattr(library, "load", lambda **_: None)
         parts = zip(*(flat(call(model)) for model in (fast, rounded, exact)), strict=True)
         for found, by_reference, truth in parts:
             error, reference_error = ((part - truth).square().mean().sqrt() for part in (found, by_reference))
             assert found.dtype == torch.float32 and 0.0 < error < 1.2 * reference_error
+
+
+@pytest.mark.parametrize(
+    ("features", "dtype"), [("avx2 fma", torch.float32), ("avx512f", torch.float32), ("avx512_bf16", torch.bfloat16)]
+)
+def test_fast_dtype_is_bfloat16_only_where_the_processor_multiplies_it(features, dtype, monkeypatch):
+    monkeypatch.setattr(library, "_describe_processor", lambda: f"flags\t\t: fpu {features} sse")
+    assert library.find_fast_dtype.__wrapped__() == dtype
 
 
 def test_accelerate_chooses_the_backend_of_the_device():

@@ -225,7 +225,7 @@ def test_torch_computes_where_there_are_no_kernels(model, frames, monkeypatch):
         for backend in (fast, plain)
     ]  # fmt: skip
     assert all(torch.equal(ours, theirs) for ours, theirs in zip(*pairs, strict=True))
-    assert fast.frozen_dtype(model) == torch.bfloat16
+    assert fast.frozen_dtype(model) == fast.trunk_dtype
 
 
 def test_default_sizes_fit_the_compiled_functions():
