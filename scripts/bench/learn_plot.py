@@ -11,7 +11,7 @@ from bench.anchors import METHODS, published_returns_of
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-MARKERS = "sD^v<>PX*hp"  # one marker for each method in METHODS
+MARKERS = "D^8svd<>PX*hp"  # one marker for each method in METHODS
 
 
 class Point(NamedTuple):

@@ -7,7 +7,7 @@ from dataclasses import replace
 import benchmark
 import numpy as np
 import pytest
-from bench.anchors import METHODS, published_returns_of
+from bench.anchors import METHODS, METHODS_AT_REPEAT_2, TASK_GROUPS, published_returns_of
 from bench.estimates import interquartile_estimate, mean_estimate
 from bench.learn import check_same, compare, first_reaching, read_run, run_facts
 from bench.learn_plot import MARKERS, Curve, Point
@@ -40,10 +40,17 @@ def test_compare_sets_runs_beside_published_returns_at_the_same_frames():
     own, other = rows["latentplan"], rows["DreamerV3"]
     assert own["returns"] == {100_000: 700.0} and own["intervals"][100_000][0] < 700.0
     assert own["frames_to"] == {"600": 100_500, "800": None}
-    assert (other["returns"][100_000], other["frames_to"]) == (605, {"600": 100_000, "800": 200_000})
+    assert (other["returns"][100_000], other["frames_to"]) == (625.3, {"600": 100_000, "800": 200_000})
     assert rows["ResAct (own repeat)"]["returns"] == {100_000: 772}
-    assert len(MARKERS) == len(METHODS) and set(published_returns_of("walker-walk")) == set(METHODS)
     assert list(compare("fish-swim", [curves[0]._replace(task="fish-swim")], [600])) == ["latentplan"]
+
+
+def test_every_published_method_has_a_name_and_a_marker_and_every_task_of_dmc20_has_methods():
+    known = {task: published_returns_of(task) for task in TASK_GROUPS["dmc20"]}
+    assert {method for returns in known.values() for method in returns} == set(METHODS)
+    assert len(MARKERS) == len(METHODS) and list(known["walker-run"]) == list(METHODS_AT_REPEAT_2)
+    assert all({"DreamerV3", "MR.Q", "DrQ-v2", "CURL"} <= set(returns) for returns in known.values())
+    assert set(TASK_GROUPS["dev"]) < set(TASK_GROUPS["dmc20"])
 
 
 def test_learn_collects_finished_runs_without_repeating_them(tmp_path, capsys):
