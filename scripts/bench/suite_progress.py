@@ -69,7 +69,7 @@ class Board:
         for run in active:
             self._progress[run] = measure_progress(run)
             if self._read(run):
-                self._write(run)
+                self._write(run, "at")
         if sys.stdout.isatty():
             print(f"\r\x1b[K{self.status()}", end="", flush=True)
 
@@ -81,8 +81,7 @@ class Board:
         """Take the last rows of a run."""
         self._progress[run] = measure_progress(run)
         self._read(run)
-        self._print(f"{run.name}: finished after {self._progress[run].minutes:,.1f} min")
-        self._write(run)
+        self._write(run, "finished at")
 
     def fail(self, run: TrainingRun, reason: str) -> None:
         """Remember why a run failed; the next start of the sweep tries the run again."""
@@ -101,7 +100,8 @@ class Board:
         failed = f", {len(self.failures)} failed" if self.failures else ""
         going = {run: progress for run, progress in self._progress.items() if run not in self.failures}
         left = estimate_minutes_left(going, self.jobs)
-        return f"{finished} of {len(self.runs)} runs finished{failed}, {share:.1%} of all; {format_left(left)}"
+        rest = f"; {format_left(left)}" if finished < len(self.runs) else ""
+        return f"{finished} of {len(self.runs)} runs finished{failed}, {share:.1%} of the work{rest}"
 
     def _read(self, run: TrainingRun) -> bool:
         """Read the rows of a run if its files have changed; returns whether its rows have changed."""
@@ -120,12 +120,13 @@ class Board:
         self.rows = merge_rows(self.rows, rows)
         return True
 
-    def _write(self, run: TrainingRun) -> None:
+    def _write(self, run: TrainingRun, where: str) -> None:
+        """Write all rows, and print the last one of a run."""
         write_rows(self.results, self.rows)
         if self._seen.get(run):
             last = self._seen[run][-1]
-            clocks = f"{last.env_frames:,} frames in {last.minutes:,.1f} min"
-            self._print(f"{run.name}: {clocks}, planner {last.planner:.1f}, actor {last.actor:.1f}")
+            clocks = f"{last.env_frames:,} frames, {last.minutes:,.1f} min"
+            self._print(f"{run.name}: {where} {clocks}: planner {last.planner:.1f}, actor {last.actor:.1f}")
         self._print(self.status())
 
     def _print(self, line: str) -> None:

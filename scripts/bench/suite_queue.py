@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Protocol
 
 from bench.runs import TrainingRun
-from latentplan.config import UserError, make_folder
+from latentplan.config import UserError
 from latentplan.config.checks import cut
 from latentplan.config.run_folder import lock_folder
 from latentplan.training.signals import Signals
@@ -34,7 +34,7 @@ class Observer(Protocol):
     """What is told about the runs of a queue."""
 
     def begin(self, run: TrainingRun) -> None:
-        """A process of the run is about to start."""
+        """A process of the run is about to start; its folder is made here."""
 
     def look(self, active: Sequence[TrainingRun]) -> None:
         """These runs are active; called once per second."""
@@ -133,7 +133,6 @@ class Queue:
 
 def _start(run: TrainingRun) -> subprocess.Popen[bytes]:
     command = run.command()
-    make_folder(run.folder)
     with (run.folder / LOG).open("ab") as log:
         return subprocess.Popen(
             command,

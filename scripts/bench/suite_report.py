@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import os
+import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
@@ -183,9 +183,10 @@ def _methods_with(tasks: Sequence[str], known: int) -> dict[str, np.ndarray]:
 
 
 def _best_published(task: str, frames: int) -> float:
-    """The highest mean of the methods with action repeat 2 at these frames; 0 without any."""
+    """The highest mean of the methods with action repeat 2 at these frames; infinite without any."""
     known = published_returns_of(task)
-    return max((known[name].get(frames, 0.0) for name in METHODS_AT_REPEAT_2 if name in known), default=0.0)
+    means = [known[name][frames] for name in METHODS_AT_REPEAT_2 if frames in known.get(name, {})]
+    return max(means, default=math.inf)
 
 
 def _shown_returns(task: str, method: str) -> str:
@@ -223,4 +224,4 @@ def _markdown(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
 
 def _picture(kind: str, png: Path) -> str:
     words = {"curves": "Evaluation returns against frames", "profile": "Share of runs above each return"}
-    return f"![{words[kind]}]({os.path.basename(png)})"
+    return f"![{words[kind]}]({png.name})"

@@ -14,7 +14,7 @@ from typing import NamedTuple
 from bench.report import write_csv, write_json
 from bench.runs import TrainingRun, read_evaluations
 from latentplan import __version__
-from latentplan.config import UserError
+from latentplan.config import UserError, make_folder
 from latentplan.config.estimates import count_cores
 from latentplan.config.reading import LARGEST_DATA, read_text
 
@@ -82,6 +82,7 @@ def note_origin(folder: Path, origin: Origin) -> None:
     if before is not None:
         hardware, commit = (_join(old, new) for old, new in zip(before[:2], origin[:2], strict=True))
         origin = Origin(hardware, commit, before.version)
+    make_folder(folder)
     write_json(folder / ORIGIN, origin._asdict())
 
 
