@@ -95,7 +95,7 @@ def run(request: Request) -> int:
         wanted = {(each.task, each.seed) for each in request.runs}
         rows = [row for row in board.rows if (row.task, row.seed) in wanted]
         if board.failures:
-            print(f"{len(board.failures)} runs failed; the same command tries them again")
+            print(f"runs that failed: {len(board.failures)}; the same command tries them again")
     if request.report is not None:
         from bench.suite_report import write_report
 

@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 from bench.runs import FINAL, METRICS, TrainingRun, read_progress
 from bench.suite_queue import LOG
-from bench.suite_rows import Origin, Row, merge_rows, note_origin, read_rows, rows_of, write_rows
+from bench.suite_rows import Origin, Row, merge_rows, note_origin, read_origin, read_rows, rows_of, write_rows
 from latentplan.config import UserError
 
 LOOK_S = 5.0
@@ -57,7 +57,7 @@ class Board:
 
     def begin(self, run: TrainingRun) -> None:
         """Note the origin of a run, whose process is about to start."""
-        is_begun = (run.folder / METRICS).exists()
+        is_begun = read_origin(run.folder) is not None
         note_origin(run.folder, self.origin)
         self._print(f"{run.name}: {'goes on' if is_begun else 'begins'}; its log is {run.folder / LOG}")
 
@@ -66,10 +66,8 @@ class Board:
         if time.monotonic() - self._looked < LOOK_S:
             return
         self._looked = time.monotonic()
-        for run in active:
-            self._progress[run] = measure_progress(run)
-            if self._read(run):
-                self._write(run, "at")
+        if any([self._update(run) for run in active]):
+            self._print(self.status())
         if sys.stdout.isatty():
             print(f"\r\x1b[K{self.status()}", end="", flush=True)
 
@@ -79,19 +77,26 @@ class Board:
 
     def finish(self, run: TrainingRun) -> None:
         """Take the last rows of a run."""
-        self._progress[run] = measure_progress(run)
-        self._read(run)
-        self._write(run, "finished at")
+        self._update(run)
+        self._print(f"{run.name}: finished")
+        self._print(self.status())
 
     def fail(self, run: TrainingRun, reason: str) -> None:
         """Remember why a run failed; the next start of the sweep tries the run again."""
+        self._update(run)
         self.failures[run] = reason
         self._print(f"{run.name}: failed, {reason}")
+        self._print(self.status())
 
     def stop(self, active: Sequence[TrainingRun]) -> None:
         """Say that runs save themselves."""
         names = "; ".join(run.name for run in active)
         self._print(f"stopping, after a save of {names}" if names else "stopping")
+
+    def pause(self, run: TrainingRun) -> None:
+        """Take the last rows of a run that has saved itself."""
+        self._update(run)
+        self._print(f"{run.name}: saved")
 
     def status(self) -> str:
         """One line about the whole sweep."""
@@ -120,14 +125,20 @@ class Board:
         self.rows = merge_rows(self.rows, rows)
         return True
 
-    def _write(self, run: TrainingRun, where: str) -> None:
-        """Write all rows, and print the last one of a run."""
+    def _update(self, run: TrainingRun) -> bool:
+        """Measure how far a run is, and take its rows; writes all rows if those of the run have changed.
+
+        Returns:
+            Whether the rows have changed; the last row of the run is printed then.
+        """
+        self._progress[run] = measure_progress(run)
+        if not self._read(run) or not self._seen[run]:
+            return False
         write_rows(self.results, self.rows)
-        if self._seen.get(run):
-            last = self._seen[run][-1]
-            clocks = f"{last.env_frames:,} frames, {last.minutes:,.1f} min"
-            self._print(f"{run.name}: {where} {clocks}: planner {last.planner:.1f}, actor {last.actor:.1f}")
-        self._print(self.status())
+        last = self._seen[run][-1]
+        clocks = f"{last.env_frames:,} frames in {last.minutes:,.1f} min"
+        self._print(f"{run.name}: {clocks}, planner {last.planner:.1f}, actor {last.actor:.1f}")
+        return True
 
     def _print(self, line: str) -> None:
         print(("\r\x1b[K" if sys.stdout.isatty() else "") + line, flush=True)

@@ -51,6 +51,9 @@ class Observer(Protocol):
     def stop(self, active: Sequence[TrainingRun]) -> None:
         """A signal ends the queue, and these runs save themselves."""
 
+    def pause(self, run: TrainingRun) -> None:
+        """The run has ended after the signal, and goes on at the next start."""
+
 
 class Queue:
     """Training runs in the order in which they start.
@@ -127,7 +130,9 @@ class Queue:
             if code == 0:
                 run.mark_finished()
                 self.observer.finish(run)
-            elif not (self._is_stopping and code in STOPPED):
+            elif self._is_stopping and code in STOPPED:
+                self.observer.pause(run)
+            else:
                 self.observer.fail(run, _describe_end(code, run.folder / LOG))
 
 

@@ -189,7 +189,7 @@ def test_failed_run_is_reported_and_tried_again_and_stops_no_other(tmp_path, cap
     assert sweep(tmp_path) == 1
     printed = capsys.readouterr().out
     assert "walker-walk, seed 0: failed, exit code 2: error: this run is broken" in printed
-    assert "1 runs failed" in printed and "5 of 6 runs finished, 1 failed" in printed
+    assert "runs that failed: 1;" in printed and "5 of 6 runs finished, 1 failed" in printed
     broken.unlink()
     before = processes(tmp_path)
     assert sweep(tmp_path) == 0
