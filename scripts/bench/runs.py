@@ -237,12 +237,11 @@ def _comparable_settings(config: Config) -> dict[str, Any]:
 
 
 def _read_metrics(path: Path) -> Iterator[Evaluation]:
-    columns = {"planner_return": "planner", "actor_return": "actor"}
+    """The evaluations of a file of metrics, whose columns `actor` and `value` are losses."""
     for row in _read_rows(path):
         if row["planner_return"]:
-            values = {columns.get(name, name): text for name, text in row.items()}
-            evaluation = Evaluation(*(float(values[name]) for name in Evaluation._fields))  # type: ignore[arg-type]
-            yield evaluation._replace(env_frames=int(evaluation.env_frames), updates=int(evaluation.updates))
+            returns = float(row["planner_return"]), float(row["actor_return"])
+            yield Evaluation(int(row["env_frames"]), float(row["minutes"]), *returns, int(row["updates"]))
 
 
 def _read_rows(path: Path) -> Iterator[dict[str, str]]:

@@ -116,7 +116,9 @@ class Board:
             return False
         try:
             rows = rows_of(run)
-        except UserError:  # a file that is just being written, or damaged, which the run itself reports
+        except UserError as error:
+            if run.is_finished():  # else a file may just be written
+                self._print(f"{run.name}: {error}")
             return False
         self._changes[run] = changes
         if rows == self._seen.get(run, []):

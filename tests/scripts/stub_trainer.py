@@ -12,7 +12,7 @@ import time
 from pathlib import Path
 
 STEP, PAUSE_S = 20, 0.02
-HEADER = "env_frames,updates,minutes,planner_return,actor_return"
+HEADER = "env_frames,updates,minutes,planner_return,actor_return,actor"  # the last is a loss
 
 
 def main(words):
@@ -34,13 +34,14 @@ def main(words):
         save.mkdir(parents=True)
         (save / "frames").write_text("0")
         metrics.write_text(HEADER + "\n")
-    lines = metrics.read_text().splitlines()[: 1 + frames // STEP]
+    lines = metrics.read_text().splitlines()[: 1 + 2 * (frames // STEP)]
     while frames < int(flags["--frames"]):
         time.sleep(PAUSE_S)
         if stopped:
             return 128 + stopped[0]
         frames += STEP
-        lines.append(f"{frames},{frames // 2},{frames / 10},{frames * 1.5},{frames * 1.25}")
+        clocks = f"{frames},{frames // 2},{frames / 10}"
+        lines += [f"{clocks},,,0.5", f"{clocks},{frames * 1.5},{frames * 1.25},"]
         metrics.write_text("\n".join(lines) + "\n")
         part = save / "frames.part"
         part.write_text(str(frames))

@@ -328,6 +328,14 @@ def test_evaluations_of_an_extended_run_keep_those_after_its_former_end(tmp_path
     assert [(each.env_frames, each.planner) for each in read_evaluations(tmp_path)] == [(20, 1.0), (40, 7.0), (60, 5.0)]
 
 
+def test_finished_run_with_damaged_results_is_named(tmp_path, capsys):
+    assert sweep(tmp_path) == 0
+    (tmp_path / "walker-walk-seed0" / "final.json").write_text("{")
+    assert sweep(tmp_path) == 0
+    assert "walker-walk, seed 0: the results in" in capsys.readouterr().out
+    assert len({(row.task, row.seed) for row in read_rows(tmp_path / "results.csv")}) == 6  # known rows stay
+
+
 def test_time_left_counts_what_is_left_over_the_runs_side_by_side(tmp_path):
     some = [TrainingRun("walker-walk", seed, tmp_path / str(seed), ("--frames", "100")) for seed in range(4)]
     assert estimate_minutes_left(dict.fromkeys(some, Progress(0.0, 0.0)), 2) is None
