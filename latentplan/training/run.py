@@ -24,7 +24,7 @@ from latentplan.agents.files import is_checkpoint
 from latentplan.config import USER_DOMAIN, Config, Device, EnvironmentFault, UserError, derive_seed
 from latentplan.config.commit import Save
 from latentplan.config.files import dump_config, read_config
-from latentplan.config.run_folder import RUN_FILE, SAVES_FOLDER, read_run_config, run_saves
+from latentplan.config.run_folder import RUN_FILE, SAVES_FOLDER, lock_folder, read_run_config, run_saves
 from latentplan.envs import default_task
 from latentplan.models import WorldModel
 from latentplan.models.fast import accelerate
@@ -49,7 +49,6 @@ from latentplan.training.state import (
     METRICS_FILE,
     RunState,
     SavedRun,
-    lock_folder,
     read_state,
     refuse_used,
     restore_learner,
