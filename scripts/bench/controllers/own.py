@@ -18,7 +18,6 @@ from bench.controllers.serve import Entry, serve
 from bench.controllers.task import GRADIENT_COST, Act, Task
 from latentplan.planning import PLANNERS, ModelPredictiveController, make_planner
 
-
 WIDTHS = tuple({"width": width} for width in (1.0, 1.5, 2.0))  # standard deviations, in halves of the action range
 
 
