@@ -15,6 +15,7 @@ from typing import Any
 
 from latentplan.config import MAX_THREADS, Config, Device, ModelConfig, PlannerConfig, UserError, from_dict, to_dict
 from latentplan.config.checks import EnvironmentFault, cut, shown, within
+from latentplan.config.env_id import as_file_name
 from latentplan.config.estimates import check_parts, estimate_search
 from latentplan.config.extras import describe_missing, extra_of
 from latentplan.config.files import build_config, has_cuda
@@ -169,7 +170,8 @@ def name_folder(kind: str, info: Mapping[str, Any]) -> Path:
         kind: First word of the name, such as `distilled`.
         info: Content of the `info.json` of the agent.
     """
-    return Path("runs") / f"{kind}-{info['domain']}-{info['task']}-{datetime.now():%Y%m%d-%H%M%S}"
+    name = as_file_name(f"{kind}-{info['domain']}-{info['task']}")
+    return Path("runs") / f"{name}-{datetime.now():%Y%m%d-%H%M%S}"
 
 
 @contextlib.contextmanager

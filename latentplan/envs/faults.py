@@ -29,6 +29,8 @@ def check_picture(picture: Any, shape: tuple[int, ...]) -> np.ndarray:
     wanted = f"the environment must return frames uint8 {shape}"
     try:
         given = np.asarray(picture)
+    except EnvironmentFault:
+        raise
     except (TypeError, ValueError):
         raise EnvironmentFault(f"{wanted}, got {type(picture).__name__}") from None
     if given.dtype == np.uint8 and given.shape == shape:
