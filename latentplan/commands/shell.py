@@ -36,21 +36,21 @@ def run_guarded(command: Callable[[Sequence[str]], int], argv: Sequence[str]) ->
         finally:
             sys.stdout.flush()
     except EnvironmentFault as error:
-        code = _refuse(str(error))
+        code = refuse(str(error))
         print(error.origin, file=sys.stderr, end="")
         return code
     except (UserError, FloatingPointError) as error:
-        return _refuse(str(error))
+        return refuse(str(error))
     except ModuleNotFoundError as error:
         if extra_of(error.name) is None:
             raise
-        return _refuse(describe_missing(str(error.name), "this command"))
+        return refuse(describe_missing(str(error.name), "this command"))
     except MemoryError:
-        return _refuse("not enough memory: lower the sizes that were asked for, or end other programs")
+        return refuse("not enough memory: lower the sizes that were asked for, or end other programs")
     except RuntimeError as error:
         if not _is_out_of_memory(error):
             raise
-        return _refuse("not enough memory on the device: lower the sizes that were asked for, or end other programs")
+        return refuse("not enough memory on the device: lower the sizes that were asked for, or end other programs")
     except KeyboardInterrupt:
         return 130
     except BrokenPipeError:
@@ -60,7 +60,7 @@ def run_guarded(command: Callable[[Sequence[str]], int], argv: Sequence[str]) ->
         if error.strerror is None:
             raise
         name = "" if error.filename is None else f": {shown(str(error.filename))}"
-        return _refuse(f"the system refused a file or a process{name}: {error.strerror}")
+        return refuse(f"the system refused a file or a process{name}: {error.strerror}")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -195,7 +195,8 @@ def _is_out_of_memory(error: RuntimeError) -> bool:
     return "can't allocate memory" in text or "out of memory" in text or "Storage size calculation overflowed" in text
 
 
-def _refuse(message: str) -> int:
+def refuse(message: str) -> int:
+    """Prints an error as one line on stderr, and returns the exit code 2."""
     line = cut(" ".join(message.split())).encode(sys.stderr.encoding or "utf-8", "backslashreplace")
     print(f"error: {line.decode(sys.stderr.encoding or 'utf-8')}", file=sys.stderr)
     return 2

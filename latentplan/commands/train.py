@@ -8,7 +8,7 @@ from typing import Any
 
 from latentplan.commands.flags import overrides
 from latentplan.config import Config, UserError
-from latentplan.config.env_id import FLAG, by_id, import_named
+from latentplan.config.env_id import FLAG, import_named, lay_env
 from latentplan.config.files import Preset, compose, read_layer
 from latentplan.config.parsing import option
 from latentplan.config.run_folder import read_run_config
@@ -48,13 +48,7 @@ class Request:
     resume: Path | None = option(None, metavar="DIR")
 
     def __post_init__(self) -> None:
-        if self.env_id is not None:
-            by_id(self.env_id)
-            for name in ("domain", "task", "suite"):
-                if name in self.settings.get("env", {}):
-                    flag = SHORT_FLAGS.get(f"env.{name}", f"--env.{name}")
-                    why = "an environment of gymnasium's registry has an id, one of a suite a domain and a task"
-                    raise UserError(f"{FLAG} and {flag} cannot both be given: {why}")
+        lay_env(self.settings.get("env", {}), self.env_id)
 
 
 def run(request: Request) -> int:
@@ -81,7 +75,7 @@ def resolve(request: Request) -> Config:
     if request.resume is None:
         given = request.settings
         if request.env_id is not None:
-            given = {**given, "env": {**given.get("env", {}), **by_id(request.env_id)}}
+            given = {**given, "env": lay_env(given.get("env", {}), request.env_id)}
         return compose(read_layer(request.config) if request.config else {}, given, request.preset)
     if not request.resume.is_dir():
         raise UserError(f"nothing to resume in {request.resume}: give the folder of a run")

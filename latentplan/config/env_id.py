@@ -50,6 +50,23 @@ def by_id(env_id: str) -> dict[str, Any]:
     return {"suite": ID_SUITE, "domain": ID_DOMAIN, "task": env_id}
 
 
+def lay_env(given: Mapping[str, Any], env_id: str | None) -> dict[str, Any]:
+    """The section `env` that flags give: those of the section, and an id, which names the environment alone.
+
+    Raises:
+        UserError: Both name an environment, or the text is no id.
+    """
+    if env_id is None:
+        return dict(given)
+    for name, flag in {"domain": "--domain", "task": "--task", "suite": "--env.suite"}.items():
+        if name in given:
+            raise UserError(
+                f"{FLAG} and {flag} cannot both be given: an environment of gymnasium's registry has an id, one of a "
+                "suite a domain and a task"
+            )
+    return {**given, **by_id(env_id)}
+
+
 def is_by_id(env: EnvConfig) -> bool:
     """Whether an environment of gymnasium's registry is named by its id."""
     return env.suite == ID_SUITE

@@ -26,9 +26,7 @@ def check_settings(config: Config) -> None:
     if config.run.run_dir is not None:
         check_folder(config.run.run_dir)
     env, learning = config.env, config.learning
-    if env.domain != USER_DOMAIN:
-        check_task(env.suite, env.domain, env.task)
-    check_env_options(env)
+    check_env_settings(env)
     if env.suite == DEFAULT_SUITE and env.domain != USER_DOMAIN:
         known = scales(env.domain)
         if env.objective is not None:
@@ -44,12 +42,14 @@ def check_settings(config: Config) -> None:
             raise_unknown("planner", config.planner.method, PLANNERS)
 
 
-def check_env_options(env: EnvConfig) -> None:
-    """Refuses settings of the environment that have no effect in it, and ids that gymnasium's registry does not have.
+def check_env_settings(env: EnvConfig) -> None:
+    """Refuses names of environments that do not exist, and settings that have no effect in the environment.
 
     Raises:
-        UserError: A setting has no effect, or there is no such environment.
+        UserError: There is no such environment, or a setting has no effect.
     """
+    if env.domain != USER_DOMAIN:
+        check_task(env.suite, env.domain, env.task)
     if is_by_id(env) and env.domain != USER_DOMAIN:
         if env.objective is not None:
             raise UserError(f"env.objective needs a domain with named quantities; {env.task} returns its own reward")
