@@ -40,7 +40,8 @@ def run(request: Request) -> int:
         for suite in SUITES:
             names = list_ids() if suite == ID_SUITE else [f"{domain}-{task}" for domain, task in list_tasks(suite)]
             print(f"{suite}, {len(names)} environments")
-            print(textwrap.fill(", ".join(names), WIDTH, initial_indent="  ", subsequent_indent="  "))
+            text = textwrap.fill(", ".join(names), WIDTH - 2, break_on_hyphens=False)
+            print(textwrap.indent(text, "  "))
         print("--suite NAME lists observation, action and length of an episode of each")
     elif request.suite == ID_SUITE:
         for env_id in list_ids():

@@ -16,6 +16,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from latentplan.config.checks import EnvironmentFault, UserError, cut, shown
+from latentplan.config.extras import extra_of
 from latentplan.config.parsing import option
 from latentplan.config.settings import EnvConfig, Pixels
 from latentplan.config.suites import ID_DOMAIN, ID_SUITE
@@ -103,13 +104,15 @@ def import_named(env_id: str) -> None:
         importlib.import_module(module)
     except ModuleNotFoundError as error:
         if error.name is not None and (module == error.name or module.startswith(f"{error.name}.")):
+            top = module.partition(".")[0]
+            extra = f"pip install 'latentplan[{extra_of(top)}]'" if extra_of(top) else "install its package"
             raise UserError(
-                f"{FLAG} {env_id}: there is no module {module} to import; install its package, or run the command in "
-                f"the folder of {module.partition('.')[0]}.py"
+                f"{FLAG} {env_id}: there is no module {module} to import; {extra}, or run the command in the folder of "
+                f"{top}.py"
             ) from None
+        what = f"'latentplan[{extra_of(error.name)}]'" if extra_of(error.name) else error.name
         raise UserError(
-            f"{FLAG} {env_id}: the module {module} needs {error.name}, which is not installed; run: pip install "
-            f"{error.name}"
+            f"{FLAG} {env_id}: the module {module} needs {error.name}, which is not installed; run: pip install {what}"
         ) from None
     except Exception as error:  # the code of the module may raise anything
         import traceback

@@ -13,6 +13,8 @@ EXTRAS = {
         *("shtab", "tensorboard", "yaml"),
     ),
     "jax": ("jax",),
+    "gymnasium": ("imageio", "pygame"),
+    "robotics": ("gymnasium_robotics",),
 }
 """By extra, the modules that it installs and the package without extras does not."""
 

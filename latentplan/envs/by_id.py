@@ -11,6 +11,7 @@ from gymnasium.error import DependencyNotInstalled, UnregisteredEnv
 from latentplan.config import EnvConfig, UserError
 from latentplan.config.checks import nearest
 from latentplan.config.env_id import FLAG, require_imported, split_id
+from latentplan.config.extras import extra_of
 from latentplan.config.reading import read_kwargs
 from latentplan.envs.faults import describe_failure
 from latentplan.envs.rendered import MODE
@@ -45,8 +46,11 @@ def make_inner(config: EnvConfig) -> gymnasium.Env[Any, Any]:
     except (DependencyNotInstalled, UnregisteredEnv) as error:
         raise UserError(f"cannot make {name}: {' '.join(str(error).split())}") from None
     except ModuleNotFoundError as error:
-        remedy = f"pip install {error.name}, or 'latentplan[gymnasium]' for the environments of gymnasium itself"
-        raise UserError(f"cannot make {name}: it needs {error.name}, which is not installed; run: {remedy}") from None
+        extra = extra_of(error.name)
+        what = f"'latentplan[{extra}]'" if extra else error.name
+        raise UserError(
+            f"cannot make {name}: it needs {error.name}, which is not installed; run: pip install {what}"
+        ) from None
     except Exception as error:
         if isinstance(error, TypeError) and "argument" in str(error):
             reason = str(error).partition(" was raised from")[0]

@@ -47,20 +47,24 @@ class Report:
 
 
 def check_environment(
-    config: EnvConfig, decisions: int, step_timeout_s: float = CollectionConfig.step_timeout_s
+    config: EnvConfig,
+    decisions: int,
+    step_timeout_s: float = CollectionConfig.step_timeout_s,
+    isolate: bool = True,
 ) -> Report:
-    """Makes an environment as training does, in a process of its own, and plays random and extreme actions.
+    """Makes an environment as training does, and plays random and extreme actions.
 
     Args:
         config: Settings of the environment.
         decisions: Decisions to play, at least 1; fewer where the environment is slow.
         step_timeout_s: Seconds that a reset or a step may take.
+        isolate: Whether the environment runs in a process of its own, so that a crash or a hang is a problem too.
     """
     report = Report()
     try:
         if is_by_id(config) and not _accepts_spaces(config, report):
             return report
-        env = make_guarded_env(config, isolate=True, step_timeout_s=step_timeout_s)
+        env = make_guarded_env(config, isolate=isolate, step_timeout_s=step_timeout_s)
         try:
             report.facts |= describe_spaces(env, config)
             _check_seeding(env, report)

@@ -120,7 +120,8 @@ def describe_failure(error: BaseException) -> UserError:
     while own is not None and own.tb_next is not None and own.tb_frame.f_code.co_filename.startswith(_OWN_FOLDERS):
         own = own.tb_next
     origin = "".join(traceback.format_exception(type(error), error, own))
-    return EnvironmentFault(f"the environment raised {type(error).__name__}: {cut(str(error))}{_advise(error)}", origin)
+    reason = cut(str(error)) or "without a message"
+    return EnvironmentFault(f"the environment raised {type(error).__name__}: {reason}{_advise(error)}", origin)
 
 
 def _advise(error: BaseException) -> str:
@@ -133,6 +134,8 @@ def _advise(error: BaseException) -> str:
             "; reset must return (observation, info), and step (observation, reward, terminated, truncated, info), as "
             "gymnasium.Env describes"
         )
+    if isinstance(error, TypeError) and "not a mapping" in text:
+        return "; reset and step must return a dict as info"
     return ""
 
 

@@ -150,9 +150,11 @@ class Collector:
 
     def describe(self) -> Description:
         """Facts of the environment that the learner needs; renders a few frames to time them."""
-        self._eval_env.reset(seed=0)
-        self._eval_env.step(np.zeros(self.model.action_dim, np.float32))  # its mistakes end the run before it starts
         env = self._eval_env
+        with warnings.catch_warnings():  # a fault ends the run before it starts, so no restart needs a warning
+            warnings.simplefilter("ignore", RuntimeWarning)
+            env.reset(seed=0)
+            env.step(np.zeros(self.model.action_dim, np.float32))
         draw = partial(env.render_large, FRAME_SIZE) if self.config.env.pixels == "render" else env.render
         started = time.perf_counter()
         for _ in range(TIMED_FRAMES):
