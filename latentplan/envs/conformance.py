@@ -111,7 +111,7 @@ def _accepts_spaces(config: EnvConfig, report: Report) -> bool:
         report.facts["own actions"] = describe_space(inner.action_space)
         if config.pixels == "render":
             report.facts["observations"] = f"pictures of render(), in place of {report.facts['observations']}"
-            wrap_user_env(inner, config.action_repeat, pixels="render")
+            wrap_user_env(inner, config.action_repeat, config=config)
         else:
             report.problems += describe_refusals(inner)
     finally:

@@ -10,7 +10,6 @@ import numpy as np
 from gymnasium.error import ResetNeeded
 
 from latentplan.config import EnvConfig, UserError
-from latentplan.config.settings import Pixels
 from latentplan.envs.faults import check_picture, check_reward
 from latentplan.envs.rendered import MODE, RenderedEnv, fit
 from latentplan.envs.suite import FRAME_SIZE
@@ -39,13 +38,13 @@ def make_from(
         env = factory()
         if not isinstance(env, gymnasium.Env):
             raise UserError(f"make_env must return a gymnasium.Env, got {type(env).__name__}")
-        return wrap_user_env(env, config.action_repeat, seed, config.pixels)
+        return wrap_user_env(env, config.action_repeat, seed, config=config)
 
     return build
 
 
 def wrap_user_env(
-    env: gymnasium.Env[Any, Any], action_repeat: int = 1, seed: int | None = None, pixels: Pixels = "observation"
+    env: gymnasium.Env[Any, Any], action_repeat: int = 1, seed: int | None = None, *, config: EnvConfig | None = None
 ) -> PixelEnv:
     """A user's environment with the interface for agents: frames of 64 x 64, actions in [-1, 1], action repeat.
 
@@ -56,8 +55,8 @@ def wrap_user_env(
         action_repeat: Steps of `env` per decision, at least 1; a step of the result repeats the action for this number
             of steps of `env`, or until the episode ends, and sums the rewards.
         seed: Seed of the first reset that is called without one; None draws a seed from the system.
-        pixels: Where the frames come from: `observation`, or `render` for the pictures that `env.render()` draws, which
-            needs `env.render_mode` "rgb_array"; the observations may then be anything.
+        config: Its `pixels` says where the frames come from; None takes `observation`. With `render` they are what
+            `env.render()` draws, which needs `env.render_mode` "rgb_array", and the observations may be anything.
 
     Returns:
         An environment with these properties:
@@ -74,7 +73,7 @@ def wrap_user_env(
         UserError: `action_repeat` is below 1, or a space is not as described; the message names the space and the
             reason and the remedy.
     """
-    env = RenderedEnv(env, FRAME_SIZE) if pixels == "render" else env
+    env = RenderedEnv(env, FRAME_SIZE) if config is not None and config.pixels == "render" else env
     refuse_spaces(env)
     return PixelEnv(env, action_repeat, seed)
 

@@ -24,8 +24,10 @@ from latentplan.commands import train
 from latentplan.commands.flags import overrides, read_request
 from latentplan.config import Config, Device, RunConfig, UserError, make_folder, to_dict
 from latentplan.config.checks import above_zero
+from latentplan.config.env_id import FLAG, as_file_name
 from latentplan.config.files import Preset, read_config
 from latentplan.config.parsing import option
+from latentplan.config.suites import ID_DOMAIN
 
 OWN_FLAGS = {  # settings that flags of this benchmark set for each run
     "env.domain": "--tasks",
@@ -45,7 +47,7 @@ class Request:
     """Flags of `benchmark.py learn`.
 
     Attributes:
-        tasks: Tasks, each as domain-task.
+        tasks: Tasks, each as domain-task, or as gymnasium-ID for an environment of gymnasium's registry.
         seeds: Seeds of each task.
         frames: Simulator frames of each run; without frames and minutes, a run has the budget of the preset.
         minutes: Minutes of each run; with frames given too, a run ends at the first of the two limits.
@@ -101,7 +103,7 @@ def run(request: Request) -> int:
     """Trains the unfinished runs, then collects, tabulates and plots the curves of all runs."""
     tasks, thresholds, mode, out = request.tasks, request.thresholds, request.mode, request.out
     budget, extra = request.budget, request.forwarded
-    folders = {(task, seed): out / f"{task}-seed{seed}" for task in tasks for seed in request.seeds}
+    folders = {(task, seed): out / as_file_name(f"{task}-seed{seed}") for task in tasks for seed in request.seeds}
     for (task, seed), folder in folders.items():  # refuses a mistake in any run before the first run begins
         asked = read_request(train.Request, _new_run_flags(task, seed, folder, budget, extra))
         check_same(train.resolve(asked), folder)
@@ -286,7 +288,9 @@ def _train(task: str, seed: int, folder: Path, budget: list[str], extra: list[st
         print(f"{folder} is finished and not repeated", flush=True)
         return
     is_begun = (folder / "config.yaml").exists()
-    arguments = ["--resume", str(folder), *budget] if is_begun else _new_run_flags(task, seed, folder, budget, extra)
+    arguments = _new_run_flags(task, seed, folder, budget, extra)
+    if is_begun:
+        arguments = ["--resume", str(folder), *budget, *(arguments[:2] if arguments[0] == FLAG else [])]
     script = Path(__file__).resolve().parent.parent / "train.py"
     print(f"training {task}, seed {seed}", flush=True)
     training = subprocess.Popen([sys.executable, str(script), *arguments])
@@ -313,8 +317,8 @@ def _read_budget(marker: Path) -> list[str] | None:
 
 def _new_run_flags(task: str, seed: int, folder: Path, budget: list[str], extra: list[str]) -> list[str]:
     domain, _, name = task.partition("-")
-    chosen = ["--domain", domain, *(["--task", name] if name else []), "--seed", str(seed)]
-    return [*chosen, "--run-dir", str(folder), *budget, *extra]
+    chosen = [FLAG, name] if domain == ID_DOMAIN else ["--domain", domain, *(["--task", name] if name else [])]
+    return [*chosen, "--seed", str(seed), "--run-dir", str(folder), *budget, *extra]
 
 
 def _final_row(name: str, facts: dict[str, Any]) -> list[str]:

@@ -98,7 +98,7 @@ def test_make_env_makes_the_environment_with_its_arguments():
 
 def test_rendered_pictures_are_squeezed_whole_and_drawn_once_per_decision():
     inner = odd.State(render_mode="rgb_array")
-    env = wrap_user_env(inner, action_repeat=3, pixels="render")
+    env = wrap_user_env(inner, action_repeat=3, config=EnvConfig(pixels="render"))
     frame, _ = env.reset(seed=0)
     assert frame.shape == (64, 64, 3) and inner.num_drawn == 1
     for _ in range(20):
