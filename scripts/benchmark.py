@@ -30,6 +30,7 @@ COMMANDS = {
         "bench.hostile", "hostile command lines and files: refused in one line, and in how many seconds"
     ),
     "learn": Command("bench.learn", "learning curves over tasks and seeds: frames and minutes to a return"),
+    "suite": Command("bench.suite", "many tasks and seeds beside published returns, over any number of interruptions"),
 }
 
 

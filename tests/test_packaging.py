@@ -17,7 +17,9 @@ from packaging.version import Version
 ROOT = Path(__file__).resolve().parent.parent
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())
 EXTRAS = PROJECT["project"]["optional-dependencies"]
-LISTED = [Requirement(text) for text in PROJECT["project"]["dependencies"] + EXTRAS["train"] + EXTRAS["dev"]]
+LISTED = [
+    Requirement(text) for text in PROJECT["project"]["dependencies"] + EXTRAS["train"] + EXTRAS["bench"] + EXTRAS["dev"]
+]
 REQUIREMENTS = [requirement for requirement in LISTED if requirement.name != "latentplan"]
 
 
@@ -36,10 +38,10 @@ def test_every_dependency_is_pinned_inside_its_range(requirement, pins):
     assert pins[canonicalize_name(requirement.name)] in requirement.specifier
 
 
-@pytest.mark.parametrize("name", ["torch", "mujoco", "dm-control", "lightning"])
+@pytest.mark.parametrize("name", ["torch", "mujoco", "dm-control", "lightning", "pandas"])
 def test_versions_known_to_break_lie_outside_the_ranges(name):
-    broken = {"torch": "2.9.1", "mujoco": "4.0.0", "dm-control": "1.1.0", "lightning": "2.6.3"}
-    works = {"torch": "2.11.0", "mujoco": "3.17.0", "dm-control": "1.0.50", "lightning": "2.6.6"}
+    broken = {"torch": "2.9.1", "mujoco": "4.0.0", "dm-control": "1.1.0", "lightning": "2.6.3", "pandas": "3.1.1"}
+    works = {"torch": "2.11.0", "mujoco": "3.17.0", "dm-control": "1.0.50", "lightning": "2.6.6", "pandas": "2.3.3"}
     requirement = next(item for item in REQUIREMENTS if item.name == name)
     assert broken[name] not in requirement.specifier
     assert works[name] in requirement.specifier
@@ -56,8 +58,8 @@ def test_python_3_13_gets_every_requirement_of_dm_control_but_labmaze():
     assert "dm-control" not in listed
 
 
-def test_development_brings_what_training_needs():
-    assert "latentplan[train]" in EXTRAS["dev"]
+def test_development_brings_what_training_and_benchmarks_need():
+    assert {"latentplan[train]", "latentplan[bench]"} <= set(EXTRAS["dev"])
 
 
 def test_package_without_extras_needs_four_libraries():

@@ -35,7 +35,7 @@ class Request(LearningRequest):
 
 def resolve(request: Request) -> dict[str, Any]:
     """The fields of the request, with every setting of the distillation and of the search that labels."""
-    from latentplan.agents.checkpoint import read_info
+    from latentplan.agents.info import read_info
 
     asked = {**vars(request), "settings": DistillConfig(**request.settings)}
     if request.checkpoint is None:
@@ -46,7 +46,7 @@ def resolve(request: Request) -> dict[str, Any]:
 
 def run(request: Request) -> int:
     """Distil, or continue a distillation, and return the exit code."""
-    from latentplan.agents.checkpoint import read_info
+    from latentplan.agents.info import read_info
 
     info = {} if request.checkpoint is None else read_info(request.checkpoint)
     planner = None

@@ -85,6 +85,17 @@ def run(request: Request) -> int:
     return int(any(finding.fatal for finding in problems))
 
 
+def processor_name() -> str:
+    """Model name of the processor."""
+    try:
+        for line in Path("/proc/cpuinfo").read_text().splitlines():
+            if line.startswith("model name"):
+                return line.partition(":")[2].strip()
+    except OSError:
+        pass  # only Linux has this file
+    return platform.processor() or platform.machine()
+
+
 def _guarded(check: Callable[[], Iterator[Finding]]) -> Iterator[Finding]:
     """The findings of a check, the last of them its failure if it fails: the report must always end."""
     try:
@@ -118,7 +129,7 @@ def _versions() -> Iterator[Finding]:
 
 
 def _device() -> Iterator[Finding]:
-    yield Finding("processor", f"{_processor_name()}, {count_cores()} cores")
+    yield Finding("processor", f"{processor_name()}, {count_cores()} cores")
     import torch
 
     if torch.cuda.is_available():
@@ -137,16 +148,6 @@ def _kernels() -> Iterator[Finding]:
     remedy = "no C compiler with OpenMP (cc, gcc, clang or $CC) works here; with one, planning takes half the time"
     compiled = load() is not None
     yield Finding("planner's kernels", "compiled" if compiled else "torch", None if compiled else remedy, fatal=False)
-
-
-def _processor_name() -> str:
-    try:
-        for line in Path("/proc/cpuinfo").read_text().splitlines():
-            if line.startswith("model name"):
-                return line.partition(":")[2].strip()
-    except OSError:
-        pass  # only Linux has this file
-    return platform.processor() or platform.machine()
 
 
 def _renderer() -> Iterator[Finding]:

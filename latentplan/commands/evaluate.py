@@ -102,7 +102,7 @@ def planning_modes() -> tuple[str, ...]:
 
 def resolve(request: Request) -> dict[str, Any]:
     """The fields of the request, with every setting of the search that the agent would use."""
-    from latentplan.agents.checkpoint import read_info
+    from latentplan.agents.info import read_info
 
     saved = saved_config(request.checkpoint, read_info(request.checkpoint))
     return {**vars(request), "planner": search_settings(saved, request.planner)}
@@ -114,13 +114,8 @@ def run(request: Request) -> int:
     Raises:
         UserError: The checkpoint, an objective, the latency or an output cannot be used.
     """
-    from latentplan.evaluation.clock import MEASURED, read_latency
-
-    latency = read_latency(request.latency or MEASURED)
-    from latentplan.agents.checkpoint import read_info
-    from latentplan.agents.modes import MODES
-    from latentplan.evaluation.clock import VirtualClock
-    from latentplan.evaluation.timed import load_timed_agent
+    from latentplan.agents.info import read_info
+    from latentplan.config.latency import MEASURED, read_durations
 
     info = read_info(request.checkpoint)
     config = saved_config(request.checkpoint, info)
@@ -128,6 +123,13 @@ def run(request: Request) -> int:
     planner = search_settings(config, request.planner)
     if request.planner:
         check_search(planner, config.model)
+    read_durations(request.latency or MEASURED)
+    _check_expressions(request, chosen.domain)
+    from latentplan.agents.modes import MODES
+    from latentplan.evaluation.clock import VirtualClock, read_latency
+    from latentplan.evaluation.timed import load_timed_agent
+
+    latency = read_latency(request.latency or MEASURED)
     changes = {name: getattr(planner, name) for name in request.planner}
     if request.planning_budget is not None:
         changes["planning_budget"] = request.planning_budget
@@ -172,6 +174,17 @@ def _make_env(config: EnvConfig, action_dim: int) -> Any:
             "--env-id of the environment that it learned in"
         )
     return env
+
+
+def _check_expressions(request: Request, domain: str) -> None:
+    """Refuses an objective or a constraint that is no expression, before torch is imported."""
+    from latentplan.config.quantities import scales
+    from latentplan.objectives.parser import parse_constraints, parse_schedule
+
+    if request.objective is not None:
+        parse_schedule(request.objective, scales(domain))
+    if request.constraint is not None:
+        parse_constraints(request.constraint, scales(domain))
 
 
 def _play_and_report(

@@ -26,6 +26,9 @@ class Request:
 
 def run(request: Request) -> int:
     """Write the program, print its size and return the exit code."""
+    from latentplan.agents.info import read_info
+
+    read_info(request.checkpoint)  # refuses a damaged agent before torch is imported
     from latentplan.agents.export import export_actor
 
     path = export_actor(request.checkpoint, request.out, request.format)

@@ -164,14 +164,17 @@ class _Parser(argparse.ArgumentParser):
             usage=usage, add_help=False, allow_abbrev=False, exit_on_error=False, formatter_class=_HelpFormatter
         )
         for flag in flags:
-            join = flag.setting.options.get("join")
+            options = flag.setting.options
+            several: dict[str, Any] = {"action": _Join, "const": options["join"]} if "join" in options else {}
+            if "separator" in options:  # `0 1` is the list `0,1`
+                several = {"nargs": "+"}
             self.add_argument(
                 *flag.names,
                 dest=flag.setting.key,
                 metavar=flag.metavar,
                 default=argparse.SUPPRESS,
                 help=flag.help.replace("%", "%%"),
-                **({"action": _Join, "const": join} if join else {}),
+                **several,
             )
 
     def error(self, message: str) -> Any:
@@ -219,12 +222,13 @@ class _HelpFormatter(argparse.HelpFormatter):
 
 
 def _read_texts(flags: Sequence[Flag], argv: Sequence[str]) -> dict[str, Any]:
-    """The text of every flag that was given, by key; lists are split."""
+    """The text of every flag that was given, by key; lists are split, of one word or of several."""
     texts = vars(_Parser(flags).parse_args(list(argv)))
     for flag in flags:
         separator = flag.setting.options.get("separator")
         if separator and flag.setting.key in texts:
-            texts[flag.setting.key] = _split(flag.names[0], texts[flag.setting.key], separator)
+            text = separator.join(texts[flag.setting.key])
+            texts[flag.setting.key] = _split(flag.names[0], text, separator)
     return texts
 
 

@@ -38,7 +38,7 @@ def resolve(request: Request) -> dict[str, Any]:
 
 def run(request: Request) -> int:
     """Learn goals, or continue to learn them, and return the exit code."""
-    from latentplan.agents.checkpoint import read_info
+    from latentplan.agents.info import read_info
 
     info = {} if request.checkpoint is None else read_info(request.checkpoint)
     device = request.use_device()

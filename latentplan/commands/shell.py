@@ -19,8 +19,8 @@ from latentplan.config.env_id import as_file_name
 from latentplan.config.estimates import check_parts, estimate_search
 from latentplan.config.extras import describe_missing, extra_of
 from latentplan.config.files import build_config, has_cuda
-from latentplan.config.parsing import option
-from latentplan.config.planner import override_planner
+from latentplan.config.parsing import option, raise_unknown
+from latentplan.config.planner import METHODS, override_planner
 
 
 def run_guarded(command: Callable[[Sequence[str]], int], argv: Sequence[str]) -> int:
@@ -123,9 +123,12 @@ def search_settings(saved: Config, given: Mapping[str, Any]) -> PlannerConfig:
         given: Settings of the search that were given, by name.
 
     Raises:
-        UserError: A given value is not allowed beside the saved ones.
+        UserError: A given value is not allowed beside the saved ones, or there is no such planner.
     """
-    return build_config({"planner": override_planner(to_dict(saved.planner), given)}).planner
+    planner = build_config({"planner": override_planner(to_dict(saved.planner), given)}).planner
+    if planner.method not in METHODS:
+        raise_unknown("planner", planner.method, METHODS)
+    return planner
 
 
 def check_search(planner: PlannerConfig, model: ModelConfig) -> None:

@@ -12,6 +12,7 @@ EXTRAS = {
         *("cv2", "dm_control", "gymnasium", "jsonargparse", "lightning", "matplotlib", "mujoco", "rich", "scipy"),
         *("shtab", "tensorboard", "yaml"),
     ),
+    "bench": ("rliable",),
     "jax": ("jax",),
     "gymnasium": ("imageio", "pygame"),
     "robotics": ("gymnasium_robotics",),

@@ -1,15 +1,20 @@
-"""The settings and the saves in the folder of a run."""
+"""The settings, the saves and the lock in the folder of a run."""
 
 from __future__ import annotations
 
+import contextlib
+import fcntl
+import os
+from collections.abc import Iterator
 from pathlib import Path
 
-from latentplan.config.checks import UserError
+from latentplan.config.checks import UserError, make_folder
 from latentplan.config.commit import Saves
 from latentplan.config.files import SECTIONS, build_config, field_names, read_config, read_layer
 from latentplan.config.settings import Config
 
 RUN_FILE = "config.yaml"
+LOCK_FILE = ".lock"
 SAVES_FOLDER = "resume"
 RUN_FORMAT = 2  # 1 was `resume/state.pt`, from which a run could not continue exactly
 
@@ -62,3 +67,32 @@ def read_run_config(folder: Path) -> tuple[Config, str | None]:
     ]
     what = ", ".join(changes) or "nothing that counts"
     return own, f"{path} was edited after the last save, or is damaged: the run goes on with a change of {what}"
+
+
+@contextlib.contextmanager
+def lock_folder(folder: Path, holder: str = "another process learns") -> Iterator[None]:
+    """Makes a folder if needed, and locks it until the context or the process ends.
+
+    On a file system without locks the folder stays unlocked.
+
+    Args:
+        folder: The folder.
+        holder: What a process does that holds the lock, for the error.
+
+    Raises:
+        UserError: Another process holds the lock, or the folder cannot be made.
+    """
+    make_folder(folder)
+    try:
+        lock = os.open(folder / LOCK_FILE, os.O_RDWR | os.O_CREAT, 0o666)
+    except OSError as error:
+        raise UserError(f"cannot write to {folder}: {error.strerror}; choose another") from None
+    try:
+        with contextlib.suppress(OSError):
+            try:
+                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:
+                raise UserError(f"{holder} in {folder}: end it first, or choose another folder") from None
+        yield
+    finally:
+        os.close(lock)

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import json
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
@@ -14,18 +12,14 @@ import torch
 from numpy.typing import NDArray
 
 from latentplan.agents.base import Agent
-from latentplan.config import UserError, derive_seed
-from latentplan.config.checks import shown
-from latentplan.config.reading import LARGEST_DATA, read_text
+from latentplan.config import derive_seed
+from latentplan.config.latency import MEASURED, read_durations
 from latentplan.planning.model import State, state_device
 from latentplan.planning.objectives import Constraint, Term
 from latentplan.planning.plan import Plan
 
 Result = TypeVar("Result")
 ROUNDING_MS = 1e-6  # tolerance, so that a plan that takes whole periods is ready at the end of a period
-MEASURED = "measured"
-_FORMATS = 'a JSON list of milliseconds, {"decision_ms": [...]}, or one number per line'
-_MAX_MS = 1e9  # eleven days
 
 
 class VirtualClock:
@@ -187,32 +181,13 @@ class Latency:
 
 
 def read_latency(text: str) -> Latency:
-    """The latency that `--latency` names: `measured`, or a file of milliseconds.
-
-    The `decision_ms` of a file without `plan_ms` hold for plans too.
+    """The latency that `--latency` names: `measured`, or a file of milliseconds; see `read_durations`.
 
     Raises:
         UserError: The file cannot be read, or does not hold durations.
     """
-    if text == MEASURED:
-        return Latency()
-    try:
-        written = read_text(Path(text), LARGEST_DATA)
-    except UserError as error:
-        raise UserError(f"--latency: {error}; give {MEASURED!r} or a file of milliseconds") from None
-    try:
-        content = _parse(written)
-    except (ValueError, RecursionError):
-        raise UserError(f"--latency {text}: not a file of milliseconds; write {_FORMATS}") from None
-    durations = content if isinstance(content, dict) else {"decision_ms": content}
-    unknown = [name for name in durations if name not in ("decision_ms", "plan_ms")]
-    if unknown or "decision_ms" not in durations:
-        raise UserError(
-            f"--latency {text}: the keys are decision_ms and, if plans differ, plan_ms; got {shown(unknown)}"
-        )
-    decision_ms = _check_durations(text, "decision_ms", durations["decision_ms"])
-    plan_ms = _check_durations(text, "plan_ms", durations["plan_ms"]) if "plan_ms" in durations else decision_ms
-    return Latency(text, decision_ms, plan_ms)
+    durations = read_durations(text)
+    return Latency() if durations is None else Latency(text, *(np.asarray(values) for values in durations))
 
 
 def _make_charge(durations: Milliseconds | None, seed: int) -> Charge:
@@ -220,22 +195,3 @@ def _make_charge(durations: Milliseconds | None, seed: int) -> Charge:
         return lambda measured_ms: measured_ms
     rng, known = np.random.default_rng(seed), durations
     return lambda measured_ms: float(rng.choice(known))
-
-
-def _parse(text: str) -> Any:
-    """The content of a file of durations, as JSON or as one number per line."""
-    try:
-        content = json.loads(text)
-    except json.JSONDecodeError:
-        return [float(line) for line in text.splitlines() if line.strip()]
-    return content if isinstance(content, list | dict) else [content]
-
-
-def _check_durations(text: str, name: str, values: Any) -> Milliseconds:
-    if not isinstance(values, list) or not values:
-        raise UserError(f"--latency {text}: {name} must be a list of at least one number; write {_FORMATS}")
-    for value in values:
-        is_number = isinstance(value, int | float) and not isinstance(value, bool)
-        if not is_number or not 0 <= value <= _MAX_MS:  # NaN is in no interval
-            raise UserError(f"--latency {text}: {name} must lie in 0 to {_MAX_MS:g}, got {shown(value)}")
-    return np.asarray(values, dtype=np.float64)

@@ -25,7 +25,7 @@ from latentplan.config import USER_DOMAIN, Config, Device, EnvironmentFault, Use
 from latentplan.config.commit import Save
 from latentplan.config.env_id import as_file_name, repeat_flag
 from latentplan.config.files import dump_config, read_config
-from latentplan.config.run_folder import RUN_FILE, SAVES_FOLDER, read_run_config, run_saves
+from latentplan.config.run_folder import RUN_FILE, SAVES_FOLDER, lock_folder, read_run_config, run_saves
 from latentplan.envs import default_task
 from latentplan.models import WorldModel
 from latentplan.models.fast import accelerate
@@ -50,7 +50,6 @@ from latentplan.training.state import (
     METRICS_FILE,
     RunState,
     SavedRun,
-    lock_folder,
     read_state,
     refuse_used,
     restore_learner,

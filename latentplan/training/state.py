@@ -1,13 +1,10 @@
-"""The state of a run (clocks, evaluations, weights, optimizers), saved and loaded, and the lock of its folder."""
+"""The state of a run (clocks, evaluations, weights, optimizers), saved and loaded."""
 
 from __future__ import annotations
 
-import contextlib
-import fcntl
-import os
 import time
 import warnings
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -15,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import torch
 
 from latentplan.agents.checkpoint import INFO
-from latentplan.config import UserError, make_folder
+from latentplan.config import UserError
 from latentplan.config.commit import DamageError, Extent, Save, Saves, write_synced
 from latentplan.config.run_folder import RUN_FILE, SAVES_FOLDER
 from latentplan.replay.buffer import read_saved
@@ -24,7 +21,6 @@ if TYPE_CHECKING:
     from latentplan.training.learner.module import Learner
 
 
-LOCK_FILE = ".lock"
 CONTENTS = {RUN_FILE: "a run", INFO: "an agent", f"{SAVES_FOLDER}/save-*[0-9]": "an agent"}
 STATE_FILE = "state.pt"
 METRICS_FILE = "metrics.csv"
@@ -212,28 +208,3 @@ def refuse_used(folder: Path, kind: str, flag: str) -> None:
             can_resume = Saves(folder / SAVES_FOLDER, kind, 0).kinds() == {kind}
             advice = f"resume it with --resume {folder} (or from Python), or " if can_resume else ""
             raise UserError(f"{folder} already holds {content}: {advice}choose another {flag}")
-
-
-@contextlib.contextmanager
-def lock_folder(folder: Path) -> Iterator[None]:
-    """Makes a folder if needed, and locks it until the context or the process ends.
-
-    On a file system without locks the folder stays unlocked.
-
-    Raises:
-        UserError: Another process holds the lock, or the folder cannot be made.
-    """
-    make_folder(folder)
-    try:
-        lock = os.open(folder / LOCK_FILE, os.O_RDWR | os.O_CREAT, 0o666)
-    except OSError as error:
-        raise UserError(f"cannot write to {folder}: {error.strerror}; choose another") from None
-    try:
-        with contextlib.suppress(OSError):
-            try:
-                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except BlockingIOError:
-                raise UserError(f"another process learns in {folder}: end it first, or choose another folder") from None
-        yield
-    finally:
-        os.close(lock)

@@ -6,111 +6,60 @@ final returns as interquartile means with 95 % intervals; `curves.csv`, `summary
 
 from __future__ import annotations
 
-import json
 import math
 import signal
 import statistics
 import subprocess
-import sys
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
 from bench.anchors import FRAMES, published_returns_of
 from bench.learn_plot import Curve, Point, plot_runs
 from bench.report import format_interval, format_number, format_table, write_csv, write_json
-from latentplan.commands import train
-from latentplan.commands.flags import overrides, read_request
-from latentplan.config import Config, Device, RunConfig, UserError, make_folder, to_dict
-from latentplan.config.checks import above_zero
-from latentplan.config.env_id import FLAG, as_file_name
-from latentplan.config.files import Preset, read_config
+from bench.runs import RunsRequest, TrainingRun, read_evaluations
+from latentplan.config import UserError, make_folder
+from latentplan.config.env_id import as_file_name
 from latentplan.config.parsing import option
-from latentplan.config.suites import ID_DOMAIN
 
-OWN_FLAGS = {  # settings that flags of this benchmark set for each run
-    "env.domain": "--tasks",
-    "env.task": "--tasks",
-    "run.seed": "--seeds",
-    "run.frames": "--frames",
-    "run.minutes": "--minutes",
-    "run.run_dir": "--out",
-}
-FINISHED = "finished.json"
 FRAMES_TOLERANCE = 0.03  # largest distance of an evaluation from a number of frames, as a share of that number
 OWN = "latentplan"
 
 
 @dataclass(frozen=True, kw_only=True)
-class Request:
+class Request(RunsRequest):
     """Flags of `benchmark.py learn`.
 
     Attributes:
         tasks: Tasks, each as domain-task, or as gymnasium-ID for an environment of gymnasium's registry.
-        seeds: Seeds of each task.
-        frames: Simulator frames of each run; without frames and minutes, a run has the budget of the preset.
-        minutes: Minutes of each run; with frames given too, a run ends at the first of the two limits.
         thresholds: Evaluation returns; the frames and minutes until each of these returns are reported.
         mode: Agent whose evaluation returns are reported.
-        out: Folder of the runs and results; finished runs in this folder are not repeated.
-        preset: Machine class, as for training; None takes `gpu` where CUDA is usable, else `cpu`.
-        device: Device, as for training; None takes CUDA where it is usable.
-        config: YAML file of settings, as for training.
-        settings: Settings of every run, by section and name.
     """
 
-    tasks: tuple[str, ...] = option(("cartpole-swingup", "walker-walk"), separator=",")
-    seeds: tuple[int, ...] = option((0, 1), separator=",")
-    frames: int | None = None
-    minutes: float | None = None
     thresholds: tuple[int, ...] = option((250, 500, 750), separator=",")
     mode: Literal["planner", "actor"] = "planner"
-    out: Path = option(Path("runs/learn"), metavar="DIR")
-    preset: Preset | None = None
-    device: Device | None = None
-    config: Path | None = option(None, metavar="FILE")
-    settings: dict[str, Any] = overrides(Config)
 
     def __post_init__(self) -> None:
-        above_zero(self, "frames", "minutes")
-        for name in ("seeds", "thresholds"):
-            if min(getattr(self, name)) < 0:
-                raise UserError(f"--{name} must be at least 0, got {min(getattr(self, name))}")
-        for key, own in OWN_FLAGS.items():
-            section, _, name = key.partition(".")
-            if name in self.settings.get(section, {}):
-                raise UserError(f"{own} sets --{key} here; give {own}")
-
-    @property
-    def budget(self) -> list[str]:
-        """The flags of `train.py` that end a run."""
-        given = (("--frames", self.frames), ("--minutes", self.minutes))
-        return [word for name, value in given if value is not None for word in (name, f"{value:.15g}")]
-
-    @property
-    def forwarded(self) -> list[str]:
-        """The other flags of `train.py` that all runs share."""
-        flags: dict[str, Any] = {"--preset": self.preset, "--device": self.device, "--config": self.config}
-        words = [word for name, value in flags.items() if value is not None for word in (name, str(value))]
-        for section, fields in self.settings.items():
-            for name, value in fields.items():
-                words += [f"--{section}.{name}", value if isinstance(value, str) else json.dumps(value)]
-        return words
+        super().__post_init__()
+        if min(self.thresholds) < 0:
+            raise UserError(f"--thresholds must be at least 0, got {min(self.thresholds)}")
 
 
 def run(request: Request) -> int:
     """Trains the unfinished runs, then collects, tabulates and plots the curves of all runs."""
     tasks, thresholds, mode, out = request.tasks, request.thresholds, request.mode, request.out
-    budget, extra = request.budget, request.forwarded
-    folders = {(task, seed): out / as_file_name(f"{task}-seed{seed}") for task in tasks for seed in request.seeds}
-    for (task, seed), folder in folders.items():  # refuses a mistake in any run before the first run begins
-        asked = read_request(train.Request, _new_run_flags(task, seed, folder, budget, extra))
-        check_same(train.resolve(asked), folder)
+    runs = [
+        TrainingRun(task, seed, out / as_file_name(f"{task}-seed{seed}"), request.budget, request.forwarded)
+        for task in tasks
+        for seed in request.seeds
+    ]
+    for each in runs:  # refuses a mistake in any run before the first run begins
+        each.check()
     make_folder(out)
-    for (task, seed), folder in folders.items():
-        _train(task, seed, folder, budget, extra)
-    curves = [read_run(task, seed, folder, mode) for (task, seed), folder in folders.items()]
+    for each in runs:
+        _train(each)
+    curves = [read_run(each.task, each.seed, each.folder, mode) for each in runs]
     write_csv(out / "curves.csv", [{"task": c.task, "seed": c.seed, **p._asdict()} for c in curves for p in c.points])
     print(run_table(curves, thresholds))
     finals = final_estimates(curves)
@@ -118,8 +67,8 @@ def run(request: Request) -> int:
     comparisons = {task: compare(task, curves, thresholds) for task in dict.fromkeys(tasks)}
     for task, rows in comparisons.items():
         print(comparison_table(task, rows, thresholds))
-    runs = run_facts(curves, thresholds)
-    write_json(out / "summary.json", {"mode": mode, "runs": runs, "final": finals, "anchors": comparisons})
+    facts = run_facts(curves, thresholds)
+    write_json(out / "summary.json", {"mode": mode, "runs": facts, "final": finals, "anchors": comparisons})
     plot_runs(curves, mode, out / "curves.png")
     print(f"curves.csv, summary.json and curves.png are in {out}")
     return 0
@@ -131,36 +80,10 @@ def read_run(task: str, seed: int, folder: Path, mode: str) -> Curve:
     Raises:
         UserError: The run has no evaluation, or its files are damaged.
     """
-    from latentplan.reporting.curves import read_curve
-
-    column = f"{mode}_return"
-    try:
-        frames, returns = read_curve(folder / "metrics.csv", "env_frames", column)
-        minutes, _ = read_curve(folder / "metrics.csv", "minutes", column)
-        points = [Point(*point) for point in zip(frames, minutes, returns, strict=True)]
-        if (folder / "final.json").exists():
-            final = json.loads((folder / "final.json").read_text())
-            points = [point for point in points if point.env_frames < final["env_frames"]]
-            points.append(Point(final["env_frames"], final["minutes"], final[mode]))
-    except (OSError, ValueError, TypeError, KeyError) as error:
-        raise UserError(f"the results in {folder} cannot be read: {error}") from None
+    points = [Point(each.env_frames, each.minutes, getattr(each, mode)) for each in read_evaluations(folder)]
     if not points:
         raise UserError(f"{folder} holds no evaluation; lower --evaluation.every_frames or train longer")
     return Curve(task, seed, points)
-
-
-def check_same(config: Config, folder: Path) -> None:
-    """Checks that the run in a folder, if there is one, has these settings, except for the budget.
-
-    Raises:
-        UserError: A setting differs; the message names the first such setting.
-    """
-    if not (folder / "config.yaml").exists():
-        return
-    asked, begun = (_comparable_settings(each) for each in (config, read_config(folder / "config.yaml")))
-    for name, value in asked.items():
-        if begun[name] != value:
-            raise UserError(f"{folder} was begun with --{name} {begun[name]}, not {value}: choose another --out")
 
 
 def first_reaching(curve: Curve, threshold: float) -> Point | None:
@@ -260,15 +183,6 @@ def comparison_table(task: str, rows: Mapping[str, Mapping[str, Any]], threshold
     return format_table([task, *columns], table)
 
 
-def _comparable_settings(config: Config) -> dict[str, Any]:
-    """The settings by name, with the default task filled in and without the budget and folder of the run."""
-    from latentplan.envs import default_task
-
-    env = replace(config.env, task=config.env.task or default_task(config.env.domain))
-    sections = to_dict(replace(config, env=env, run=RunConfig(seed=config.run.seed)))
-    return {f"{section}.{name}": value for section, fields in sections.items() for name, value in fields.items()}
-
-
 def _nearest_point(curve: Curve, frames: int) -> Point | None:
     """The evaluation nearest to a number of env frames; None if its distance exceeds `FRAMES_TOLERANCE`."""
     point = min(curve.points, key=lambda point: abs(point.env_frames - frames))
@@ -281,19 +195,13 @@ def _median_frames(curves: Sequence[Curve], threshold: int) -> float | None:
     return None if math.isinf(middle) else middle
 
 
-def _train(task: str, seed: int, folder: Path, budget: list[str], extra: list[str]) -> None:
-    """Runs `train.py` in a new process, unless the folder holds the finished run with this budget."""
-    marker = folder / FINISHED
-    if _read_budget(marker) == budget:
-        print(f"{folder} is finished and not repeated", flush=True)
+def _train(run: TrainingRun) -> None:
+    """Runs `train.py` in a new process, unless the run is finished."""
+    if run.is_finished():
+        print(f"{run.folder} is finished and not repeated", flush=True)
         return
-    is_begun = (folder / "config.yaml").exists()
-    arguments = _new_run_flags(task, seed, folder, budget, extra)
-    if is_begun:
-        arguments = ["--resume", str(folder), *budget, *(arguments[:2] if arguments[0] == FLAG else [])]
-    script = Path(__file__).resolve().parent.parent / "train.py"
-    print(f"training {task}, seed {seed}", flush=True)
-    training = subprocess.Popen([sys.executable, str(script), *arguments])
+    print(f"training {run.name}", flush=True)
+    training = subprocess.Popen(run.command())
     previous = signal.signal(signal.SIGINT, signal.SIG_IGN)  # the run gets Ctrl-C too, and saves its state
     try:
         code = training.wait()
@@ -302,23 +210,8 @@ def _train(task: str, seed: int, folder: Path, budget: list[str], extra: list[st
     if code == 130:
         raise KeyboardInterrupt
     if code != 0:
-        raise UserError(f"training {task} with seed {seed} ended with exit code {code}; see above")
-    write_json(marker, {"budget": budget})
-
-
-def _read_budget(marker: Path) -> list[str] | None:
-    """The budget of a finished run; None if the run is not finished or its marker cannot be read."""
-    try:
-        budget: list[str] = json.loads(marker.read_text())["budget"]
-    except (OSError, ValueError, TypeError, KeyError):
-        return None
-    return budget
-
-
-def _new_run_flags(task: str, seed: int, folder: Path, budget: list[str], extra: list[str]) -> list[str]:
-    domain, _, name = task.partition("-")
-    chosen = [FLAG, name] if domain == ID_DOMAIN else ["--domain", domain, *(["--task", name] if name else [])]
-    return [*chosen, "--seed", str(seed), "--run-dir", str(folder), *budget, *extra]
+        raise UserError(f"training {run.name} ended with exit code {code}; see above")
+    run.mark_finished()
 
 
 def _final_row(name: str, facts: dict[str, Any]) -> list[str]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -11,7 +11,7 @@ from bench.anchors import METHODS, published_returns_of
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-MARKERS = "sD^v<>PX*hp"  # one marker for each method in METHODS
+MARKERS = "D^8svd<>PX*hp"  # one marker for each method in METHODS
 
 
 class Point(NamedTuple):
@@ -45,7 +45,7 @@ def plot_runs(curves: Sequence[Curve], mode: str, png: Path) -> None:
         for curve in (curve for curve in curves if curve.task == task):
             frames, _, returns = zip(*curve.points, strict=True)
             axes.plot(frames, returns, marker="o", markersize=3, label=f"seed {curve.seed}")
-        _mark_published(axes, task, axes.get_xlim()[1])
+        mark_published(axes, task, axes.get_xlim()[1])
         axes.set(title=task, xlabel="environment frames", ylabel=f"evaluation return, {mode}")
         axes.set_ylim(bottom=min(0.0, axes.get_ylim()[0]))
         axes.xaxis.set_major_formatter(EngFormatter(sep=""))
@@ -54,10 +54,18 @@ def plot_runs(curves: Sequence[Curve], mode: str, png: Path) -> None:
     save_figure(figure, png)
 
 
-def _mark_published(axes: Axes, task: str, last: float) -> None:
-    """Marks published returns at the env frames that a panel shows."""
+def mark_published(axes: Axes, task: str, last: float, colors: Mapping[str, str] | None = None) -> None:
+    """Marks published returns of a task at the env frames that a panel shows.
+
+    Args:
+        axes: The panel.
+        task: The task as domain-task.
+        last: Last env frames of the panel.
+        colors: Colours of the methods to mark; None marks all methods in grey.
+    """
     for method, known in published_returns_of(task).items():
         marker = MARKERS[METHODS.index(method)]
         shown = {frames: value for frames, value in known.items() if frames <= last}
-        if shown:
-            axes.plot(*zip(*shown.items(), strict=True), marker, color="0.45", markersize=5, label=method)
+        if shown and (colors is None or method in colors):
+            color = "0.45" if colors is None else colors[method]
+            axes.plot(*zip(*shown.items(), strict=True), marker, color=color, markersize=5, label=method)

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import platform
 import time
-from pathlib import Path
 from typing import Any
 
 import torch
+
+from latentplan.commands.doctor import processor_name
 
 PRODUCT_SIZES = {"cpu": 2048, "cuda": 8192}
 SMALLEST_PRODUCT = 256
@@ -25,15 +25,6 @@ def describe_machine(device: torch.device) -> dict[str, Any]:
         "torch": torch.__version__,
         "float32_matmul_precision": torch.get_float32_matmul_precision(),
     }
-
-
-def processor_name() -> str:
-    """Model name of the processor."""
-    try:
-        lines = Path("/proc/cpuinfo").read_text().splitlines()
-        return next(line.partition(":")[2].strip() for line in lines if line.startswith("model name"))
-    except (OSError, StopIteration):  # no Linux, or an architecture without a model name
-        return platform.processor() or platform.machine()
 
 
 def product_limits(device: torch.device, size: int | None = None, repeats: int = 4) -> dict[str, float]:

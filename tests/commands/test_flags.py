@@ -73,6 +73,15 @@ def test_read_request_splits_lists_into_distinct_items():
     assert read_request(Request, ["--checkpoint", "a", "--seeds", "2, 1,2,,1e1"]).seeds == (2, 1, 10)
 
 
+def test_read_request_takes_the_items_of_a_list_as_words_too():
+    assert (
+        read("--seeds 2 1 --num-episodes 3")
+        == read("--num-episodes 3 --seeds 2,1")
+        == read("--seeds 2, 1 {n}", n="--num-episodes=3")
+    )
+    assert read("--seeds 5 --seeds 2 1").seeds == (2, 1)
+
+
 def test_read_request_keeps_only_the_given_settings_of_another_dataclass():
     request = read("--planner.min_std 1e-3 --updates 2e2 --learning-rate 1 --minutes null")
     assert request.planner == {"min_std": 1e-3}
@@ -107,6 +116,9 @@ def test_read_request_tries_outputs_and_takes_where_links_lead(tmp_path):
         ("--planner.min_std nan", "--planner.min_std must be a finite number, got 'nan'"),
         ("--relabel-share 2", "--relabel-share must be in [0.0, 1.0], got 2.0"),
         ("--seeds ,", "--seeds must name at least one, separated by ',', got ','"),
+        ("--seeds 1 x", "--seeds must be whole numbers, separated by ',', got '1,x'"),
+        ("--seeds=1 2", "unexpected argument '2'"),
+        ("--seeds --num-episodes 3", "flag --seeds needs a value"),
         ("--seeds 1,x", "--seeds must be whole numbers, separated by ',', got '1,x'"),
         ("cartpole", "unexpected argument 'cartpole'; settings are given as --name value"),
         ("-x 3", "unexpected argument '-x'"),

@@ -1,6 +1,7 @@
 """The command `latentplan`: its table of commands, help, versions, printed settings and completion."""
 
 import re
+import shutil
 import subprocess
 import sys
 
@@ -71,6 +72,33 @@ def test_no_command_imports_heavy_libraries_before_it_runs(run_python):
     )
     result = run_python("-c", code)
     assert result.returncode == 0 and result.stdout.splitlines()[-1] == "loaded []", result.stderr
+
+
+def test_agents_and_their_settings_are_refused_before_torch_is_imported(run_python, checkpoint, tmp_path):
+    """Importing torch takes longer than every check of a file, a name or a number."""
+    for name in ("info.json", "weights.safetensors"):
+        shutil.copytree(checkpoint, tmp_path / name)
+        content = bytearray((tmp_path / name / name).read_bytes())
+        content[len(content) // 2] ^= 1
+        (tmp_path / name / name).write_bytes(content)
+    good, missing = ["--checkpoint", str(checkpoint)], ["--checkpoint", str(tmp_path / "missing")]
+    damaged = [["--checkpoint", str(tmp_path / name)] for name in ("info.json", "weights.safetensors")]
+    words = [[command, *agent] for command in ("eval", "distill", "goals", "export") for agent in (missing, *damaged)]
+    words = [[*line, "--out", str(tmp_path / "out.pt2")] if line[0] == "export" else line for line in words]
+    for flags in (["--planner.method", "cme"], ["--planner.horizon", "0"], ["--planner.num_samples", "1e12"]):
+        words += [["eval", *good, *flags], ["distill", *good, *flags]]
+    words += [["eval", *good, flag, "nonsense ->"] for flag in ("--objective", "--constraint")]
+    words += [["eval", *good, "--control-hz", "50", "--latency", str(tmp_path)]]
+    code = (
+        "import sys\nfrom latentplan.commands.main import main\n"
+        f"for words in {words!r}:\n"
+        "    code = main(words)\n"
+        f"    print(code, sorted({HEAVY} & set(sys.modules)), words)\n"
+    )
+    result = run_python("-c", code)
+    lines = result.stdout.splitlines()
+    assert len(lines) == len(words) == result.stderr.count("\n")
+    assert all(line.startswith("2 []") for line in lines), result.stdout
 
 
 @pytest.mark.parametrize("script", ["train", "eval", "distill", "goals"])

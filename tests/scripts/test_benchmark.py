@@ -99,6 +99,7 @@ def test_every_flag_of_the_benchmarks_keeps_its_default():
     assert found["plan"].items() >= {"--samples": 500, "--horizon": 20, "--iterations": 5, "--plans": 30}.items()
     assert found["soak"].items() >= {"--control-hz": 50.0, "--decisions": 10_000, "--block": 250}.items()
     assert found["learn"].items() >= {"--seeds": (0, 1), "--thresholds": (250, 500, 750), "--mode": "planner"}.items()
+    assert found["suite"].items() >= {"--tasks": (), "--seeds": (), "--frames": 100_000, "--jobs": 1}.items()
     assert found["decide"].items() >= {"--batch": 1, "--decisions": 50, "--checkpoint": None}.items()
 
 

@@ -7,13 +7,16 @@ from dataclasses import replace
 import benchmark
 import numpy as np
 import pytest
-from bench.anchors import METHODS, published_returns_of
+from bench.anchors import METHODS, METHODS_AT_REPEAT_2, TASK_GROUPS, published_returns_of
 from bench.estimates import interquartile_estimate, mean_estimate
-from bench.learn import check_same, compare, first_reaching, read_run, run_facts
+from bench.learn import compare, first_reaching, read_run, run_facts
 from bench.learn_plot import MARKERS, Curve, Point
+from bench.runs import check_same
 
 from latentplan.config import Config, EnvConfig, PlannerConfig, RunConfig, UserError
 from latentplan.config.files import dump_config
+
+HEADER = "env_frames,updates,minutes,planner_return,actor_return\n"
 
 
 def test_first_reaching_returns_the_first_evaluation_above_a_threshold():
@@ -25,9 +28,11 @@ def test_first_reaching_returns_the_first_evaluation_above_a_threshold():
 
 
 def test_read_run_ends_with_the_final_evaluation(tmp_path):
-    (tmp_path / "metrics.csv").write_text("env_frames,minutes,planner_return,actor_return\n80,4.0,1,2\n100,5.0,3,4\n")
+    (tmp_path / "metrics.csv").write_text(HEADER + "80,7,4.0,1,2\n100,9,5.0,3,4\n")
     assert read_run("walker-walk", 0, tmp_path, "actor").points == [Point(80, 4.0, 2.0), Point(100, 5.0, 4.0)]
-    (tmp_path / "final.json").write_text(json.dumps({"env_frames": 100, "minutes": 5.5, "planner": 7, "actor": 8}))
+    (tmp_path / "final.json").write_text(
+        json.dumps({"env_frames": 100, "updates": 9, "minutes": 5.5, "planner": 7, "actor": 8})
+    )
     assert read_run("walker-walk", 0, tmp_path, "actor").points == [Point(80, 4.0, 2.0), Point(100, 5.5, 8.0)]
 
 
@@ -40,10 +45,17 @@ def test_compare_sets_runs_beside_published_returns_at_the_same_frames():
     own, other = rows["latentplan"], rows["DreamerV3"]
     assert own["returns"] == {100_000: 700.0} and own["intervals"][100_000][0] < 700.0
     assert own["frames_to"] == {"600": 100_500, "800": None}
-    assert (other["returns"][100_000], other["frames_to"]) == (605, {"600": 100_000, "800": 200_000})
+    assert (other["returns"][100_000], other["frames_to"]) == (625.3, {"600": 100_000, "800": 200_000})
     assert rows["ResAct (own repeat)"]["returns"] == {100_000: 772}
-    assert len(MARKERS) == len(METHODS) and set(published_returns_of("walker-walk")) == set(METHODS)
     assert list(compare("fish-swim", [curves[0]._replace(task="fish-swim")], [600])) == ["latentplan"]
+
+
+def test_every_published_method_has_a_name_and_a_marker_and_every_task_of_dmc20_has_methods():
+    known = {task: published_returns_of(task) for task in TASK_GROUPS["dmc20"]}
+    assert {method for returns in known.values() for method in returns} == set(METHODS)
+    assert len(MARKERS) == len(METHODS) and list(known["walker-run"]) == list(METHODS_AT_REPEAT_2)
+    assert all({"DreamerV3", "MR.Q", "DrQ-v2", "CURL"} <= set(returns) for returns in known.values())
+    assert set(TASK_GROUPS["dev"]) < set(TASK_GROUPS["dmc20"])
 
 
 def test_learn_collects_finished_runs_without_repeating_them(tmp_path, capsys):
@@ -51,7 +63,7 @@ def test_learn_collects_finished_runs_without_repeating_them(tmp_path, capsys):
         folder = tmp_path / f"walker-walk-seed{seed}"
         folder.mkdir()
         (folder / "finished.json").write_text(json.dumps({"budget": ["--frames", "100"]}))
-        rows = f"env_frames,minutes,planner_return,actor_return\n50,1.0,{seed},0\n60,1.5,,\n100,2.0,{seed + 300},1\n"
+        rows = f"{HEADER}50,5,1,{seed},0\n60,6,2,,\n100,9,3,{seed + 300},1\n"
         (folder / "metrics.csv").write_text(rows)
     flags = ["--tasks", "walker-walk", "--frames", "100", "--out", str(tmp_path)]
     assert benchmark.main(["learn", *flags]) == 0
@@ -97,13 +109,11 @@ def test_compare_takes_the_median_of_frames_to_a_threshold():
 
 
 @pytest.mark.parametrize(
-    ("name", "text"), [("final.json", "{"), ("final.json", "[]"), ("metrics.csv", ""), ("metrics.csv", None)]
+    ("name", "text"), [("final.json", "{"), ("final.json", "[]"), ("metrics.csv", "env_frames,planner_return\n80,1\n")]
 )
 def test_read_run_names_the_folder_when_results_are_damaged(tmp_path, name, text):
-    (tmp_path / "metrics.csv").write_text("env_frames,minutes,planner_return,actor_return\n80,4.0,1,2\n")
-    (tmp_path / name).unlink(missing_ok=True)
-    if text is not None:
-        (tmp_path / name).write_text(text)
+    (tmp_path / "metrics.csv").write_text(HEADER + "80,7,4.0,1,2\n")
+    (tmp_path / name).write_text(text)
     with pytest.raises(UserError, match="the results in"):
         read_run("walker-walk", 0, tmp_path, "planner")
 

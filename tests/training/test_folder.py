@@ -5,7 +5,7 @@ import multiprocessing
 import pytest
 
 from latentplan.config import UserError
-from latentplan.training.state import lock_folder
+from latentplan.config.run_folder import lock_folder
 
 
 def test_lock_folder_refuses_a_second_lock_until_the_first_is_released(tmp_path):

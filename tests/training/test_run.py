@@ -9,9 +9,9 @@ import torch
 
 from latentplan.agents.checkpoint import load_agent, read_info
 from latentplan.config import UserError
+from latentplan.config.run_folder import lock_folder
 from latentplan.training import resume, train
 from latentplan.training.callbacks import COLUMNS
-from latentplan.training.state import lock_folder
 from tests.training.run_folder import list_saves, read_epochs, read_rows, read_state, seal
 
 LOSSES = (

@@ -107,9 +107,9 @@ class _ConvertingBackend(Backend):
 
 
 class CpuBackend(_ConvertingBackend):
-    """One compiled call for each rollout, step and value if the processor multiplies bfloat16; else calls of torch.
+    """One compiled call for each rollout, step and value; calls of torch where there is no compiler.
 
-    Products of torch are bfloat16 or float32, whichever the processor computes faster. Augmented frames are copied
+    Products are bfloat16 or float32, whichever the processor computes faster. Augmented frames are copied
     slice by slice.
     """
 

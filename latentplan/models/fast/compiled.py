@@ -1,4 +1,4 @@
-"""Rollouts in one call of compiled C, on processors with bfloat16 products (AVX-512 or AMX).
+"""Rollouts in one call of compiled C, in the precision in which the processor multiplies fastest.
 
 This module arranges the weights in the layout that `imagine.c` reads. Sums and elementwise work are float32, so results
 differ from those of torch only where torch rounds intermediate results.
@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from latentplan.models.fast.library import load
-from latentplan.models.fast.native import MULTIPLE, TILE, pad
+from latentplan.models.fast.native import MULTIPLE, TILE, find_kernels, pad
 
 if TYPE_CHECKING:
     from latentplan.models.fast.rollout import Trunk, Weights
@@ -49,22 +49,23 @@ def pack(weights: Weights, critic: tuple[Trunk, Tensor, Tensor]) -> Packed | Non
         weights: Converted weights from `rollout.convert_weights`.
         critic: Trunk, logits and shift of the value head, in the form that `weights` has for the reward head.
     """
-    library = load()
+    kernels = find_kernels(torch.float32)
     (action, hidden), latent, deter = weights.action.shape, len(weights.stoch), len(weights.prior)
-    known = weights.gates.device.type == "cpu" and weights.gates.dtype == torch.bfloat16
     fit = all(size % MULTIPLE == 0 for size in (latent, deter, hidden))
-    if library is None or not (known and fit and library.can_imagine()):
+    if kernels is None or not fit or weights.gates.device.type != "cpu" or weights.gates.dtype != kernels.half:
         return None
+    half = kernels.half
 
     def rotate(matrix: Tensor, first: int) -> Tensor:
         """The rows from `first` on, then the rows before: compiled calls store stoch before deter."""
         return torch.cat([matrix[first:], matrix[:first]])
 
     def split_output(matrix: Tensor, shift: Tensor) -> tuple[Tensor, None, Tensor]:
-        """A float32 product as two bfloat16 products: of the rounded weights, and of the rounding errors."""
+        """A float32 product, or two bfloat16 products: of the rounded weights, and of the rounding errors."""
         matrix, shift = pad(matrix, 1, MULTIPLE), pad(shift, 0, MULTIPLE)
-        rounded = matrix.bfloat16()
-        return torch.cat([rounded, (matrix - rounded.float()).bfloat16()], 1), None, shift
+        rounded = matrix.to(half)
+        parts = [rounded] if half == matrix.dtype else [rounded, (matrix - rounded.float()).to(half)]
+        return torch.cat(parts, 1), None, shift
 
     def pack_mlp(trunk: Trunk, matrix: Tensor, shift: Tensor) -> list[tuple[Tensor, Tensor | None, Tensor]]:
         (first, first_norm), (second, second_norm) = trunk
@@ -135,7 +136,8 @@ def _to_tiles(
     built, kept = [], [values]
     for matrix, scale, shift in layers:
         inputs, outputs = matrix.shape
-        tiles = matrix.view(inputs // MULTIPLE, TILE, 2, outputs // TILE, TILE).permute(3, 0, 1, 4, 2).contiguous()
+        pair = 4 // matrix.element_size()  # neighbouring rows of weights share a place in a tile, as in products.h
+        tiles = matrix.view(inputs // pair, pair, outputs // TILE, TILE).permute(2, 0, 3, 1).contiguous()
         kept += [tiles, shift] if scale is None else [tiles, scale, shift]
         built.append(
             _Layer(tiles.data_ptr(), None if scale is None else scale.data_ptr(), shift.data_ptr(), inputs, outputs)

@@ -1,26 +1,16 @@
 // Rollouts along the mean of the prior. A thread computes all steps of 32 rows before the next 32, so that its working
-// memory stays in the core's cache. Products are bfloat16 with float32 sums; elementwise work is float32.
-
-#include "products.h"
-
-#if PAIR != 2
-
-int can_imagine(void) { return 0; }
-int imagine(void) { return 1; }
-
-#else
+// memory stays in the core's cache. Factors of products are `half`; sums and elementwise work are float32.
 
 #include <stdlib.h>
 
-#include "vectors.h"
+#include "wide.h"
 
 #define BLOCK 32
 #define ALIGNMENT 64
 
-// A product's weights are stored in tiles of 16 columns x 32 rows, with the rows in pairs: (column tile, row tile,
-// row pair, column, 2). `inputs` and `outputs` are multiples of 32.
+// Weights lie as `multiply` reads them. `inputs` and `outputs` are multiples of 32.
 typedef struct {
-    const bfloat16 *weights;
+    const half *weights;
     const float *scale, *shift;
     long inputs, outputs;
 } Layer;
@@ -36,23 +26,21 @@ typedef struct {
     long action, latent, deter, hidden, bins;
 } Model;
 
-// The working memory of a thread: up to BLOCK rows of [action, padded to 32 | stoch | deter | hidden] in bfloat16, and
+// The working memory of a thread: up to BLOCK rows of [action, padded to 32 | stoch | deter | hidden] as factors, and
 // deter and the last product in float32.
 typedef struct {
-    bfloat16 *rows, *stoch, *rounded, *hidden;
+    half *rows, *stoch, *rounded, *hidden;
     float *deter, *product;
     long width, count;
 } Workspace;
 
-int can_imagine(void) { return can_multiply(); }
-
-static void apply(Workspace *work, const bfloat16 *rows, const Layer *layer) {
+static void apply(Workspace *work, const half *rows, const Layer *layer) {
     long count = (work->count + TILE - 1) / TILE * TILE, outputs = layer->outputs;
     multiply(rows, work->width, count, layer->weights, layer->inputs, outputs, work->product, outputs, 0);
 }
 
 // One hidden layer of every row, written to `hidden`.
-static void apply_layer(Workspace *work, const bfloat16 *from, const Layer *layer) {
+static void apply_layer(Workspace *work, const half *from, const Layer *layer) {
     apply(work, from, layer);
     for (long r = 0; r < work->count; r++) {
         const float *row = work->product + r * layer->outputs;
@@ -60,16 +48,17 @@ static void apply_layer(Workspace *work, const bfloat16 *from, const Layer *laye
     }
 }
 
-// The output of an Mlp at every row. Its weights are two bfloat16 matrices side by side, whose products are added.
+// The output of an Mlp at every row. Where factors are bfloat16, its weights are two matrices side by side, the second of
+// rounding errors, whose products are added.
 static void apply_mlp(Workspace *work, const Mlp *mlp) {
     const Layer *output = &mlp->output;
-    long half = output->outputs / 2;
+    long size = output->outputs / PAIR;
     apply_layer(work, work->stoch, &mlp->first);
     apply_layer(work, work->hidden, &mlp->second);
     apply(work, work->hidden, output);
     for (long r = 0; r < work->count; r++) {
         float *row = work->product + r * output->outputs;
-        VECTOR() for (long i = 0; i < half; i++) row[i] += row[half + i] + output->shift[i];
+        VECTOR() for (long i = 0; i < size; i++) row[i] += (PAIR == 2 ? row[size + i] : 0.0f) + output->shift[i];
     }
 }
 
@@ -85,8 +74,8 @@ static void advance(Workspace *work, const Model *model) {
     apply(work, work->hidden, &model->mean);
     for (long r = 0; r < work->count; r++) {
         const float *row = work->product + r * model->latent;
-        bfloat16 *stoch = work->stoch + r * work->width;
-        VECTOR() for (long i = 0; i < model->latent; i++) stoch[i] = write_bfloat16(row[i] + model->mean.shift[i]);
+        half *stoch = work->stoch + r * work->width;
+        VECTOR() for (long i = 0; i < model->latent; i++) stoch[i] = write_half(row[i] + model->mean.shift[i]);
     }
 }
 
@@ -94,43 +83,42 @@ static void advance(Workspace *work, const Model *model) {
 static void read_bins(Workspace *work, const Model *model, const Mlp *head, float *scalars, long apart) {
     apply_mlp(work, head);
     for (long r = 0; r < work->count; r++)
-        scalars[r * apart] = wide_expected(work->product + r * head->output.outputs, model->bin_values, model->bins);
+        scalars[r * apart] = expected_of(work->product + r * head->output.outputs, model->bin_values, model->bins);
 }
 
-static size_t workspace_floats(const Model *model) {
+static size_t workspace_bytes(const Model *model) {
     long widest = 3 * model->deter;
     widest = widest > model->hidden ? widest : model->hidden;
     widest = widest > model->latent ? widest : model->latent;
     widest = widest > model->head.output.outputs ? widest : model->head.output.outputs;
     widest = widest > model->actor.output.outputs ? widest : model->actor.output.outputs;
     long width = padded(model->action) + model->latent + model->deter + model->hidden;
-    return (size_t)(BLOCK * (width / 2 + model->deter + widest));
+    return (size_t)(BLOCK * width) * sizeof(half) + (size_t)(BLOCK * (model->deter + widest)) * sizeof(float);
 }
 
-static float *allocate_workspace(const Model *model) {
+static half *allocate_workspace(const Model *model) {
     set_up_products();
-    return aligned_alloc(ALIGNMENT, (workspace_floats(model) * sizeof(float) + ALIGNMENT - 1) / ALIGNMENT * ALIGNMENT);
+    return aligned_alloc(ALIGNMENT, (workspace_bytes(model) + ALIGNMENT - 1) / ALIGNMENT * ALIGNMENT);
 }
 
-static void free_workspace(float *memory) {
+static void free_workspace(half *memory) {
     free(memory);
     tear_down_products();
 }
 
 // Copies up to BLOCK rows into the working memory of a thread; missing rows are zeros.
-static Workspace copy_rows(float *memory, const Model *model, const float *deter, const float *stoch, long rows) {
+static Workspace copy_rows(half *memory, const Model *model, const float *deter, const float *stoch, long rows) {
     long width = padded(model->action) + model->latent + model->deter + model->hidden;
-    bfloat16 *halves = (bfloat16 *)memory, *stochs = halves + padded(model->action), *rounded = stochs + model->latent;
-    float *deters = memory + BLOCK * width / 2;
-    bfloat16 *hidden = rounded + model->deter;
-    Workspace work = {halves, stochs, rounded, hidden, deters, deters + BLOCK * model->deter, width, rows};
-    memset(memory, 0, workspace_floats(model) * sizeof(float));
+    half *stochs = memory + padded(model->action), *rounded = stochs + model->latent, *hidden = rounded + model->deter;
+    float *deters = (float *)(memory + BLOCK * width);
+    Workspace work = {memory, stochs, rounded, hidden, deters, deters + BLOCK * model->deter, width, rows};
+    memset(memory, 0, workspace_bytes(model));
     memcpy(work.deter, deter, (size_t)(rows * model->deter) * sizeof(float));
     for (long r = 0; r < rows; r++) {
         for (long i = 0; i < model->latent; i++)
-            work.stoch[r * width + i] = write_bfloat16(stoch[r * model->latent + i]);
+            work.stoch[r * width + i] = write_half(stoch[r * model->latent + i]);
         for (long i = 0; i < model->deter; i++)
-            work.rounded[r * width + i] = write_bfloat16(deter[r * model->deter + i]);
+            work.rounded[r * width + i] = write_half(deter[r * model->deter + i]);
     }
     return work;
 }
@@ -138,7 +126,7 @@ static Workspace copy_rows(float *memory, const Model *model, const float *deter
 static void set_actions(Workspace *work, const Model *model, const float *actions, long time) {
     for (long r = 0; r < work->count; r++)
         for (long i = 0; i < model->action; i++)
-            work->rows[r * work->width + i] = write_bfloat16(actions[r * time * model->action + i]);
+            work->rows[r * work->width + i] = write_half(actions[r * time * model->action + i]);
 }
 
 // Replaces standard normal draws by the actor's actions: the mean plus std times the draw, clamped to [-1, 1].
@@ -165,7 +153,7 @@ int imagine(const Model *model, float *deter, float *stoch, float *actions, floa
     if (blocks == 0) return failed;
 #pragma omp parallel num_threads(threads < blocks ? threads : (int)blocks) reduction(| : failed)
     {
-        float *memory = allocate_workspace(model);
+        half *memory = allocate_workspace(model);
         failed = memory == NULL;
 #pragma omp for schedule(static)
         for (long block = 0; block < blocks; block++) {
@@ -184,11 +172,9 @@ int imagine(const Model *model, float *deter, float *stoch, float *actions, floa
             memcpy(deters, work.deter, (size_t)(here * model->deter) * sizeof(float));
             for (long r = 0; r < here; r++)
                 for (long i = 0; i < model->latent; i++)
-                    stochs[r * model->latent + i] = read_bfloat16(work.stoch[r * work.width + i]);
+                    stochs[r * model->latent + i] = read_half(work.stoch[r * work.width + i]);
         }
         free_workspace(memory);
     }
     return failed;
 }
-
-#endif

@@ -1,8 +1,8 @@
 """Rollouts of many action sequences along the mean of the prior, with weights that are converted once.
 
 The result equals repeated calls of `Backend.step` up to rounding. Weights are transposed and cast once, the prior's std
-is not computed, and rows are processed in blocks that fit the cache. A processor with bfloat16 products runs one
-compiled call (`compiled`); any other runs torch with compiled kernels for the elementwise parts (`library`). If
+is not computed, and rows are processed in blocks that fit the cache. A rollout is one compiled call (`compiled`); where
+sizes or precision do not allow it, torch computes, with compiled kernels for the elementwise parts (`library`). If
 gradients are required, no tensor is changed in place.
 """
 

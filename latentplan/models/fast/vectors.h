@@ -1,4 +1,5 @@
-// Elementwise work on single rows for imagine.c, with vectors of sixteen floats. Lengths are multiples of 16.
+// Elementwise work on single rows for imagine.c, with vectors of sixteen floats. Lengths are multiples of 16. The same
+// functions for other processors are in wide.h.
 // Reciprocals have a precision of 14 bits; the next product reads 8.
 
 #ifndef LATENTPLAN_VECTORS_H
@@ -81,7 +82,7 @@ static inline void gate_row(float *deter, bfloat16 *rounded, const float *row, c
 }
 
 // The mean of the bins' values under the softmax of a row of logits.
-static inline float wide_expected(const float *row, const float *values, long size) {
+static inline float expected_of(const float *row, const float *values, long size) {
     __m512 highest = _mm512_loadu_ps(row), sum = _mm512_setzero_ps(), mean = sum;
     for (long i = WIDTH; i < size; i += WIDTH) highest = _mm512_max_ps(highest, _mm512_loadu_ps(row + i));
     highest = _mm512_set1_ps(_mm512_reduce_max_ps(highest));

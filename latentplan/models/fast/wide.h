@@ -92,4 +92,34 @@ static inline wide normed_of(const Norm *norm, long i, long length) {
     return centred * load(norm->scale + i, length - i) + load(norm->shift + i, length - i);
 }
 
+#if PAIR != 2
+
+// SiLU of the layer norm of a row.
+static inline void silu_row(half *to, const real *row, const real *scale, const real *shift, long length) {
+    Norm norm = compute_norm(row, scale, shift, length);
+    FOR_LANES(i, length) {
+        wide x = normed_of(&norm, i, length);
+        store_half(to + i, x * sigmoid_of(x), length - i);
+    }
+}
+
+// The next state of the GRU, and its copy as a factor; a row holds reset, candidate and update gates.
+static inline void gate_row(real *deter, half *rounded, const real *row, const real *scale, const real *shift,
+                            long size) {
+    Norm norm = compute_norm(row, scale, shift, 3 * size);
+    FOR_LANES(i, size) {
+        wide reset = sigmoid_of(normed_of(&norm, i, 3 * size));
+        wide candidate = tanh_of(reset * normed_of(&norm, size + i, 3 * size));
+        wide update = sigmoid_of(normed_of(&norm, 2 * size + i, 3 * size) - 1);
+        wide before = load(deter + i, size - i), after = before + update * (candidate - before);
+        store(deter + i, after, size - i);
+        store_half(rounded + i, after, size - i);
+    }
+}
+
+// The mean of the bins' values under the softmax of a row of logits.
+static inline real expected_of(const real *row, const real *values, long size) { return expected(row, values, size); }
+
+#endif
+
 #endif

@@ -31,7 +31,7 @@ from latentplan.config import USER_DOMAIN, DistillConfig, PlannerConfig, UserErr
 from latentplan.config.commit import Saves
 from latentplan.config.env_id import choose_env, repeat_flag
 from latentplan.config.removed import drop_removed
-from latentplan.config.run_folder import SAVES_FOLDER
+from latentplan.config.run_folder import SAVES_FOLDER, lock_folder
 from latentplan.envs import make_env, make_from
 from latentplan.evaluation.episodes import OnStep, Step, episode_seed, iterate_episodes
 from latentplan.evaluation.statistics import confidence_interval
@@ -42,7 +42,7 @@ from latentplan.training.distillation.labels import Demonstrations, plan_actions
 from latentplan.training.distillation.student import Student
 from latentplan.training.run import Result
 from latentplan.training.signals import Signals, exit_code, raise_interrupt
-from latentplan.training.state import load_values, lock_folder, refuse_used, save_values
+from latentplan.training.state import load_values, refuse_used, save_values
 
 KIND, FORMAT = "distillation", 2
 NUM_STAGES = 3  # per round: collect, train, select

@@ -16,7 +16,7 @@ import torch
 from latentplan.agents.checkpoint import load_model, read_info, resolve_checkpoint, save_checkpoint
 from latentplan.config import USER_DOMAIN, Config, GoalsConfig, UserError, derive_seed, to_dict
 from latentplan.config.commit import Save, Saves
-from latentplan.config.run_folder import RUN_FILE, SAVES_FOLDER, run_saves
+from latentplan.config.run_folder import RUN_FILE, SAVES_FOLDER, lock_folder, run_saves
 from latentplan.models import WorldModel
 from latentplan.replay.buffer import Replay
 from latentplan.replay.disk import FORMAT as REPLAY_FORMAT
@@ -26,7 +26,7 @@ from latentplan.training.console import StatusLine
 from latentplan.training.goal_conditioning.learner import BoxSource, GoalLearner
 from latentplan.training.run import Result
 from latentplan.training.signals import Signals, exit_code, raise_interrupt
-from latentplan.training.state import load_values, lock_folder, refuse_used, save_values, warn_of_loss
+from latentplan.training.state import load_values, refuse_used, save_values, warn_of_loss
 
 ROUND_DECISIONS = 125
 SAVE_SECONDS = 300.0

@@ -3,7 +3,8 @@
 All sequences that a decision evaluates count: those of the iterations, the mean and the best one that `final` compares,
 and those of the gradient ascent. `num_samples` is what the budget leaves for each iteration.
 
-A planner `NAME-wide` starts with a standard deviation of half the range of the actions, in place of a quarter.
+A planner `NAME-wide` starts with a larger standard deviation than its default, a quarter of the range of the actions;
+which one is chosen for each problem, as the settings of other libraries are.
 """
 
 from __future__ import annotations
@@ -17,17 +18,19 @@ from bench.controllers.serve import Entry, serve
 from bench.controllers.task import GRADIENT_COST, Act, Task
 from latentplan.planning import PLANNERS, ModelPredictiveController, make_planner
 
+WIDTHS = tuple({"width": width} for width in (1.0, 1.5, 2.0))  # standard deviations, in halves of the action range
 
-def controller(name: str, is_wide: bool = False) -> Callable[[Task, Sequence[int]], Act]:
-    """A function that makes the controller of a registered planner."""
+
+def controller(name: str) -> Callable[[Task, Sequence[int]], Act]:
+    """A function that makes the controller of a registered planner, with its defaults but for a `width` of `WIDTHS`."""
 
     def make(task: Task, seeds: Sequence[int]) -> Act:
         problem = task.problem
         bounds: dict[str, Any] = {"action_low": problem.action_low, "action_high": problem.action_high}
         size: dict[str, Any] = {"action_dim": problem.action_dim, "horizon": problem.horizon}
         budget: dict[str, Any] = budget_options(make_planner(name, **size), task)
-        width: dict[str, Any] = {"init_std": task.scale[1]} if is_wide else {}
-        planner = make_planner(name, **size, **bounds, **budget, **width, **task.settings)
+        start = {"init_std": task.settings["width"] * task.scale[1]} if "width" in task.settings else {}
+        planner = make_planner(name, **size, **bounds, **budget, **start)
         streams = [torch.Generator().manual_seed(seed) for seed in seeds]
         return ModelPredictiveController(planner, task.model(), generator=streams).act
 
@@ -49,5 +52,6 @@ def budget_options(planner: Any, task: Task) -> dict[str, int]:
 
 
 if __name__ == "__main__":
-    narrow = {name: Entry(controller(name), is_batched=True) for name in PLANNERS}
-    serve(narrow | {f"{name}-wide": Entry(controller(name, is_wide=True), is_batched=True) for name in PLANNERS})
+    default = {name: Entry(controller(name), is_batched=True) for name in PLANNERS}
+    wide = {f"{name}-wide": Entry(controller(name), is_batched=True, choices=WIDTHS) for name in PLANNERS}
+    serve(default | wide)

@@ -161,7 +161,7 @@ def test_cpu_backend_is_as_near_to_float32_as_the_reference_in_bfloat16(call, pa
     fast.backend.trunk_dtype = torch.bfloat16  # also on a processor where float32 is faster
     with torch.no_grad():
         if path == "compiled" and fast.backend._packed(fast) is None:
-            pytest.skip("no compiler, or a processor without bfloat16 products")
+            pytest.skip("no compiler, or a processor that multiplies in another precision")
         if path != "compiled":
             monkeypatch.setattr(rollout.compiled, "pack", lambda *_: None)
             fast.backend = CpuBackend()

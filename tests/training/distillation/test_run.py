@@ -10,12 +10,12 @@ import torch
 from latentplan.agents.checkpoint import load_agent, load_model, read_info, save_checkpoint
 from latentplan.agents.planning import PlanningAgent
 from latentplan.config import DistillConfig, PlannerConfig, UserError
+from latentplan.config.run_folder import lock_folder
 from latentplan.models import Gaussian, State, WorldModel
 from latentplan.training import distill, resume_distillation
 from latentplan.training.distillation.labels import Demonstrations, plan_actions
 from latentplan.training.distillation.run import Comparison
 from latentplan.training.distillation.student import Student
-from latentplan.training.state import lock_folder
 from tests.training.run_folder import list_saves, read_state
 
 INFO = {"domain": "user", "task": "push", "env_frames": 7, "discount": 0.9, "metrics": [{"planner": 1.0}]}

@@ -16,6 +16,7 @@ from latentplan.config import GoalsConfig, UserError
 from latentplan.config.commit import Saves
 from latentplan.config.files import dump_config
 from latentplan.config.quantities import QUANTITIES
+from latentplan.config.run_folder import lock_folder
 from latentplan.models import State, WorldModel
 from latentplan.objectives.box import box_degree, box_of
 from latentplan.objectives.parser import parse_objective
@@ -27,7 +28,6 @@ from latentplan.training.goal_conditioning import run as goal_run
 from latentplan.training.goal_conditioning.learner import Boxes, BoxSource, GoalLearner
 from latentplan.training.goal_conditioning.run import describe_box, load_replay
 from latentplan.training.learner.optimization import descend
-from latentplan.training.state import lock_folder
 
 LABELS = {"height": 0.5, "speed": 1.0, "task.walk": 0.5}
 INFO = {"domain": "walker", "task": "walk", "env_frames": 7, "discount": 0.9, "metrics": []}

@@ -1,0 +1,192 @@
+"""Progress of `benchmark.py suite`: rows of results as they come, lines on the terminal, and the time that is left."""
+
+from __future__ import annotations
+
+import heapq
+import statistics
+import sys
+import time
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+from bench.runs import FINAL, METRICS, TrainingRun, read_progress
+from bench.suite_queue import LOG
+from bench.suite_rows import Origin, Row, merge_rows, note_origin, read_origin, read_rows, rows_of, write_rows
+from latentplan.config import UserError
+
+LOOK_S = 5.0
+LEAST_SHARE = 0.02  # of a run, from which its speed is known
+
+
+class Progress(NamedTuple):
+    """How far a run is: the share of its budget that is spent, and the minutes that this took."""
+
+    share: float
+    minutes: float
+
+
+class Board:
+    """Keeps the rows of all runs in a file, and prints what happens to the runs.
+
+    Args:
+        runs: All runs of the sweep, in their order.
+        jobs: Runs side by side.
+        results: File of results; rows of other runs in it stay.
+        origin: Origin of a run that begins now.
+
+    Attributes:
+        rows: The rows in the file.
+        failures: The reason of each run that failed, by run.
+
+    Raises:
+        UserError: The file of results cannot be read.
+    """
+
+    def __init__(self, runs: Sequence[TrainingRun], jobs: int, results: Path, origin: Origin) -> None:
+        self.runs, self.jobs, self.results, self.origin = runs, jobs, results, origin
+        self.failures: dict[TrainingRun, str] = {}
+        self.rows = read_rows(results)
+        self._changes: dict[TrainingRun, tuple[int, ...]] = {}
+        self._seen: dict[TrainingRun, list[Row]] = {}
+        self._progress = {run: measure_progress(run) for run in runs}
+        self._looked = 0.0
+        for run in runs:
+            self._read(run)
+        write_rows(results, self.rows)
+
+    def begin(self, run: TrainingRun) -> None:
+        """Note the origin of a run, whose process is about to start."""
+        is_begun = read_origin(run.folder) is not None
+        note_origin(run.folder, self.origin)
+        self._print(f"{run.name}: {'goes on' if is_begun else 'begins'}; its log is {run.folder / LOG}")
+
+    def look(self, active: Sequence[TrainingRun]) -> None:
+        """Take new evaluations of active runs into the file of results; at most once in five seconds."""
+        if time.monotonic() - self._looked < LOOK_S:
+            return
+        self._looked = time.monotonic()
+        if any([self._update(run) for run in active]):
+            self._print(self.status())
+        if sys.stdout.isatty():
+            print(f"\r\x1b[K{self.status()}", end="", flush=True)
+
+    def wait(self, run: TrainingRun) -> None:
+        """Say that a run has to wait."""
+        self._print(f"{run.name}: waits, because another process learns in {run.folder}")
+
+    def finish(self, run: TrainingRun) -> None:
+        """Take the last rows of a run."""
+        self._update(run)
+        self._print(f"{run.name}: finished")
+        self._print(self.status())
+
+    def fail(self, run: TrainingRun, reason: str) -> None:
+        """Remember why a run failed; the next start of the sweep tries the run again."""
+        self._update(run)
+        self.failures[run] = reason
+        self._print(f"{run.name}: failed, {reason}")
+        self._print(self.status())
+
+    def stop(self, active: Sequence[TrainingRun]) -> None:
+        """Say that runs save themselves."""
+        names = "; ".join(run.name for run in active)
+        self._print(f"stopping, after a save of {names}" if names else "stopping")
+
+    def pause(self, run: TrainingRun) -> None:
+        """Take the last rows of a run that has saved itself."""
+        self._update(run)
+        self._print(f"{run.name}: saved")
+
+    def status(self) -> str:
+        """One line about the whole sweep."""
+        finished = sum(run.is_finished() for run in self.runs)
+        share = statistics.fmean(progress.share for progress in self._progress.values())
+        failed = f", {len(self.failures)} failed" if self.failures else ""
+        going = {run: progress for run, progress in self._progress.items() if run not in self.failures}
+        left = estimate_minutes_left(going, self.jobs)
+        rest = f"; {format_left(left)}" if finished < len(self.runs) else ""
+        return f"{finished} of {len(self.runs)} runs finished{failed}, {share:.1%} of the work{rest}"
+
+    def _read(self, run: TrainingRun) -> bool:
+        """Read the rows of a run if its files have changed; returns whether its rows have changed."""
+        files = (run.folder / METRICS, run.folder / FINAL)
+        changes = tuple(path.stat().st_mtime_ns if path.exists() else 0 for path in files)
+        if changes == self._changes.get(run, (0, 0)):
+            return False
+        try:
+            rows = rows_of(run)
+        except UserError as error:
+            if run.is_finished():  # else a file may just be written
+                self._print(f"{run.name}: {error}")
+            return False
+        self._changes[run] = changes
+        if rows == self._seen.get(run, []):
+            return False
+        self._seen[run] = rows
+        self.rows = merge_rows(self.rows, rows)
+        return True
+
+    def _update(self, run: TrainingRun) -> bool:
+        """Measure how far a run is, and take its rows; writes all rows if those of the run have changed.
+
+        Returns:
+            Whether the rows have changed; the last row of the run is printed then.
+        """
+        self._progress[run] = measure_progress(run)
+        if not self._read(run) or not self._seen[run]:
+            return False
+        write_rows(self.results, self.rows)
+        last = self._seen[run][-1]
+        clocks = f"{last.env_frames:,} frames in {last.minutes:,.1f} min"
+        self._print(f"{run.name}: {clocks}, planner {last.planner:.1f}, actor {last.actor:.1f}")
+        return True
+
+    def _print(self, line: str) -> None:
+        print(("\r\x1b[K" if sys.stdout.isatty() else "") + line, flush=True)
+
+
+def measure_progress(run: TrainingRun) -> Progress:
+    """How far a run is, from its metrics."""
+    frames, minutes = read_progress(run.folder)
+    if run.is_finished():
+        return Progress(1.0, minutes)
+    spent = {"--frames": frames, "--minutes": minutes}
+    return Progress(min(1.0, max(spent[name] / limit for name, limit in run.limits.items())), minutes)
+
+
+def estimate_minutes_left(progress: Mapping[TrainingRun, Progress], jobs: int) -> float | None:
+    """Minutes until all runs are finished; None before the speed of any run is known.
+
+    A run goes on as fast as it was, and a run that has not begun is as fast as others of its domain, or as all others.
+
+    Args:
+        progress: How far each run is, in the order of their starts.
+        jobs: Runs side by side.
+    """
+    whole = {run: minutes / share for run, (share, minutes) in progress.items() if share >= LEAST_SHARE}
+    if not whole:
+        return None
+    by_domain: dict[str, list[float]] = {}
+    for run, minutes in whole.items():
+        by_domain.setdefault(_domain(run), []).append(minutes)
+    mean = statistics.fmean(whole.values())
+    ends = [0.0] * jobs  # when each place in the queue becomes free
+    for run, (share, _) in progress.items():
+        expected = whole.get(run) or statistics.fmean(by_domain.get(_domain(run), [mean]))
+        heapq.heapreplace(ends, ends[0] + (1.0 - share) * expected)
+    return max(ends)
+
+
+def format_left(minutes: float | None) -> str:
+    """The time that is left, in words."""
+    if minutes is None:
+        return "the time left is not known yet"
+    hours, rest = divmod(round(minutes), 60)
+    days, hours = divmod(hours, 24)
+    parts = [f"{days} d"] * bool(days) + [f"{hours} h"] * bool(days or hours) + [f"{rest} min"] * (not days)
+    return f"about {' '.join(parts)} left"
+
+
+def _domain(run: TrainingRun) -> str:
+    return run.task.partition("-")[0]

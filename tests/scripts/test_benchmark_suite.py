@@ -1,0 +1,430 @@
+"""`benchmark.py suite`: the queue of runs and its interruptions, rows of results, and the report."""
+
+import csv
+import json
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import benchmark
+import numpy as np
+import pytest
+from bench import runs, suite, suite_progress, suite_queue
+from bench.anchors import TASK_GROUPS
+from bench.estimates import interquartile_mean
+from bench.runs import TrainingRun, read_evaluations
+from bench.suite_progress import Progress, estimate_minutes_left, format_left
+from bench.suite_rows import Origin, Row, merge_rows, note_origin, read_origin, read_rows, write_rows
+from bench.suite_scores import aggregate, completed, improvement, newest_curves, profile, rows_at
+from hypothesis import given
+from hypothesis import strategies as st
+
+from latentplan.commands.flags import read_request
+from latentplan.config.run_folder import lock_folder
+
+STUB = Path(__file__).with_name("stub_trainer.py")
+TASKS = ("walker-walk", "cartpole-swingup", "ball_in_cup-catch")
+FRAMES = 100
+DRIVER = f"""
+import sys
+from pathlib import Path
+import benchmark
+from bench import runs, suite_progress, suite_queue
+runs.SCRIPT, suite_queue.POLL_S, suite_progress.LOOK_S = Path({str(STUB)!r}), 0.02, 0.05
+sys.exit(benchmark.main(sys.argv[1:]))
+"""
+
+
+@pytest.fixture(autouse=True)
+def _stub(monkeypatch):
+    monkeypatch.setattr(runs, "SCRIPT", STUB)
+    monkeypatch.setattr(suite_queue, "POLL_S", 0.02)
+    monkeypatch.setattr(suite_progress, "LOOK_S", 0.05)
+
+
+def words(out, *flags, tasks=TASKS, seeds=(0, 1), frames=FRAMES):
+    given = ["--tasks", ",".join(tasks), "--seeds", *seeds, "--frames", frames, "--jobs", 2, "--out", out, *flags]
+    return ["suite", *map(str, given)]
+
+
+def sweep(out, *flags, **changes):
+    return benchmark.main(words(out, *flags, **changes))
+
+
+def start(root, out, **changes):
+    """Starts a sweep as a process of its own."""
+    environment = {**os.environ, "PYTHONPATH": f"{root}:{root / 'scripts'}"}
+    command = [sys.executable, "-c", DRIVER, *words(out, **changes)]
+    return subprocess.Popen(command, env=environment, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
+
+
+def processes(out):
+    """The processes that each run has had, by run: the flag of each process and its number."""
+    found = {}
+    for path in out.glob("*/processes.txt"):
+        found[path.parent.name] = [line.split() for line in path.read_text().splitlines()]
+    return found
+
+
+def wait_for(condition, seconds=60.0):
+    deadline = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < deadline
+        time.sleep(0.01)
+
+
+def make_row(task="walker-walk", seed=0, env_frames=100_000, planner=500.0, actor=400.0, version="0.2.0", minutes=60.0):
+    return Row(task, seed, env_frames, minutes, planner, actor, env_frames // 4, "2 cores of X", "abc", version)
+
+
+def results_of(out):
+    """The rows of a sweep without the origin of its runs."""
+    return [row[:7] for row in read_rows(out / "results.csv")]
+
+
+def test_runs_begin_with_the_first_seed_of_every_task(tmp_path):
+    order = [(run.task, run.seed) for run in suite.Request(tasks=("dev", *TASKS), seeds=(3, 1), out=tmp_path).runs]
+    tasks = TASK_GROUPS["dev"]  # TASKS are among them
+    assert order == [(task, seed) for seed in (3, 1) for task in tasks]
+    assert len(suite.Request().runs) == 2 * len(TASK_GROUPS["dmc20"])
+    assert [run.task for run in suite.Request(tasks=("walker", "walker-run"), seeds=(0,)).runs] == [
+        "walker-walk",
+        "walker-run",
+    ]
+
+
+def test_every_task_of_dmc20_has_settings():
+    for run in suite.Request(tasks=("dmc20",), seeds=(0,)).runs:
+        env = run.resolve().env
+        assert f"{env.domain}-{env.task}" == run.task
+
+
+def test_runs_get_one_thread_each_where_they_fill_the_cores(monkeypatch):
+    monkeypatch.setattr(suite, "count_cores", lambda: 2)
+    one, two = (suite.Request(jobs=jobs).runs[0].extra for jobs in (1, 2))
+    assert one == () and two == ("--run.threads", "1")
+    assert suite.Request(jobs=2, settings={"run": {"threads": 3}}).runs[0].extra == ("--run.threads", "3")
+
+
+def test_sweep_passes_preset_config_and_settings_to_each_run(tmp_path):
+    (tmp_path / "own.yaml").write_text("planner: {horizon: 7}\n")
+    flags = ["--minutes", "9", "--config", str(tmp_path / "own.yaml"), "--learning.batch_size", "5", "--preset", "cpu"]
+    request = read_request(suite.Request, words(tmp_path, *flags)[1:])
+    for run in request.runs:
+        config = run.resolve()
+        assert (config.planner.horizon, config.learning.batch_size) == (7, 5)
+        assert (config.run.frames, config.run.minutes, config.run.seed) == (FRAMES, 9.0, run.seed)
+
+
+def test_sweep_runs_everything_once_and_writes_a_row_per_evaluation(tmp_path, capsys):
+    assert sweep(tmp_path) == 0
+    first = processes(tmp_path)
+    assert {name: [flag for flag, _ in each] for name, each in first.items()} == {
+        f"{task}-seed{seed}": ["--domain"] for task in TASKS for seed in (0, 1)
+    }
+    rows = read_rows(tmp_path / "results.csv")
+    assert rows == sorted(rows) and len(rows) == len(TASKS) * 2 * FRAMES / 20
+    assert {(row.planner, row.actor) for row in rows if row.env_frames == FRAMES} == {(7.0, 5.0)}  # of the final ones
+    assert all("2 runs side by side" in row.hardware and row.commit and row.version for row in rows)
+    assert sweep(tmp_path) == 0  # the same again starts nothing
+    assert sweep(tmp_path, frames=FRAMES - 20) == 0  # and so does less
+    assert processes(tmp_path) == first and read_rows(tmp_path / "results.csv") == rows
+    assert "6 of 6 runs finished, 100.0% of the work" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGTERM, signal.SIGINT], ids=lambda number: number.name)
+def test_interrupted_sweep_goes_on_and_ends_like_one_that_was_not(root, tmp_path, number):
+    whole, cut = tmp_path / "whole", tmp_path / "cut"
+    changes = {"tasks": TASKS[:2], "frames": 300}
+    assert sweep(whole, **changes) == 0
+    first = start(root, cut, **changes)
+    wait_for(lambda: len(list(cut.glob("*/final.json"))) >= 2 and len(processes(cut)) > 2)
+    os.kill(first.pid, number)
+    first.communicate(timeout=60)
+    assert first.returncode == (-number if number == signal.SIGKILL else 128 + number)
+    if number == signal.SIGKILL:  # the runs are told too, and save themselves
+        numbers = [int(number) for each in processes(cut).values() for _, number in each]
+        wait_for(lambda: not any(is_running(number) for number in numbers))
+    assert sweep(cut, **changes) == 0
+    flags = [[flag for flag, _ in each] for each in processes(cut).values()]
+    assert all(each[0] == "--domain" and set(each[1:]) <= {"--resume"} for each in flags)
+    assert [len(each) for each in flags].count(1) >= 2  # finished runs were not repeated
+    assert results_of(cut) == results_of(whole)
+
+
+def is_running(number):
+    """Whether there is a process that has not ended."""
+    try:
+        return Path(f"/proc/{number}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
+    except OSError:
+        return False
+
+
+def test_runs_that_are_killed_with_their_sweep_go_on(root, tmp_path):
+    first = start(root, tmp_path, tasks=TASKS[:1], frames=400)
+    wait_for(lambda: len(list(tmp_path.glob("*/resume/save-000001/frames"))) == 2)
+    first.kill()
+    for each in processes(tmp_path).values():
+        os.kill(int(each[0][1]), signal.SIGKILL)
+    first.communicate(timeout=60)
+    assert sweep(tmp_path, tasks=TASKS[:1], frames=400) == 0
+    assert all([flag for flag, _ in each] == ["--domain", "--resume"] for each in processes(tmp_path).values())
+
+
+def test_second_sweep_in_a_folder_is_refused_in_one_line(tmp_path, capsys):
+    with lock_folder(tmp_path):
+        assert sweep(tmp_path) == 2
+    captured = capsys.readouterr()
+    assert captured.err.count("\n") == 1 and f"another sweep runs in {tmp_path}" in captured.err
+    assert not processes(tmp_path)
+
+
+def test_failed_run_is_reported_and_tried_again_and_stops_no_other(tmp_path, capsys):
+    broken = tmp_path / "walker-walk-seed0.broken"
+    broken.touch()
+    assert sweep(tmp_path) == 1
+    printed = capsys.readouterr().out
+    assert "walker-walk, seed 0: failed, exit code 2: error: this run is broken" in printed
+    assert "runs that failed: 1;" in printed and "5 of 6 runs finished, 1 failed" in printed
+    broken.unlink()
+    before = processes(tmp_path)
+    assert sweep(tmp_path) == 0
+    after = processes(tmp_path)
+    assert set(after) - set(before) == {"walker-walk-seed0"} and before.items() <= after.items()
+
+
+def test_run_waits_while_another_process_has_its_folder(tmp_path, capsys):
+    folder = tmp_path / "walker-walk-seed0"
+    code = f"import sys; sys.path.insert(0, {str(STUB.parents[2])!r})\n"
+    code += "import time; from pathlib import Path; from latentplan.config.run_folder import lock_folder\n"
+    code += f"with lock_folder(Path({str(folder)!r})): print('held', flush=True); time.sleep(1.0)"
+    with subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True) as other:
+        assert other.stdout.readline() == "held\n"
+        assert sweep(tmp_path) == 0
+    printed = capsys.readouterr().out
+    assert printed.count("walker-walk, seed 0: waits") == 1 and "6 of 6 runs finished" in printed
+
+
+@pytest.mark.parametrize(
+    ("flags", "named"),
+    [
+        (["--tasks", "walkr-walk"], "'walker'"),
+        (["--tasks", "walker-wlk"], "'walk'"),
+        (["--tasks", "dmc21"], "dmc20, dev"),
+        (["--tasks", "walker-walk", "--seeds", "0", "-1"], "--seeds"),
+        (["--seeds", "0", "x"], "--seeds"),
+        (["--jobs", "0"], "--jobs"),
+        (["--frames", "0"], "--frames"),
+        (["--minutes", "nan"], "--minutes"),
+        (["--run.seed", "3"], "--seeds"),
+        (["--learning.batch_size", "0"], "batch_size"),
+        (["--planner.num_samples", "1e12"], "num_samples"),
+        (["--report", "report.txt"], "--report"),
+        (["--report", "no/such/folder/report.md"], "no/such/folder"),
+        (["--merge", "."], "--results"),
+        (["--results", "rows.csv"], "--report"),
+        (["--results", "rows.csv", "--report", "report.md"], "rows.csv holds no rows"),
+        (["--results", "rows.csv", "--merge", "nowhere"], "nowhere/results.csv holds no rows"),
+        (["--config", "nowhere.yaml"], "nowhere.yaml"),
+    ],
+)
+def test_suite_refuses_bad_input_in_one_line_before_anything_starts(tmp_path, monkeypatch, capsys, flags, named):
+    monkeypatch.chdir(tmp_path)
+    assert benchmark.main(["suite", "--out", "out", *flags]) == 2
+    captured = capsys.readouterr()
+    assert captured.out == "" and captured.err.count("\n") == 1 and named in captured.err
+    assert not list(tmp_path.iterdir())
+
+
+def test_missing_rliable_is_one_line_before_anything_starts(tmp_path, monkeypatch, capsys):
+    monkeypatch.setitem(sys.modules, "rliable", None)
+    assert sweep(tmp_path / "out", "--report", tmp_path / "report.md") == 2
+    line = "error: --report needs rliable, which is not installed; run: pip install 'latentplan[bench]'\n"
+    assert capsys.readouterr().err == line and not (tmp_path / "out").exists()
+
+
+ROWS = st.lists(
+    st.builds(
+        make_row,
+        task=st.sampled_from(TASKS),
+        seed=st.integers(0, 2),
+        env_frames=st.integers(1, 4).map(lambda count: 25_000 * count),
+        planner=st.floats(0.0, 1000.0).map(lambda value: round(value, 2)),
+        version=st.sampled_from(("0.2.0", "0.10.0")),
+    ),
+    unique_by=lambda row: (row.task, row.seed, row.version, row.env_frames),
+)
+
+
+@given(known=ROWS, new=ROWS)
+def test_merge_keeps_other_runs_and_replaces_those_of_a_task_seed_and_version(known, new):
+    merged = merge_rows(known, new)
+    replaced = {(row.task, row.seed, row.version) for row in new}
+    kept = [row for row in known if (row.task, row.seed, row.version) not in replaced]
+    assert sorted(merged) == sorted([*kept, *new])
+    assert merge_rows(merged, new) == merged == merge_rows(merged, []) == merge_rows([], merged)
+
+
+@given(rows=ROWS)
+def test_rows_return_unchanged_from_their_file(tmp_path_factory, rows):
+    path = tmp_path_factory.mktemp("rows") / "rows.csv"
+    write_rows(path, rows)
+    assert read_rows(path) == rows and path.exists() == bool(rows)
+
+
+def test_merge_adds_a_sweep_to_a_file_that_need_not_exist(tmp_path, capsys):
+    results, out = tmp_path / "suite.csv", tmp_path / "out"
+    out.mkdir()
+    other, old, new = make_row("fish-swim"), make_row(planner=1.0), make_row(planner=2.0)
+    for rows, expected in (([other, old], [other, old]), ([new], [other, new])):
+        write_rows(out / "results.csv", rows)
+        assert benchmark.main(["suite", "--results", str(results), "--merge", str(out)]) == 0
+        assert read_rows(results) == expected
+    assert results.read_text().splitlines()[0] == (
+        "task,seed,env_frames,minutes,planner,actor,updates,hardware,commit,version"
+    )
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "named"),
+    [
+        ("planner", "plan", "lacks the column planner"),
+        ("100000", "many", "line 2"),
+        ("500.0", "nan", "line 2"),
+        ("walker-walk", "", "line 2"),
+        (",0.2.0", "", "line 2"),
+    ],
+)
+def test_damaged_file_of_results_is_refused_in_one_line(tmp_path, capsys, old, new, named):
+    path = tmp_path / "rows.csv"
+    write_rows(path, [make_row()])
+    path.write_text(path.read_text().replace(old, new))
+    assert benchmark.main(["suite", "--results", str(path), "--report", str(tmp_path / "report.md")]) == 2
+    assert named in capsys.readouterr().err
+
+
+def test_origin_names_every_machine_and_commit_and_the_version_that_began(tmp_path):
+    assert read_origin(tmp_path) is None
+    for hardware, commit, version in (("A", "1", "0.2.0"), ("A", "2", "0.3.0"), ("B", "1", "0.3.0")):
+        note_origin(tmp_path, Origin(hardware, commit, version))
+    assert read_origin(tmp_path) == Origin("A + B", "1 + 2", "0.2.0")
+
+
+def test_evaluations_of_an_extended_run_keep_those_after_its_former_end(tmp_path):
+    lines = [
+        "env_frames,updates,minutes,planner_return,actor_return",
+        "20,5,1,1,2",
+        "40,9,2,3,4",
+        "60,12,3,5,6",
+        "80,15",
+    ]
+    (tmp_path / "metrics.csv").write_text("\n".join(lines))  # the last line is still being written
+    final = {"env_frames": 40, "updates": 9, "minutes": 2.0, "planner": 7.0, "actor": 8.0}
+    (tmp_path / "final.json").write_text(json.dumps(final))
+    assert [(each.env_frames, each.planner) for each in read_evaluations(tmp_path)] == [(20, 1.0), (40, 7.0), (60, 5.0)]
+
+
+def test_finished_run_with_damaged_results_is_named(tmp_path, capsys):
+    assert sweep(tmp_path) == 0
+    (tmp_path / "walker-walk-seed0" / "final.json").write_text("{")
+    assert sweep(tmp_path) == 0
+    assert "walker-walk, seed 0: the results in" in capsys.readouterr().out
+    assert len({(row.task, row.seed) for row in read_rows(tmp_path / "results.csv")}) == 6  # known rows stay
+
+
+def test_time_left_counts_what_is_left_over_the_runs_side_by_side(tmp_path):
+    some = [TrainingRun("walker-walk", seed, tmp_path / str(seed), ("--frames", "100")) for seed in range(4)]
+    assert estimate_minutes_left(dict.fromkeys(some, Progress(0.0, 0.0)), 2) is None
+    progress = {some[0]: Progress(1.0, 60.0), some[1]: Progress(0.5, 30.0), **dict.fromkeys(some[2:], Progress(0, 0))}
+    assert estimate_minutes_left(progress, 1) == pytest.approx(30.0 + 60.0 + 60.0)
+    assert estimate_minutes_left(progress, 2) == pytest.approx(30.0 + 60.0)
+    assert estimate_minutes_left(dict.fromkeys(some, Progress(1.0, 60.0)), 2) == 0.0
+    slow = TrainingRun("fish-swim", 0, tmp_path, ("--frames", "100"))
+    known = progress | {slow: Progress(0.5, 300.0)}  # a slow run of another domain does not slow the walker's
+    assert estimate_minutes_left(known, 1) == pytest.approx(150.0 + 300.0)
+    assert [format_left(minutes) for minutes in (0.4, 61.0, 3000.0)] == [
+        "about 0 min left",
+        "about 1 h 1 min left",
+        "about 2 d 2 h left",
+    ]
+
+
+def test_rows_at_a_number_of_frames_are_the_last_within_them_of_the_newest_version():
+    rows = [make_row(env_frames=frames) for frames in (50_000, 100_800, 150_000)]
+    rows += [make_row(env_frames=60_000, version="0.1.9"), make_row(seed=1, env_frames=60_000, version="0.10.0")]
+    found = rows_at(newest_curves(rows), 100_000)
+    assert found == {"walker-walk": {0: rows[1], 1: rows[4]}}
+    assert completed(found, 100_000) == {"walker-walk": [rows[1]]}
+
+
+def test_improvement_agrees_with_rliable_and_is_fair():
+    from rliable.metrics import probability_of_improvement
+
+    rng = np.random.default_rng(0)
+    ours, theirs = rng.integers(0, 9, (4, 6)) / 9, rng.integers(0, 9, (3, 6)) / 9
+    forward, backward = improvement(ours, theirs), improvement(theirs, ours)
+    assert forward.mean == pytest.approx(probability_of_improvement(ours, theirs))
+    assert forward.mean + backward.mean == pytest.approx(1.0) and improvement(ours, ours).mean == pytest.approx(0.5)
+    assert forward.low <= forward.mean <= forward.high
+    assert improvement(ours[:1], theirs).low is None
+
+
+def test_aggregate_is_repeatable_and_has_intervals_from_two_runs_on():
+    scores = np.random.default_rng(1).uniform(size=(3, 8))
+    found = aggregate(scores)
+    assert found == aggregate(scores)
+    assert found["interquartile mean"].mean == pytest.approx(interquartile_mean(scores.ravel().tolist()))
+    mean, low, high = found["mean"]
+    assert mean == pytest.approx(scores.mean()) and low < mean < high
+    assert all(each.low is None for each in aggregate(scores[:1]).values())
+    share, low, high = profile(scores, np.array([-0.1, 0.5, 1.0]))
+    assert share.tolist() == [1.0, np.mean(scores > 0.5), 0.0] and (low <= share).all() and (share <= high).all()
+
+
+def test_report_needs_nothing_but_a_file_of_results(tmp_path, capsys):
+    rows = [
+        make_row(task, seed, frames, planner=frames / 200 + 10 * seed, actor=frames / 250)
+        for task in (*TASKS, "fish-swim")
+        for seed in (0, 1)
+        for frames in (50_000, 100_000, 150_000)
+    ]
+    rows.append(make_row("cheetah-run", 0, 50_000))
+    write_rows(tmp_path / "suite.csv", rows)
+    report = tmp_path / "suite.md"
+    assert benchmark.main(["suite", "--results", str(tmp_path / "suite.csv"), "--report", str(report)]) == 0
+    text = report.read_text()
+    lines = {line.split(" | ")[0].strip("| "): line for line in text.splitlines() if line.startswith("| ")}
+    assert "| 505 (441 to 569) | 400 (400 to 400) | 60 | 625 / 874 |" in lines["walker-walk"]
+    assert "| 505 (441 to 569) |" in lines["fish-swim"]  # of which nothing is published
+    assert "| 50,000 | 1 | **500** | 400 | 60 |" in lines["cheetah-run"]  # EfficientZero V2 has 463
+    assert "cheetah-run, seed 0 (50,000)" in text
+    assert lines["mean"].startswith("| mean | 505 (")
+    assert re.match(r"\| DreamerV3 \| 3 \| 505 / 6\d\d \|", lines["DreamerV3"])
+    for kind in ("curves", "profile"):
+        assert f"(suite-{kind}.png)" in text and (tmp_path / f"suite-{kind}.png").stat().st_size > 10_000
+    flags = ["--results", str(tmp_path / "suite.csv"), "--tasks", "fish-swim", "--seeds", "1"]
+    assert benchmark.main(["suite", *flags, "--report", str(report)]) == 0
+    assert "1 runs of 1 tasks" in report.read_text() and "walker" not in report.read_text()
+    assert benchmark.main(["suite", *flags, "--frames", "20", "--report", str(report)]) == 2
+    assert "no run has an evaluation within 20 frames" in capsys.readouterr().err
+
+
+def test_sweep_ends_with_its_report(tmp_path):
+    out = tmp_path / "out"
+    assert sweep(out, "--report", tmp_path / "report.md", tasks=TASKS[:1], seeds=(0,)) == 0
+    assert "walker-walk" in (tmp_path / "report.md").read_text()
+    assert len(list(csv.DictReader((out / "results.csv").open()))) == FRAMES / 20
+
+
+def test_run_is_finished_with_its_budget_or_a_larger_one(tmp_path):
+    run = TrainingRun("walker-walk", 0, tmp_path, ("--frames", "100"))
+    assert not run.is_finished()
+    run.mark_finished()
+    for budget, finished in ((("--frames", "1e2"), True), (("--frames", "101"), False), (("--minutes", "1"), False)):
+        assert TrainingRun("walker-walk", 0, tmp_path, budget).is_finished() == finished
+    (tmp_path / "finished.json").write_text("{")
+    assert not run.is_finished()
