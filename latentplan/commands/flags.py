@@ -92,7 +92,7 @@ def list_flags(request: type) -> list[Flag]:
         for inner in list_settings(kind):
             dotted = setting.options["prefix"] + inner.key
             short = setting.options["short"].get(inner.key)
-            names = (*((short,) if short else ()), _spelled(dotted))
+            names = tuple(dict.fromkeys([*((short,) if short else ()), _spelled(dotted)]))
             is_common = short is not None or ("." not in dotted and not inner.options.get("is_rare"))
             flags.append(Flag(names, dataclasses.replace(inner, key=f"{setting.key}.{inner.key}"), is_common))
     return sorted(flags, key=lambda flag: bool(flag.setting.options.get("is_last")))

@@ -17,6 +17,7 @@ SHORT_FLAGS = {
     "env.domain": "--domain",
     "env.task": "--task",
     "env.kwargs": "--env-kwargs",
+    "env.pixels": "--env.pixels",
     "run.frames": "--frames",
     "run.minutes": "--minutes",
     "run.device": "--device",
