@@ -8,6 +8,7 @@ from typing import Any
 from latentplan.commands.flags import overrides
 from latentplan.commands.shell import LearningRequest, check_search, name_folder, saved_config, search_settings
 from latentplan.config import DistillConfig, PlannerConfig
+from latentplan.config.env_id import ENV_FLAGS, EnvChoice
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -17,13 +18,15 @@ class Request(LearningRequest):
     Attributes:
         settings: Settings of the distillation that were given.
         planner: Settings of the search that labels, in place of the agent's own.
+        env: The environment of an agent that learned in one of the user's; of gymnasium's registry, as for training.
     """
 
-    RESUMABLE = ("--rounds", "--minutes", "--device", "--threads")
+    RESUMABLE = ("--rounds", "--minutes", "--device", "--threads", *ENV_FLAGS.values())
     NOTES = "The world model stays as it is. --planner.* replace the settings of the agent's own search."
 
     settings: dict[str, Any] = overrides(DistillConfig)
     planner: dict[str, Any] = overrides(PlannerConfig, prefix="planner.")
+    env: dict[str, Any] = overrides(EnvChoice, ENV_FLAGS, prefix="env.")
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -55,8 +58,8 @@ def run(request: Request) -> int:
     from latentplan.training import distill, resume_distillation
 
     if request.resume is not None:
-        return resume_distillation(request.resume, device=device, **request.settings).exit_code
+        return resume_distillation(request.resume, device=device, env=request.env, **request.settings).exit_code
     assert request.checkpoint is not None
     out = request.out or name_folder("distilled", info)
     settings = DistillConfig(**request.settings)
-    return distill(request.checkpoint, out, settings, planner=planner, device=device).exit_code
+    return distill(request.checkpoint, out, settings, planner=planner, device=device, env=request.env).exit_code

@@ -18,6 +18,7 @@ from latentplan.commands.flags import overrides
 from latentplan.commands.shell import ComputeRequest, check_search, saved_config, search_settings
 from latentplan.config import EnvConfig, PlannerConfig, UserError, to_dict
 from latentplan.config.checks import MAX_EPISODES, above_zero, at_least, one_of, within
+from latentplan.config.env_id import ENV_FLAGS, EnvChoice, choose_env, is_by_id
 from latentplan.config.parsing import option
 
 if TYPE_CHECKING:
@@ -43,6 +44,7 @@ class Request(ComputeRequest):
         control_hz: Decisions per second of a world that goes on while the agent computes; None makes the world wait.
         latency: Time that a decision takes in a world that does not wait: `measured`, or a file of milliseconds.
         seed: Seed of the starts: episode i starts from a state that depends only on the seed and i.
+        env: The environment, in place of the one that the agent learned in.
         planner: Settings of the search, in place of the agent's own.
     """
 
@@ -59,6 +61,7 @@ class Request(ComputeRequest):
     control_hz: float | None = None
     latency: str | None = option(None, metavar="measured|FILE")
     seed: int = 0
+    env: dict[str, Any] = overrides(EnvChoice, ENV_FLAGS, prefix="env.")
     planner: dict[str, Any] = overrides(PlannerConfig, prefix="planner.")
 
     def __post_init__(self) -> None:
@@ -116,11 +119,12 @@ def run(request: Request) -> int:
 
     info = read_info(request.checkpoint)
     config = saved_config(request.checkpoint, info)
+    chosen = choose_env(config.env, request.env)
     planner = search_settings(config, request.planner)
     if request.planner:
         check_search(planner, config.model)
     read_durations(request.latency or MEASURED)
-    _check_expressions(request, config.env.domain)
+    _check_expressions(request, chosen.domain)
     from latentplan.agents.modes import MODES
     from latentplan.evaluation.clock import VirtualClock, read_latency
     from latentplan.evaluation.timed import load_timed_agent
@@ -130,12 +134,11 @@ def run(request: Request) -> int:
     if request.planning_budget is not None:
         changes["planning_budget"] = request.planning_budget
     device = request.use_device(threads=1 if MODES[request.mode].one_thread else None)
-    from latentplan.envs import make_env
     from latentplan.evaluation.goals import goal_env, read_goals, score_env
 
-    goals = read_goals(request.objective, request.constraint, config.env.domain)
-    world = config.env if goals is None else goal_env(config.env)
-    env = make_env(world)
+    goals = read_goals(request.objective, request.constraint, chosen.domain)
+    world = chosen if goals is None else goal_env(chosen)
+    env = _make_env(world, info["action_dim"])
     try:
         clock = VirtualClock(request.control_hz, latency)
         agent = load_timed_agent(request.checkpoint, request.mode, clock, device, **changes)
@@ -151,6 +154,26 @@ def run(request: Request) -> int:
             raise UserError(f"an output could not be written: {error}") from error
     finally:
         env.close()
+
+
+def _make_env(config: EnvConfig, action_dim: int) -> Any:
+    """The environment to play in; one of the user's, whose code may fail, gives an error of one line.
+
+    Raises:
+        UserError: The environment cannot be made, or takes actions of another size than the agent's.
+    """
+    from latentplan.envs import make_env
+    from latentplan.envs.vector import make_guarded_env
+
+    env = make_guarded_env(config) if is_by_id(config) else make_env(config)
+    size = (env.action_space.shape or (0,))[0]
+    if size != action_dim:
+        env.close()
+        raise UserError(
+            f"{config.domain}-{config.task} takes actions of {size} numbers, the agent gives {action_dim}: give "
+            "--env-id of the environment that it learned in"
+        )
+    return env
 
 
 def _check_expressions(request: Request, domain: str) -> None:
@@ -208,17 +231,17 @@ def _play_and_report(
 def _describe(
     request: Request, info: dict[str, Any], env: EnvConfig, planner: PlannerConfig, goals: Goals | None
 ) -> dict[str, Any]:
-    from latentplan.envs import render_info
+    from latentplan.envs.registry import describe_renderer
 
     described = {
-        "domain": info["domain"],
-        "task": info["task"],
+        "domain": env.domain if request.env else info["domain"],
+        "task": env.task if request.env else info["task"],
         "mode": request.mode,
         "seed": request.seed,
         "env_frames_trained": int(info["env_frames"]),
         "render_quality": env.render_quality,
         "floor": env.floor,
-        "renderer": render_info()["renderer"],
+        "renderer": describe_renderer(env)["renderer"],
     }
     if request.mode not in planning_modes():
         return described

@@ -92,7 +92,7 @@ def list_flags(request: type) -> list[Flag]:
         for inner in list_settings(kind):
             dotted = setting.options["prefix"] + inner.key
             short = setting.options["short"].get(inner.key)
-            names = (*((short,) if short else ()), _spelled(dotted))
+            names = tuple(dict.fromkeys([*((short,) if short else ()), _spelled(dotted)]))
             is_common = short is not None or ("." not in dotted and not inner.options.get("is_rare"))
             flags.append(Flag(names, dataclasses.replace(inner, key=f"{setting.key}.{inner.key}"), is_common))
     return sorted(flags, key=lambda flag: bool(flag.setting.options.get("is_last")))
@@ -105,6 +105,9 @@ def read_request(request: type[Request], argv: Sequence[str]) -> Request:
         UserError: A flag or value is wrong or an output cannot be written; the message says what to give instead.
     """
     flags = list_flags(request)
+    first = vars(request).get("FIRST")  # the flag that the first word needs not repeat
+    if first is not None and argv and not argv[0].startswith("-"):
+        argv = [first, *argv]
     names = {flag.setting.key: flag.names[0] for flag in flags}
     values = read_values([flag.setting for flag in flags], _read_texts(flags, argv), names)
     _check_resumed(request, [names[key] for key in values])

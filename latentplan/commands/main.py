@@ -40,6 +40,8 @@ COMMANDS = {
     "distill": Command("latentplan.commands.distill", "teach a trained agent's actor to act as its planner does"),
     "goals": Command("latentplan.commands.goals", "teach a trained agent to pursue goals that are named later"),
     "export": Command("latentplan.commands.export", "write the actor as a program that runs without this package"),
+    "envs": Command("latentplan.commands.envs", "list the environments that there are, by suite"),
+    "check-env": Command("latentplan.commands.check_env", "test an environment before an agent learns in it"),
     "doctor": Command("latentplan.commands.doctor", "report versions, device and renderer, and how to mend problems"),
 }
 

@@ -15,6 +15,7 @@ from typing import Any
 
 from latentplan.config import MAX_THREADS, Config, Device, ModelConfig, PlannerConfig, UserError, from_dict, to_dict
 from latentplan.config.checks import EnvironmentFault, cut, shown, within
+from latentplan.config.env_id import as_file_name
 from latentplan.config.estimates import check_parts, estimate_search
 from latentplan.config.extras import describe_missing, extra_of
 from latentplan.config.files import build_config, has_cuda
@@ -35,21 +36,21 @@ def run_guarded(command: Callable[[Sequence[str]], int], argv: Sequence[str]) ->
         finally:
             sys.stdout.flush()
     except EnvironmentFault as error:
-        code = _refuse(str(error))
+        code = refuse(str(error))
         print(error.origin, file=sys.stderr, end="")
         return code
     except (UserError, FloatingPointError) as error:
-        return _refuse(str(error))
+        return refuse(str(error))
     except ModuleNotFoundError as error:
         if extra_of(error.name) is None:
             raise
-        return _refuse(describe_missing(str(error.name), "this command"))
+        return refuse(describe_missing(str(error.name), "this command"))
     except MemoryError:
-        return _refuse("not enough memory: lower the sizes that were asked for, or end other programs")
+        return refuse("not enough memory: lower the sizes that were asked for, or end other programs")
     except RuntimeError as error:
         if not _is_out_of_memory(error):
             raise
-        return _refuse("not enough memory on the device: lower the sizes that were asked for, or end other programs")
+        return refuse("not enough memory on the device: lower the sizes that were asked for, or end other programs")
     except KeyboardInterrupt:
         return 130
     except BrokenPipeError:
@@ -59,7 +60,7 @@ def run_guarded(command: Callable[[Sequence[str]], int], argv: Sequence[str]) ->
         if error.strerror is None:
             raise
         name = "" if error.filename is None else f": {shown(str(error.filename))}"
-        return _refuse(f"the system refused a file or a process{name}: {error.strerror}")
+        return refuse(f"the system refused a file or a process{name}: {error.strerror}")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -172,7 +173,8 @@ def name_folder(kind: str, info: Mapping[str, Any]) -> Path:
         kind: First word of the name, such as `distilled`.
         info: Content of the `info.json` of the agent.
     """
-    return Path("runs") / f"{kind}-{info['domain']}-{info['task']}-{datetime.now():%Y%m%d-%H%M%S}"
+    name = as_file_name(f"{kind}-{info['domain']}-{info['task']}")
+    return Path("runs") / f"{name}-{datetime.now():%Y%m%d-%H%M%S}"
 
 
 @contextlib.contextmanager
@@ -196,7 +198,8 @@ def _is_out_of_memory(error: RuntimeError) -> bool:
     return "can't allocate memory" in text or "out of memory" in text or "Storage size calculation overflowed" in text
 
 
-def _refuse(message: str) -> int:
+def refuse(message: str) -> int:
+    """Prints an error as one line on stderr, and returns the exit code 2."""
     line = cut(" ".join(message.split())).encode(sys.stderr.encoding or "utf-8", "backslashreplace")
     print(f"error: {line.decode(sys.stderr.encoding or 'utf-8')}", file=sys.stderr)
     return 2

@@ -8,6 +8,7 @@ from typing import Any
 
 from latentplan.commands.flags import overrides
 from latentplan.config import Config, UserError
+from latentplan.config.env_id import FLAG, import_named, lay_env
 from latentplan.config.files import Preset, compose, read_layer
 from latentplan.config.parsing import option
 from latentplan.config.run_folder import read_run_config
@@ -15,6 +16,8 @@ from latentplan.config.run_folder import read_run_config
 SHORT_FLAGS = {
     "env.domain": "--domain",
     "env.task": "--task",
+    "env.kwargs": "--env-kwargs",
+    "env.pixels": "--env.pixels",
     "run.frames": "--frames",
     "run.minutes": "--minutes",
     "run.device": "--device",
@@ -28,24 +31,32 @@ class Request:
     """The command line of a training run.
 
     Attributes:
+        env_id: Environment of gymnasium's registry, as ID or module:ID, in place of a domain and a task. A module is
+            imported; a run that resumes needs it again.
         preset: Machine class; `auto` takes `gpu` where CUDA is usable.
         config: YAML file of settings, laid over the preset.
         resume: Folder of the run to continue.
         settings: Settings that were given, by section and name.
     """
 
-    RESUMABLE = ("--frames", "--minutes", "--device")
+    RESUMABLE = ("--frames", "--minutes", "--device", "--env-id")
     NOTES = "Values shown are the defaults before configs/<domain>.yaml and the preset are laid over them."
 
     settings: dict[str, Any] = overrides(Config, SHORT_FLAGS)
+    env_id: str | None = option(None, metavar="[MODULE:]ID")
     preset: Preset = "auto"
     config: Path | None = option(None, metavar="FILE")
     resume: Path | None = option(None, metavar="DIR")
+
+    def __post_init__(self) -> None:
+        lay_env(self.settings.get("env", {}), self.env_id)
 
 
 def run(request: Request) -> int:
     """Train or resume, and return the exit code."""
     config = resolve(request)
+    if request.env_id is not None:
+        import_named(request.env_id)
     from latentplan.training.checks import check_settings
 
     check_settings(config)
@@ -63,10 +74,18 @@ def resolve(request: Request) -> Config:
         UserError: A file cannot be read, a value is not allowed, or there is nothing to resume.
     """
     if request.resume is None:
-        return compose(read_layer(request.config) if request.config else {}, request.settings, request.preset)
+        given = request.settings
+        if request.env_id is not None:
+            given = {**given, "env": lay_env(given.get("env", {}), request.env_id)}
+        return compose(read_layer(request.config) if request.config else {}, given, request.preset)
     if not request.resume.is_dir():
         raise UserError(f"nothing to resume in {request.resume}: give the folder of a run")
     saved, changes = read_run_config(request.resume)[0], request.settings.get("run", {})
+    if request.env_id not in (None, saved.env.task):
+        raise UserError(
+            f"{FLAG} {request.env_id} is not the environment of {request.resume}, which learns in "
+            f"{saved.env.domain}-{saved.env.task}; only the same can be given"
+        )
     if "frames" in changes or "minutes" in changes:  # a new budget replaces the saved one, of either kind
         changes = {"frames": None, "minutes": None, **changes}
     try:

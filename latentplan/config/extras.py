@@ -14,6 +14,8 @@ EXTRAS = {
     ),
     "bench": ("rliable",),
     "jax": ("jax",),
+    "gymnasium": ("imageio", "pygame"),
+    "robotics": ("gymnasium_robotics",),
 }
 """By extra, the modules that it installs and the package without extras does not."""
 

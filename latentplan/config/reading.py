@@ -13,7 +13,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from latentplan.config.checks import UserError
+from latentplan.config.checks import UserError, shown
 
 LARGEST_SETTINGS = 2**20  # bytes of a file of settings
 LARGEST_DATA = 2**26  # bytes of a file of measurements
@@ -104,6 +104,26 @@ def parse_json(text: str, path: Path | str) -> Any:
     except ValueError as error:
         reason = str(error) if isinstance(error, json.JSONDecodeError) else "it holds a number that is too long"
         raise UserError(f"{path} cannot be read: {reason}") from None
+
+
+def read_kwargs(text: str) -> dict[str, Any]:
+    """The arguments of an environment.
+
+    Args:
+        text: A JSON object.
+
+    Raises:
+        ValueError: The text is something else.
+    """
+    example = """'{"max_episode_steps": 200}'"""
+    try:
+        kwargs = json.loads(text)
+    except (ValueError, RecursionError, TypeError) as error:
+        reason = f": {error}" if isinstance(error, json.JSONDecodeError) else ""
+        raise ValueError(f"kwargs must be a JSON object such as {example}, got {shown(text)}{reason}") from None
+    if not isinstance(kwargs, dict):
+        raise ValueError(f"kwargs must be a JSON object such as {example}, got {shown(text)}")
+    return kwargs
 
 
 def _read_parts(opened: int, size: int) -> Iterator[bytes]:

@@ -11,16 +11,20 @@ from typing import Any, Literal, get_args
 
 from latentplan.config.checks import MAX_EPISODES, MAX_THREADS, UserError, above_zero, at_least, one_of, within
 from latentplan.config.learning import CollectionConfig, LearningConfig
+from latentplan.config.parsing import option
 from latentplan.config.planner import PlannerConfig
+from latentplan.config.reading import read_kwargs
 from latentplan.config.removed import drop_removed
 
 LATENT_DIM = 32
 RenderQuality = Literal["exact", "fast", "fastest"]
 Floor = Literal["suite", "endless"]
 Device = Literal["auto", "cpu", "cuda"]
+Pixels = Literal["observation", "render"]
 RENDER_QUALITIES = get_args(RenderQuality)
 FLOORS = get_args(Floor)
 DEVICES = get_args(Device)
+PIXELS = get_args(Pixels)
 MAX_REPEAT = 10_000  # ten of the longest episodes of dm_control
 MAX_ENVS = 1024
 MAX_CAMERA = 1000
@@ -44,6 +48,10 @@ class EnvConfig:
         objective: Expression over the body's quantities that replaces the task's reward at every control step, such as
             `speed -> 2.0 and height > 1.1`; None keeps the task's reward.
         suite: Suite of the domain, a name in `latentplan/config/suites.py`.
+        kwargs: Arguments of an environment of gymnasium's registry (suite `gymnasium`), as a JSON object; the argument
+            `max_episode_steps` sets its time limit.
+        pixels: Where the pictures of an environment outside of dm_control come from: `observation` takes its
+            observations, `render` takes what its `render()` draws, squeezed to a square; observations are then ignored.
     """
 
     domain: str = "walker"
@@ -55,10 +63,13 @@ class EnvConfig:
     num_envs: int = 1
     objective: str | None = None
     suite: str = "dm_control"
+    kwargs: str = option("{}", metavar="JSON")
+    pixels: Pixels = "observation"
 
     def __post_init__(self) -> None:
+        read_kwargs(self.kwargs)
         within(self, action_repeat=(1, MAX_REPEAT), num_envs=(1, MAX_ENVS), camera=(-1, MAX_CAMERA))
-        one_of(self, render_quality=RENDER_QUALITIES, floor=FLOORS)
+        one_of(self, render_quality=RENDER_QUALITIES, floor=FLOORS, pixels=PIXELS)
 
 
 @dataclass(frozen=True)

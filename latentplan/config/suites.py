@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from latentplan.config.checks import UserError, nearest, shown
 
 DEFAULT_SUITE = "dm_control"
+ID_SUITE = ID_DOMAIN = "gymnasium"  # of environments that are named by their id in gymnasium's registry
 
 
 @dataclass(frozen=True)
@@ -54,6 +55,7 @@ SUITES: dict[str, Suite] = {
             "walker": ("walk", "stand", "run"),
         },
     ),
+    ID_SUITE: Suite("latentplan.envs.by_id:make", {ID_DOMAIN: "InvertedPendulum-v5"}),
 }
 
 

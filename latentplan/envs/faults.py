@@ -29,6 +29,8 @@ def check_picture(picture: Any, shape: tuple[int, ...]) -> np.ndarray:
     wanted = f"the environment must return frames uint8 {shape}"
     try:
         given = np.asarray(picture)
+    except EnvironmentFault:
+        raise
     except (TypeError, ValueError):
         raise EnvironmentFault(f"{wanted}, got {type(picture).__name__}") from None
     if given.dtype == np.uint8 and given.shape == shape:
@@ -36,11 +38,12 @@ def check_picture(picture: Any, shape: tuple[int, ...]) -> np.ndarray:
     if given.dtype == object or given.shape == ():
         raise EnvironmentFault(f"{wanted}, got {shown(picture)}")
     if given.shape != shape:
-        raise EnvironmentFault(f"{wanted}, got shape {given.shape}")
+        raise EnvironmentFault(f"{wanted}, got shape {given.shape}: declare in observation_space what it returns")
     if not np.issubdtype(given.dtype, np.integer):
-        raise EnvironmentFault(f"{wanted}, got {given.dtype} {_describe_range(given)}")
+        remedy = "return brightness 0 to 255 as np.uint8"
+        raise EnvironmentFault(f"{wanted}, got {given.dtype} {_describe_range(given)}: {remedy}")
     if given.min() < 0 or given.max() > 255:
-        raise EnvironmentFault(f"{wanted}, got values {given.min()} to {given.max()}")
+        raise EnvironmentFault(f"{wanted}, got values {given.min()} to {given.max()}: scale them to 0 to 255")
     return given.astype(np.uint8)
 
 
@@ -56,7 +59,9 @@ def check_reward(reward: Any) -> float:
         raise EnvironmentFault(f"the environment must return rewards that are numbers, got {shown(reward)}") from None
     with np.errstate(over="ignore"):
         if not np.isfinite(np.float32(value)):
-            raise EnvironmentFault(f"the environment returned a reward that is not finite: {value}")
+            raise EnvironmentFault(
+                f"the environment returned a reward that is not finite: {value}; return a finite number at every step"
+            )
     return value
 
 
@@ -115,7 +120,23 @@ def describe_failure(error: BaseException) -> UserError:
     while own is not None and own.tb_next is not None and own.tb_frame.f_code.co_filename.startswith(_OWN_FOLDERS):
         own = own.tb_next
     origin = "".join(traceback.format_exception(type(error), error, own))
-    return EnvironmentFault(f"the environment raised {type(error).__name__}: {cut(str(error))}", origin)
+    reason = cut(str(error)) or "without a message"
+    return EnvironmentFault(f"the environment raised {type(error).__name__}: {reason}{_advise(error)}", origin)
+
+
+def _advise(error: BaseException) -> str:
+    """What to do about an error that is known to come from an environment written for another interface."""
+    text = str(error)
+    if isinstance(error, TypeError) and "unexpected keyword argument" in text and "reset" in text:
+        return "; its reset must take both: def reset(self, *, seed=None, options=None)"
+    if isinstance(error, TypeError | ValueError) and "unpack" in text:
+        return (
+            "; reset must return (observation, info), and step (observation, reward, terminated, truncated, info), as "
+            "gymnasium.Env describes"
+        )
+    if isinstance(error, TypeError) and "not a mapping" in text:
+        return "; reset and step must return a dict as info"
+    return ""
 
 
 class FrameCheck:

@@ -174,12 +174,18 @@ class ProcessLane:
     def _receive(self, timeout_s: float) -> Any:
         try:
             if not self._connection.poll(timeout_s):
-                raise EnvironmentFault(f"the environment has not answered for {timeout_s:g} s")
+                raise EnvironmentFault(
+                    f"the environment has not answered for {timeout_s:g} s: make it faster, or allow more with "
+                    "--collection.step_timeout_s"
+                )
             kind, value = self._connection.recv()
         except (EOFError, OSError):
             self._process.join(CLOSING_SECONDS)
             code = self._process.exitcode
-            raise EnvironmentFault(f"the environment's process ended unexpectedly (exit code {code})") from None
+            raise EnvironmentFault(
+                f"the environment's process ended unexpectedly (exit code {code}): look for os._exit, or a crash or a "
+                "lack of memory in native code"
+            ) from None
         if kind == "ok":
             return value
         raise value

@@ -26,7 +26,11 @@ import importlib
 from typing import Any
 
 from latentplan.config import USER_DOMAIN, EnvConfig, UserError
+from latentplan.config.env_id import is_by_id
 from latentplan.config.suites import DEFAULT_SUITE, check_task, find_suite
+from latentplan.envs.gl import render_info
+
+USERS_RENDERER: dict[str, str | bool] = {"renderer": "the user's environment"}
 
 
 def make_env(config: EnvConfig, seed: int | None = None) -> Any:
@@ -41,12 +45,21 @@ def make_env(config: EnvConfig, seed: int | None = None) -> Any:
     """
     if config.domain == USER_DOMAIN:
         raise UserError(
-            "this agent learned in an environment of your own, which a command cannot make: play it from Python, "
-            "agent = load_agent(DIR)"
+            "this agent learned in an environment of your own that a function made: register it with gymnasium and "
+            "give --env-id module:ID, or play it from Python, agent = load_agent(DIR)"
         )
     check_task(config.suite, config.domain, config.task)
     module, name = find_suite(config.suite).factory.split(":")
     return getattr(importlib.import_module(module), name)(config, seed)
+
+
+def describe_renderer(config: EnvConfig) -> dict[str, str | bool]:
+    """Facts about the renderer of an environment's frames; see `render_info`.
+
+    Raises:
+        UserError: No OpenGL context can be made.
+    """
+    return USERS_RENDERER if is_by_id(config) else render_info()
 
 
 def default_task(domain: str, suite: str = DEFAULT_SUITE) -> str:

@@ -5,19 +5,20 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING, Any
 
-import cv2
 import gymnasium
 import numpy as np
 from gymnasium.error import ResetNeeded
 
 from latentplan.config import EnvConfig, UserError
 from latentplan.envs.faults import check_picture, check_reward
+from latentplan.envs.rendered import MODE, RenderedEnv, fit
 from latentplan.envs.suite import FRAME_SIZE
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
 
+LARGEST_RANGE = 1e6  # from the lowest to the highest value of an action; a longer one was not meant
 MAX_DECISIONS = 1000  # decisions of an episode without a time limit, as in the longest episodes of dm_control
 
 
@@ -26,7 +27,7 @@ def make_from(
 ) -> Callable[[EnvConfig, int | None], PixelEnv]:
     """A function with the signature of `make_env` that builds a user's environments.
 
-    The function reads `action_repeat` of the settings, and raises `UserError` where the factory returns no
+    The function reads `action_repeat` and `pixels` of the settings, and raises `UserError` where the factory returns no
     `gymnasium.Env` or an environment that `wrap_user_env` refuses.
 
     Args:
@@ -37,12 +38,14 @@ def make_from(
         env = factory()
         if not isinstance(env, gymnasium.Env):
             raise UserError(f"make_env must return a gymnasium.Env, got {type(env).__name__}")
-        return wrap_user_env(env, config.action_repeat, seed)
+        return wrap_user_env(env, config.action_repeat, seed, config=config)
 
     return build
 
 
-def wrap_user_env(env: gymnasium.Env[Any, Any], action_repeat: int = 1, seed: int | None = None) -> PixelEnv:
+def wrap_user_env(
+    env: gymnasium.Env[Any, Any], action_repeat: int = 1, seed: int | None = None, *, config: EnvConfig | None = None
+) -> PixelEnv:
     """A user's environment with the interface for agents: frames of 64 x 64, actions in [-1, 1], action repeat.
 
     Args:
@@ -52,6 +55,8 @@ def wrap_user_env(env: gymnasium.Env[Any, Any], action_repeat: int = 1, seed: in
         action_repeat: Steps of `env` per decision, at least 1; a step of the result repeats the action for this number
             of steps of `env`, or until the episode ends, and sums the rewards.
         seed: Seed of the first reset that is called without one; None draws a seed from the system.
+        config: Its `pixels` says where the frames come from; None takes `observation`. With `render` they are what
+            `env.render()` draws, which needs `env.render_mode` "rgb_array", and the observations may be anything.
 
     Returns:
         An environment with these properties:
@@ -66,8 +71,10 @@ def wrap_user_env(env: gymnasium.Env[Any, Any], action_repeat: int = 1, seed: in
 
     Raises:
         UserError: `action_repeat` is below 1, or a space is not as described; the message names the space and the
-            reason.
+            reason and the remedy.
     """
+    env = RenderedEnv(env, FRAME_SIZE) if config is not None and config.pixels == "render" else env
+    refuse_spaces(env)
     return PixelEnv(env, action_repeat, seed)
 
 
@@ -144,12 +151,12 @@ class PixelEnv(gymnasium.Env[np.ndarray, np.ndarray]):
 
     def render(self) -> np.ndarray:  # type: ignore[override]
         """The last frame, a new uint8 array (64, 64, 3)."""
-        return _resize(self._picture, FRAME_SIZE)
+        return fit(self._picture, FRAME_SIZE)
 
     def render_large(self, size: int) -> np.ndarray:
         """The inner environment's rendering where it has one, else its last observation, uint8 (size, size, 3)."""
         rendered = self._env.render() if self._env.render_mode == "rgb_array" else None
-        return _resize(self._picture if rendered is None else np.asarray(rendered), size)
+        return fit(self._picture if rendered is None else np.asarray(rendered), size)
 
     def close(self) -> None:
         """Closes the inner environment."""
@@ -157,37 +164,82 @@ class PixelEnv(gymnasium.Env[np.ndarray, np.ndarray]):
 
     def _to_frame(self, picture: np.ndarray) -> np.ndarray:
         self._picture = check_picture(picture, self._env.observation_space.shape or ())
-        return _resize(self._picture, FRAME_SIZE)
+        return fit(self._picture, FRAME_SIZE)
 
 
 def _check_observations(space: gymnasium.Space[Any]) -> None:
     wanted = "observations must be a Box of uint8 images (height, width, 3)"
     if not isinstance(space, gymnasium.spaces.Box):
-        raise UserError(f"{wanted}, got {type(space).__name__}")
-    if space.dtype != np.uint8:
-        raise UserError(f"{wanted}, got dtype {space.dtype}")
+        remedy = "return one picture, by a gymnasium.ObservationWrapper"
+        raise UserError(f"{wanted}, got {type(space).__name__}: {remedy}")
     if len(space.shape) != 3 or space.shape[2] != 3:
-        raise UserError(f"{wanted}, got shape {space.shape}")
+        remedy = "return a picture with its three colours last, by a gymnasium.ObservationWrapper"
+        raise UserError(f"{wanted}, got shape {space.shape}: {remedy}")
+    if space.dtype != np.uint8:
+        raise UserError(f"{wanted}, got dtype {space.dtype}: return brightness 0 to 255 as np.uint8")
 
 
 def _check_actions(space: gymnasium.Space[Any]) -> gymnasium.spaces.Box:
     wanted = "actions must be a bounded Box of floats with shape (action,)"
     if not isinstance(space, gymnasium.spaces.Box):
-        raise UserError(f"{wanted}, got {type(space).__name__}")
+        remedy = "declare a Box and translate it, by a gymnasium.ActionWrapper"
+        raise UserError(f"{wanted}, got {type(space).__name__}: {remedy}")
     if not np.issubdtype(space.dtype, np.floating):
-        raise UserError(f"{wanted}, got dtype {space.dtype}")
+        raise UserError(f"{wanted}, got dtype {space.dtype}: declare np.float32, and round in step")
     if len(space.shape) != 1 or space.shape[0] == 0:
-        raise UserError(f"{wanted}, got shape {space.shape}")
-    with np.errstate(over="ignore"):
+        raise UserError(f"{wanted}, got shape {space.shape}: flatten it, by gymnasium.wrappers.TransformAction")
+    with np.errstate(over="ignore", invalid="ignore"):
         is_bounded = bool(np.isfinite(space.high - space.low).all())
     if not is_bounded:
-        raise UserError(f"{wanted}, got bounds {space.low} to {space.high}")
+        bounds = f"{space.low} to {space.high}"
+        raise UserError(f"{wanted}, got bounds {bounds}: declare finite low and high in action_space")
     return space
 
 
-def _resize(picture: np.ndarray, size: int) -> np.ndarray:
-    """The picture at another size, a new uint8 array (size, size, 3)."""
-    if picture.shape[:2] == (size, size):
-        return picture.copy()
-    shrinks = picture.shape[0] >= size and picture.shape[1] >= size
-    return cv2.resize(picture, (size, size), interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR)
+def accept_spaces(observation_space: gymnasium.Space[Any], action_space: gymnasium.Space[Any]) -> None:
+    """Decides whether agents can learn in an environment with these spaces.
+
+    Raises:
+        UserError: A space is not accepted; the message names the space, what it is and the remedy.
+    """
+    _check_observations(observation_space)
+    _check_actions(action_space)
+
+
+def describe_refusals(env: gymnasium.Env[Any, Any]) -> list[str]:
+    """One line for each space of an environment that agents cannot learn with, with its remedy; empty without one.
+
+    Args:
+        env: The environment.
+    """
+    pictures = gymnasium.spaces.Box(0, 255, (FRAME_SIZE, FRAME_SIZE, 3), np.uint8)
+    numbers = gymnasium.spaces.Box(-1.0, 1.0, (1,), np.float32)
+    problems = []
+    try:
+        accept_spaces(env.observation_space, numbers)
+    except UserError as error:
+        can_render = MODE in env.metadata.get("render_modes", ())
+        shows = f"; --env.pixels render takes what its render() draws instead (render_mode '{MODE}')"
+        problems.append(f"{error}{shows if can_render else ''}")
+    try:
+        accept_spaces(pictures, env.action_space)
+        space = env.action_space
+        if isinstance(space, gymnasium.spaces.Box) and np.ptp([space.low, space.high], axis=0).max() > LARGEST_RANGE:
+            raise UserError(
+                f"actions range from {space.low.min():g} to {space.high.max():g}, further than {LARGEST_RANGE:g}: "
+                "declare in action_space the values that move the body"
+            )
+    except UserError as error:
+        problems.append(str(error))
+    return problems
+
+
+def refuse_spaces(env: gymnasium.Env[Any, Any]) -> None:
+    """Refuses an environment that agents cannot learn in.
+
+    Raises:
+        UserError: See `describe_refusals`.
+    """
+    problems = describe_refusals(env)
+    if problems:
+        raise UserError("; ".join(problems))

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import importlib
 import itertools
 import time
 import warnings
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
@@ -16,6 +17,7 @@ from gymnasium.wrappers import TimeLimit
 
 from latentplan.config import CollectionConfig, EnvConfig, derive_seed
 from latentplan.config.checks import EnvironmentFault
+from latentplan.config.env_id import imported_modules, is_by_id
 from latentplan.envs.process import CLOSING_SECONDS, Lane, LocalLane, ProcessLane
 from latentplan.envs.registry import make_env
 from latentplan.envs.user import make_from
@@ -60,14 +62,14 @@ def make_vector_env(
     """
     lanes: list[Lane] = []
     for index in range(num_envs):
-        factory = _EnvFactory(config, _derive_env_seed(seed, index), make_env, episode_decisions)
+        factory = EnvMaker(config, _derive_env_seed(seed, index), make_env, episode_decisions)
         lanes.append(ProcessLane(factory, step_timeout_s) if isolate or num_envs > 1 else LocalLane(factory))
     return GuardedVectorEnv(lanes, restarts or Restarts(0))
 
 
 def make_guarded_env(
     config: EnvConfig,
-    restarts: Restarts,
+    restarts: Restarts | None = None,
     make_env: Callable[[], gymnasium.Env[Any, Any]] | None = None,
     isolate: bool = False,
     step_timeout_s: float = CollectionConfig.step_timeout_s,
@@ -76,12 +78,12 @@ def make_guarded_env(
 
     Args:
         config: Settings of the environment.
-        restarts: Counts the restarts.
+        restarts: Counts the restarts; None makes no environment anew.
         make_env: See `make_vector_env`.
         isolate: See `make_vector_env`.
         step_timeout_s: See `make_vector_env`.
     """
-    factory = _EnvFactory(config, 0, make_env, None)
+    factory = EnvMaker(config, 0, make_env)
     return GuardedEnv(ProcessLane(factory, step_timeout_s) if isolate else LocalLane(factory), restarts)
 
 
@@ -244,16 +246,16 @@ class GuardedVectorEnv(VectorEnv[np.ndarray, np.ndarray, Any]):
 
 
 class GuardedEnv(gymnasium.Env[np.ndarray, np.ndarray]):
-    """One environment whose faults are raised as `EnvironmentFault`, and that is then made anew.
+    """One environment whose faults are raised as `EnvironmentFault`, and that is then made anew within a budget.
 
     The first look at its spaces, metadata or `facts` waits for the environment's process.
 
     Args:
         lane: The environment.
-        restarts: Counts the restarts.
+        restarts: Counts the restarts; None makes no environment anew.
     """
 
-    def __init__(self, lane: Lane, restarts: Restarts) -> None:
+    def __init__(self, lane: Lane, restarts: Restarts | None) -> None:
         self._lane, self._restarts = lane, restarts
 
     @property
@@ -306,24 +308,43 @@ class GuardedEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         try:
             return self._lane.answer()
         except EnvironmentFault as fault:
-            self._restarts.spend(fault)
-            self._lane.restart()
+            if self._restarts is not None:
+                self._restarts.spend(fault)
+                self._lane.restart()
             raise
 
 
 @dataclass(frozen=True)
-class _EnvFactory:
-    """Builds one environment in the process that calls it; picklable where the user's factory is."""
+class EnvMaker:
+    """Makes one environment in the process that calls it, from its settings or by the user's factory.
+
+    The object is picklable where the user's factory is. It takes along the module that registers the environment, if
+    the present process has imported it, and imports it in the other process.
+
+    Attributes:
+        config: Settings of the environment.
+        seed: Seed of the first reset.
+        factory: The user's factory, or None.
+        episode_decisions: Decisions after which an episode is truncated; None leaves the length to the task.
+        modules: Modules to import first.
+    """
 
     config: EnvConfig
     seed: int | None
-    factory: Callable[[], gymnasium.Env[Any, Any]] | None
-    episode_decisions: int | None
+    factory: Callable[[], gymnasium.Env[Any, Any]] | None = None
+    episode_decisions: int | None = None
+    modules: tuple[str, ...] = field(init=False)
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "modules", imported_modules(self.config))
 
     def __call__(self) -> gymnasium.Env[np.ndarray, np.ndarray]:
+        """The environment."""
+        for module in self.modules:
+            importlib.import_module(module)
         build = make_env if self.factory is None else make_from(self.factory)
         env: gymnasium.Env[np.ndarray, np.ndarray] = build(self.config, self.seed)
-        env = env if self.factory is None else _WithoutInfo(env)
+        env = _WithoutInfo(env) if self.factory is not None or is_by_id(self.config) else env
         return env if self.episode_decisions is None else TimeLimit(env, self.episode_decisions)
 
 

@@ -5,8 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping
 from pathlib import Path
 
-from latentplan.config import USER_DOMAIN, Config, PlannerConfig, UserError
+from latentplan.config import USER_DOMAIN, Config, EnvConfig, PlannerConfig, UserError
 from latentplan.config.checks import shown
+from latentplan.config.env_id import is_by_id
 from latentplan.config.parsing import raise_unknown
 from latentplan.config.quantities import TASK_PREFIX, scales
 from latentplan.config.suites import DEFAULT_SUITE, check_task
@@ -25,8 +26,7 @@ def check_settings(config: Config) -> None:
     if config.run.run_dir is not None:
         check_folder(config.run.run_dir)
     env, learning = config.env, config.learning
-    if env.domain != USER_DOMAIN:
-        check_task(env.suite, env.domain, env.task)
+    check_env_settings(env)
     if env.suite == DEFAULT_SUITE and env.domain != USER_DOMAIN:
         known = scales(env.domain)
         if env.objective is not None:
@@ -40,6 +40,26 @@ def check_settings(config: Config) -> None:
 
         if config.planner.method not in PLANNERS:
             raise_unknown("planner", config.planner.method, PLANNERS)
+
+
+def check_env_settings(env: EnvConfig) -> None:
+    """Refuses names of environments that do not exist, and settings that have no effect in the environment.
+
+    Raises:
+        UserError: There is no such environment, or a setting has no effect.
+    """
+    if env.domain != USER_DOMAIN:
+        check_task(env.suite, env.domain, env.task)
+    if is_by_id(env) and env.domain != USER_DOMAIN:
+        if env.objective is not None:
+            raise UserError(f"env.objective needs a domain with named quantities; {env.task} returns its own reward")
+        from latentplan.envs.by_id import find_id
+
+        find_id(env)
+    elif env.kwargs != EnvConfig.kwargs and env.suite == DEFAULT_SUITE:
+        raise UserError("--env-kwargs has no effect here: give --env-id too")
+    elif env.pixels != EnvConfig.pixels and env.suite == DEFAULT_SUITE and env.domain != USER_DOMAIN:
+        raise UserError(f"--env.pixels has no effect in {env.domain}, which always renders: leave it out")
 
 
 def check_folder(run_dir: str) -> None:

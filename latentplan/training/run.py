@@ -23,6 +23,7 @@ from latentplan.agents.checkpoint import INFO, load_model
 from latentplan.agents.files import is_checkpoint
 from latentplan.config import USER_DOMAIN, Config, Device, EnvironmentFault, UserError, derive_seed
 from latentplan.config.commit import Save
+from latentplan.config.env_id import as_file_name, repeat_flag
 from latentplan.config.files import dump_config, read_config
 from latentplan.config.run_folder import RUN_FILE, SAVES_FOLDER, lock_folder, read_run_config, run_saves
 from latentplan.envs import default_task
@@ -105,7 +106,7 @@ def train(config: Config, make_env: EnvFactory | None = None) -> Result:
     )
     if config.run.run_dir is None:
         stamp = datetime.now().strftime("%Y%m%d-%H%M%S")
-        name = f"{config.env.domain}-{config.env.task}-seed{config.run.seed}-{stamp}"
+        name = as_file_name(f"{config.env.domain}-{config.env.task}-seed{config.run.seed}-{stamp}")
         config = replace(config, run=replace(config.run, run_dir=str(Path("runs") / name)))
     check_folder(str(config.run.run_dir))
     folder = Path(str(config.run.run_dir))
@@ -281,7 +282,7 @@ class _Run:
         except EnvironmentFault as fault:
             save.save(trainer, self.learner)
             raise EnvironmentFault(f"{fault}; the run is saved in {self.folder}", fault.origin) from None
-        command = f"python scripts/train.py --resume {self.folder}"
+        command = f"python scripts/train.py --resume {self.folder}{repeat_flag(config.env)}"
         if config.env.domain == USER_DOMAIN:
             command = f'latentplan.training.resume("{self.folder}", make_env=...)'
         self.console.console.print(f"stopped; to resume: {command}", soft_wrap=True)

@@ -113,6 +113,17 @@ FLAGS = {
     "--preset": ("../gpu",),
     "--threads": ("1e9",),
     "--run.threads": ("1e9", "0"),
+    "--env-id": (
+        "os:system",
+        "os.path:InvertedPendulum-v9",
+        f"$({TOUCH}):Reach-v0",
+        "../x:Reach-v0",
+        LONG,
+        "",
+        "a:b:c",
+    ),
+    "--env-kwargs": ("", "[1]", "[" * 100_000, LONG, f'{{"a": {DIGITS}}}'),
+    "--env.pixels": ("video", LONG),
     "--run-dir": ("{folder}/file", "{folder}/file/run", LONG, ""),
     "--resume": ("{folder}/nothing", "{folder}/file", "/dev/zero", LONG),
     "--config": (
@@ -174,6 +185,7 @@ OTHERS = (
     ("export", "--checkpoint", "{agent}", "--out", LONG),
     ("export", "--checkpoint", "{agent}", "--out", "{folder}/actor.pt2", "--format", "exe"),
 )
+BY_MODULE = {"suite": "gymnasium", "domain": "gymnasium", "task": "antigravity:Reach-v0"}
 CHECKPOINTS = (
     "no-info",
     "info-brackets",
@@ -183,6 +195,7 @@ CHECKPOINTS = (
     "info-pipe",
     "info-large",
     "info-domain",
+    "info-module",
     "info-deter",
     "info-action",
     "info-samples",
@@ -246,6 +259,7 @@ def write_files(folder: Path, agent: Path) -> None:
         "info-binary": bytes(range(256)),
         "info-large": json.dumps(info | {"note": "x" * 2**25}),
         "info-domain": json.dumps(info | {"config": _changed(info, "env", domain="../../etc")}),
+        "info-module": json.dumps(info | {"config": _changed(info, "env", **BY_MODULE)}),
         "info-deter": json.dumps(info | {"config": _changed(info, "model", deter_dim=10**9)}),
         "info-action": json.dumps(info | {"action_dim": 10**12}),
         "info-samples": json.dumps(info | {"config": _changed(info, "planner", num_samples=10**12)}),

@@ -20,6 +20,7 @@ from bench.learn_plot import Curve, Point, plot_runs
 from bench.report import format_interval, format_number, format_table, write_csv, write_json
 from bench.runs import RunsRequest, TrainingRun, read_evaluations
 from latentplan.config import UserError, make_folder
+from latentplan.config.env_id import as_file_name
 from latentplan.config.parsing import option
 
 FRAMES_TOLERANCE = 0.03  # largest distance of an evaluation from a number of frames, as a share of that number
@@ -31,6 +32,7 @@ class Request(RunsRequest):
     """Flags of `benchmark.py learn`.
 
     Attributes:
+        tasks: Tasks, each as domain-task, or as gymnasium-ID for an environment of gymnasium's registry.
         thresholds: Evaluation returns; the frames and minutes until each of these returns are reported.
         mode: Agent whose evaluation returns are reported.
     """
@@ -48,7 +50,7 @@ def run(request: Request) -> int:
     """Trains the unfinished runs, then collects, tabulates and plots the curves of all runs."""
     tasks, thresholds, mode, out = request.tasks, request.thresholds, request.mode, request.out
     runs = [
-        TrainingRun(task, seed, out / f"{task}-seed{seed}", request.budget, request.forwarded)
+        TrainingRun(task, seed, out / as_file_name(f"{task}-seed{seed}"), request.budget, request.forwarded)
         for task in tasks
         for seed in request.seeds
     ]

@@ -20,10 +20,11 @@ from latentplan.commands import train
 from latentplan.commands.flags import overrides, read_request
 from latentplan.config import Config, Device, RunConfig, UserError, to_dict
 from latentplan.config.checks import above_zero
+from latentplan.config.env_id import FLAG, import_named, is_by_id
 from latentplan.config.files import Preset, read_config
 from latentplan.config.parsing import option
 from latentplan.config.run_folder import RUN_FILE, read_run_config, run_saves
-from latentplan.config.suites import check_task
+from latentplan.config.suites import ID_DOMAIN, check_task
 from latentplan.training.checks import check_settings
 
 OWN_FLAGS = {  # settings that flags of these benchmarks set for each run
@@ -95,7 +96,7 @@ class TrainingRun:
     """One run of a task and a seed.
 
     Attributes:
-        task: The task as domain-task; a domain alone stands for its usual task.
+        task: The task as domain-task, or as gymnasium-ID; a domain alone stands for its usual task.
         seed: Seed of the run.
         folder: Folder of the run.
         budget: Flags that end the run.
@@ -135,13 +136,17 @@ class TrainingRun:
         config = self.resolve()
         check_same(config, self.folder)
         if not self.is_finished():
+            if is_by_id(config.env):
+                import_named(str(config.env.task))
             check_settings(config)
         return config
 
     def command(self) -> list[str]:
         """The command line that begins the run, or continues it from its last save."""
         is_begun = run_saves(self.folder).exist()
-        flags = ["--resume", str(self.folder), *self.budget] if is_begun else self._new_flags()
+        flags = self._new_flags()
+        if is_begun:
+            flags = ["--resume", str(self.folder), *self.budget, *(flags[:2] if flags[0] == FLAG else ())]
         return [sys.executable, str(SCRIPT), *flags]
 
     def is_finished(self) -> bool:
@@ -158,8 +163,8 @@ class TrainingRun:
 
     def _new_flags(self) -> list[str]:
         domain, _, name = self.task.partition("-")
-        chosen = ["--domain", domain, *(["--task", name] if name else []), "--seed", str(self.seed)]
-        return [*chosen, "--run-dir", str(self.folder), *self.budget, *self.extra]
+        chosen = [FLAG, name] if domain == ID_DOMAIN else ["--domain", domain, *(["--task", name] if name else [])]
+        return [*chosen, "--seed", str(self.seed), "--run-dir", str(self.folder), *self.budget, *self.extra]
 
 
 class Evaluation(NamedTuple):

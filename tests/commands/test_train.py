@@ -80,7 +80,10 @@ def test_resume_takes_saved_settings_with_the_given_changes(tmp_path):
         ("--collection.noise_share 0.5", "--collection.noise_share no longer exists: every round is collected with"),
         ("--config missing.yaml", "cannot read missing.yaml"),
         ("--resume nowhere", "nothing to resume in nowhere"),
-        ("--resume nowhere --seed 3", "--seed cannot be given with --resume; only --frames, --minutes, --device can"),
+        (
+            "--resume nowhere --seed 3",
+            "--seed cannot be given with --resume; only --frames, --minutes, --device, --env-id can",
+        ),
         ("--resume nowhere --preset auto", "--preset cannot be given with --resume"),
     ],
 )

@@ -18,7 +18,7 @@ import sys
 for name in {[name for names in EXTRAS.values() for name in names]}:
     sys.modules[name] = None  # as if it were not installed
 """
-PACKAGES = {"cv2": "opencv-python-headless", "dm_control": "dm-control", "yaml": "pyyaml"}
+PACKAGES = {"cv2": "opencv-python-headless", "dm_control": "dm-control", "yaml": "pyyaml", "pygame": "pygame-ce"}
 
 
 def run_without_extras(code, *arguments):
@@ -30,7 +30,7 @@ def test_extras_install_the_modules_that_are_said_to_need_them():
     listed = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
     for extra, modules in EXTRAS.items():
         packages = {Requirement(text).name for text in listed[extra]}
-        assert {PACKAGES.get(module, module) for module in modules} <= packages
+        assert {PACKAGES.get(module, module).replace("_", "-") for module in modules} <= packages
 
 
 def test_extra_of_a_submodule_is_that_of_its_package():

@@ -7,6 +7,7 @@ import time
 import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -21,8 +22,10 @@ from latentplan.agents.planning import PlanningAgent
 from latentplan.agents.random import RandomAgent
 from latentplan.config import Config, EnvironmentFault, derive_seed
 from latentplan.config.suites import DEFAULT_SUITE
-from latentplan.envs import make_vector_env, render_info
+from latentplan.envs import make_vector_env
 from latentplan.envs.faults import FrameCheck
+from latentplan.envs.registry import USERS_RENDERER, describe_renderer
+from latentplan.envs.suite import FRAME_SIZE
 from latentplan.envs.vector import Restarts, make_guarded_env
 from latentplan.evaluation.episodes import OnStep, episode_seed, run_episodes
 from latentplan.evaluation.statistics import Episode
@@ -147,12 +150,17 @@ class Collector:
 
     def describe(self) -> Description:
         """Facts of the environment that the learner needs; renders a few frames to time them."""
-        self._eval_env.reset(seed=0)
+        env = self._eval_env
+        with warnings.catch_warnings():  # a fault ends the run before it starts, so no restart needs a warning
+            warnings.simplefilter("ignore", RuntimeWarning)
+            env.reset(seed=0)
+            env.step(np.zeros(self.model.action_dim, np.float32))
+        draw = partial(env.render_large, FRAME_SIZE) if self.config.env.pixels == "render" else env.render
         started = time.perf_counter()
         for _ in range(TIMED_FRAMES):
-            self._eval_env.render()
+            draw()
         render_ms = 1000.0 * (time.perf_counter() - started) / TIMED_FRAMES
-        facts = render_info() if self._make_user_env is None else {"renderer": "the user's environment"}
+        facts = describe_renderer(self.config.env) if self._make_user_env is None else USERS_RENDERER
         renderer = {name: str(value) for name, value in facts.items()}
         return Description(self.model.action_dim, self.discount, render_ms, renderer, self.labels)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import multiprocessing
 import signal
 import sys
@@ -18,6 +19,7 @@ import torch
 from gymnasium.vector.utils import CloudpickleWrapper
 
 from latentplan.config import Config, EnvironmentFault, UserError
+from latentplan.config.env_id import imported_modules
 from latentplan.envs import single_threaded_children
 from latentplan.envs.process import end_with_parent
 from latentplan.training.collection.collector import CLOSING_SECONDS, Collector, EnvFactory
@@ -86,7 +88,8 @@ class RemoteWorker:
         threads: int = 1,
         should_stop: Callable[[], bool] = lambda: False,
     ) -> None:
-        self._arguments = (make_user_env and CloudpickleWrapper(make_user_env), config, threads)
+        modules = imported_modules(config.env)
+        self._arguments = (make_user_env and CloudpickleWrapper(make_user_env), config, threads, modules)
         self._should_stop = should_stop
         self._start()
 
@@ -167,7 +170,13 @@ def make_worker(
     return LocalWorker(config, make_user_env, str(device), should_stop)
 
 
-def _serve(connection: Connection, make_user_env: EnvFactory | None, config: Config, threads: int) -> None:
+def _serve(
+    connection: Connection,
+    make_user_env: EnvFactory | None,
+    config: Config,
+    threads: int,
+    modules: tuple[str, ...],
+) -> None:
     """Runs methods of a `Collector` in this process as the learner requests them, until the connection closes."""
     signal.signal(signal.SIGTERM, lambda *_: sys.exit())  # an ordinary exit also ends the environments' processes
     # Ctrl-C and a closed terminal reach the whole process group, but only the learner reacts.
@@ -183,6 +192,8 @@ def _serve(connection: Connection, make_user_env: EnvFactory | None, config: Con
             return
         try:
             if collector is None:
+                for module in modules:
+                    importlib.import_module(module)
                 collector = Collector(config, make_user_env, "cpu")
             answer = "ok", getattr(collector, method)(*arguments)
         except UserError as error:

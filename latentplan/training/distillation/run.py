@@ -15,7 +15,7 @@ from __future__ import annotations
 import copy
 import math
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -29,6 +29,7 @@ from latentplan.agents.checkpoint import load_model, read_info, resolve_checkpoi
 from latentplan.agents.planning import PlanningAgent
 from latentplan.config import USER_DOMAIN, DistillConfig, PlannerConfig, UserError, derive_seed, to_dict
 from latentplan.config.commit import Saves
+from latentplan.config.env_id import choose_env, repeat_flag
 from latentplan.config.removed import drop_removed
 from latentplan.config.run_folder import SAVES_FOLDER, lock_folder
 from latentplan.envs import make_env, make_from
@@ -58,6 +59,7 @@ def distill(
     planner: PlannerConfig | None = None,
     device: str = "cpu",
     make_env: EnvFactory | None = None,
+    env: Mapping[str, Any] | None = None,
 ) -> Result:
     """Teaches a trained agent's actor to act as its planner does.
 
@@ -67,7 +69,9 @@ def distill(
         settings: Settings of the distillation; None takes the defaults.
         planner: Settings of the search that labels beliefs; None takes the agent's own. A deadline is ignored.
         device: "cpu" or "cuda".
-        make_env: Makes the user's environment, as for `train`; None makes the suite's task of the agent.
+        make_env: Makes the user's environment, as for `train`; None makes the environment of the agent.
+        env: Fields of `latentplan.config.env_id.EnvChoice`, such as `{"id": "my_robot:Reach-v0"}`, for an agent whose
+            environment has to be named again.
 
     Returns:
         The folder, and mean returns on the same test starts: `before`, `after`, `planner`, `planner_after`.
@@ -78,7 +82,7 @@ def distill(
     folder = Path(folder)
     refuse_used(folder, KIND, "--out")
     source = resolve_checkpoint(checkpoint)
-    return _Distillation(source, folder, settings or DistillConfig(), planner, device, make_env).run()
+    return _Distillation(source, folder, settings or DistillConfig(), planner, device, make_env, env).run()
 
 
 def resume_distillation(
@@ -88,6 +92,7 @@ def resume_distillation(
     minutes: float | None = None,
     device: str = "cpu",
     make_env: EnvFactory | None = None,
+    env: Mapping[str, Any] | None = None,
 ) -> Result:
     """Continues a distillation from its last save.
 
@@ -97,6 +102,7 @@ def resume_distillation(
         minutes: New total budget of minutes; None keeps the old budget.
         device: "cpu" or "cuda".
         make_env: Makes the user's environment, as for `distill`.
+        env: As for `distill`.
 
     Raises:
         UserError: The folder holds no distillation, or the agent that it started from has changed.
@@ -107,7 +113,7 @@ def resume_distillation(
     settings = DistillConfig(**saved["settings"])
     settings = replace(settings, rounds=rounds or settings.rounds, minutes=minutes or settings.minutes)
     planner = PlannerConfig(**drop_removed("planner", saved["planner"]))
-    run = _Distillation(Path(saved["source"]), Path(folder), settings, planner, device, make_env)
+    run = _Distillation(Path(saved["source"]), Path(folder), settings, planner, device, make_env, env)
     run.load(saved)
     return run.run()
 
@@ -208,6 +214,7 @@ class _Distillation:
         planner: PlannerConfig | None,
         device: str,
         make_user_env: EnvFactory | None,
+        env: Mapping[str, Any] | None,
     ) -> None:
         self.source, self.folder, self.settings = source, folder, settings
         self.model, self.config, self.info = load_model(source, device)
@@ -220,7 +227,7 @@ class _Distillation:
         self.planning = PlanningAgent(self.model, self.config, self.info["discount"], planner=self.planner_config)
         self.acting = ActorAgent(self.model, self.config)
         build = make_env if make_user_env is None else make_from(make_user_env)
-        self.env = build(self.config.env, 0)
+        self.env = build(choose_env(self.config.env, env or {}, must_match=True), 0)
         self.state, self.demonstrations = DistillationState(), Demonstrations()
         self.student = Student(self.model.actor, settings)
         self.initial = self.best = copy.deepcopy(self.model.actor.state_dict())
@@ -245,7 +252,7 @@ class _Distillation:
                     self._save()
                 return Result(self.folder, 0, self._finish())
         except KeyboardInterrupt:
-            command = f"python scripts/distill.py --resume {self.folder}"
+            command = f"python scripts/distill.py --resume {self.folder}{repeat_flag(self.config.env)}"
             if self.config.env.domain == USER_DOMAIN:
                 command = f'latentplan.training.resume_distillation("{self.folder}", make_env=...)'
             self.line.print(f"stopped; to resume: {command}")

@@ -1,0 +1,87 @@
+"""The suite `gymnasium`: environments of gymnasium's registry, named by their id; see `latentplan.config.env_id`."""
+
+from __future__ import annotations
+
+import warnings
+from typing import Any
+
+import gymnasium
+from gymnasium.error import DependencyNotInstalled, UnregisteredEnv
+
+from latentplan.config import EnvConfig, UserError
+from latentplan.config.checks import nearest
+from latentplan.config.env_id import FLAG, require_imported, split_id
+from latentplan.config.extras import extra_of
+from latentplan.config.reading import read_kwargs
+from latentplan.envs.faults import describe_failure
+from latentplan.envs.rendered import MODE
+from latentplan.envs.suite import FRAME_SIZE
+from latentplan.envs.user import PixelEnv, make_from
+
+
+def make(config: EnvConfig, seed: int | None = None) -> PixelEnv:
+    """The environment that `config.task` names, with the frames and actions of an agent; see `wrap_user_env`.
+
+    Raises:
+        UserError: The id is unknown, its module was not imported, the environment cannot be made with these arguments,
+            or agents cannot learn from its observations or actions.
+    """
+    return make_from(lambda: make_inner(config))(config, seed)
+
+
+def make_inner(config: EnvConfig) -> gymnasium.Env[Any, Any]:
+    """The environment that `config.task` names, with its own observations and actions.
+
+    Raises:
+        UserError: See `make`.
+        EnvironmentFault: The environment's own code failed.
+    """
+    name, kwargs = find_id(config), read_kwargs(config.kwargs)
+    if config.pixels == "render":
+        kwargs = {"render_mode": MODE, **kwargs}
+    try:
+        with warnings.catch_warnings():
+            warnings.filterwarnings("ignore", message=".*render_mode.*")  # `RenderedEnv` refuses a wrong mode
+            env = gymnasium.make(name, disable_env_checker=True, **kwargs)
+    except (DependencyNotInstalled, UnregisteredEnv) as error:
+        raise UserError(f"cannot make {name}: {' '.join(str(error).split())}") from None
+    except ModuleNotFoundError as error:
+        extra = extra_of(error.name)
+        what = f"'latentplan[{extra}]'" if extra else error.name
+        raise UserError(
+            f"cannot make {name}: it needs {error.name}, which is not installed; run: pip install {what}"
+        ) from None
+    except Exception as error:
+        if isinstance(error, TypeError) and "argument" in str(error):
+            reason = str(error).partition(" was raised from")[0]
+            raise UserError(f"cannot make {name} with --env-kwargs {config.kwargs}: {reason}; correct them") from None
+        raise describe_failure(error) from error
+    _draw_small(env, kwargs)
+    return env
+
+
+def find_id(config: EnvConfig) -> str:
+    """The id of the environment in gymnasium's registry; nothing is made.
+
+    Raises:
+        UserError: The registry does not have it, or the module that registers it was not imported.
+    """
+    require_imported(config)
+    _, name = split_id(str(config.task))
+    try:
+        gymnasium.spec(name)
+    except gymnasium.error.Error:
+        similar = nearest(name, gymnasium.registry, cutoff=0.6)
+        hint = f"; did you mean {similar!r}?" if similar else ";"
+        raise UserError(
+            f"unknown environment {name!r}{hint} `latentplan envs --suite gymnasium` lists gymnasium's own, and {FLAG} "
+            f"module:{name} imports the module that registers another"
+        ) from None
+    return name
+
+
+def _draw_small(env: gymnasium.Env[Any, Any], kwargs: dict[str, Any]) -> None:
+    """Makes gymnasium's MuJoCo renderer draw at the size of a frame, which takes a tenth of the time of 480 x 480."""
+    renderer = getattr(env.unwrapped, "mujoco_renderer", None)
+    if renderer is not None and not {"width", "height"} & set(kwargs):
+        renderer.width = renderer.height = FRAME_SIZE

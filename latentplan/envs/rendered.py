@@ -1,0 +1,83 @@
+"""The pictures that an environment draws, in place of its observations."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import cv2
+import gymnasium
+import numpy as np
+
+from latentplan.config import UserError
+from latentplan.config.checks import EnvironmentFault
+from latentplan.envs.faults import describe_failure
+
+MODE = "rgb_array"
+
+
+class RenderedEnv(gymnasium.Wrapper[Any, Any, Any, Any]):
+    """An environment whose observations are the pictures of its `render()`, uint8 (size, size, 3).
+
+    A rectangular picture is squeezed to the square, so that nothing at its sides is cut off. A picture is drawn when it
+    is read: steps between two decisions draw none.
+
+    Args:
+        env: An environment with the render mode `rgb_array`.
+        size: Height and width of the observations, in pixels.
+
+    Raises:
+        UserError: The environment has another render mode.
+    """
+
+    def __init__(self, env: gymnasium.Env[Any, Any], size: int) -> None:
+        if env.render_mode != MODE:
+            raise UserError(
+                f"env.pixels render needs an environment that is made with render_mode='{MODE}', got "
+                f"{env.render_mode!r} of {env.metadata.get('render_modes', [])}: give it a render() that returns uint8 "
+                "pictures (height, width, 3)"
+            )
+        super().__init__(env)
+        self.observation_space = gymnasium.spaces.Box(0, 255, (size, size, 3), np.uint8)
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        """Begins an episode; the observation is ignored."""
+        _, info = self.env.reset(seed=seed, options=options)
+        return _Picture(self), info
+
+    def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
+        """Steps the environment; the observation is ignored."""
+        _, reward, terminated, truncated, info = self.env.step(action)
+        return _Picture(self), reward, terminated, truncated, info
+
+
+class _Picture:
+    """The picture of an environment's present state, drawn when it becomes an array."""
+
+    def __init__(self, env: RenderedEnv) -> None:
+        self._env = env
+
+    def __array__(self, dtype: Any = None, copy: bool | None = None) -> np.ndarray:
+        try:
+            given = self._env.env.render()
+        except Exception as error:
+            raise describe_failure(error) from error
+        picture = np.asarray(given)
+        if picture.dtype != np.uint8 or picture.ndim != 3 or picture.shape[2] != 3 or 0 in picture.shape:
+            what = type(given).__name__ if picture.dtype == object else f"{picture.dtype} {picture.shape}"
+            raise EnvironmentFault(
+                f"render() must return pictures uint8 (height, width, 3), got {what}: correct the environment's render"
+            )
+        return fit(picture, self._env.observation_space.shape[0])  # type: ignore[index]
+
+
+def fit(picture: np.ndarray, size: int) -> np.ndarray:
+    """The picture at another size, a new uint8 array (size, size, 3); a larger one is averaged, a smaller interpolated.
+
+    Args:
+        picture: The picture, uint8 (height, width, 3).
+        size: Height and width of the result, in pixels.
+    """
+    if picture.shape[:2] == (size, size):
+        return picture.copy()
+    shrinks = picture.shape[0] >= size and picture.shape[1] >= size
+    return cv2.resize(picture, (size, size), interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR)

@@ -1,0 +1,197 @@
+"""Environments of gymnasium's registry: named by id, refused in one line, and never imported from a file."""
+
+import sys
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from latentplan.config import CollectionConfig, Config, EnvConfig, ModelConfig, RunConfig, UserError
+from latentplan.config.env_id import (
+    EnvChoice,
+    as_file_name,
+    by_id,
+    choose_env,
+    import_named,
+    imported_modules,
+    repeat_flag,
+    split_id,
+)
+from latentplan.envs import make_env, wrap_user_env
+from latentplan.envs.conformance import check_environment
+from latentplan.envs.vector import make_vector_env
+from latentplan.training import train
+from tests.envs import odd
+
+MODULE = "tests.envs.odd"
+
+
+def config_of(name, **settings):
+    return EnvConfig(**by_id(f"{MODULE}:{name}-v0"), **settings)
+
+
+def as_one_line(error, words):
+    text = str(error)
+    assert "\n" not in text and all(word in text for word in words), text
+
+
+@pytest.mark.parametrize("name", odd.REFUSED)
+def test_check_environment_refuses_odd_environments_in_one_line_with_a_remedy(name):
+    _, settings, words = odd.REFUSED[name]
+    report = check_environment(config_of(f"odd/{name}", **settings), decisions=20, isolate=False)
+    assert len(report.problems) == 1
+    as_one_line(report.problems[0], words)
+
+
+@pytest.mark.parametrize("name", odd.REFUSED)
+def test_train_refuses_odd_environments_before_it_learns(name, tmp_path):
+    _, settings, words = odd.REFUSED[name]
+    config = Config(
+        env=config_of(f"odd/{name}", **settings),
+        model=ModelConfig(deter_dim=8, hidden_dim=8, encoder_channels=(4, 4), decoder_channels=2, num_bins=5),
+        collection=CollectionConfig(overlap=False),
+        run=RunConfig(frames=100, device="cpu", threads=1, run_dir=str(tmp_path / "run")),
+    )
+    with pytest.raises(UserError) as error:
+        train(config)
+    as_one_line(error.value, words)
+    assert not (tmp_path / "run" / "config.yaml").exists()
+
+
+@pytest.mark.parametrize("name", odd.CRASHING)
+def test_check_environment_survives_crashes_and_hangs(name):
+    report = check_environment(config_of(f"odd/{name}"), decisions=5, step_timeout_s=1.0)
+    assert len(report.problems) == 1
+    as_one_line(report.problems[0], odd.CRASHING[name][1])
+
+
+@pytest.mark.parametrize("name", odd.NOTED)
+def test_check_environment_notes_what_training_accepts_and_nobody_means(name):
+    report = check_environment(config_of(f"odd/{name}"), decisions=150, isolate=False)
+    assert report.problems == [] and any(odd.NOTED[name][1] in note for note in report.notes), report.notes
+
+
+def test_check_environment_finds_nothing_to_note_in_a_good_environment():
+    report = check_environment(config_of("Slider"), decisions=120, isolate=False)
+    assert (report.problems, report.notes) == ([], [])
+    assert report.facts["own actions"] == "float32 (1,) in [-1, 1]" and report.facts["starts"] == "differ by seed"
+    assert report.facts["episode"] == "at most 10 decisions of 2 steps"
+    assert len(report.pictures) == 8 and report.pictures[0].shape == (64, 64, 3)
+
+
+def test_refusal_names_both_spaces():
+    report = check_environment(config_of("odd/TextActions"), decisions=1, isolate=False)
+    both = odd.with_spaces(odd.STATE, odd.REFUSED["TextActions"][0].action_space)
+    with pytest.raises(UserError, match=r"observations .*; action.*Text"):
+        wrap_user_env(both())
+    assert len(report.problems) == 1
+
+
+def test_make_env_makes_the_environment_with_its_arguments():
+    bright, dim = (
+        make_env(config_of("odd/State", pixels="render", kwargs=text), seed=0) for text in ("{}", '{"brightness": 100}')
+    )
+    assert bright.reset()[0].max() == 255 and dim.reset()[0].max() == 100
+    assert bright.decisions_per_episode == 10
+    assert make_env(config_of("Slider", kwargs='{"max_episode_steps": 8}')).decisions_per_episode == 4
+
+
+def test_rendered_pictures_are_squeezed_whole_and_drawn_once_per_decision():
+    inner = odd.State(render_mode="rgb_array")
+    env = wrap_user_env(inner, action_repeat=3, config=EnvConfig(pixels="render"))
+    frame, _ = env.reset(seed=0)
+    assert frame.shape == (64, 64, 3) and inner.num_drawn == 1
+    for _ in range(20):
+        right, *_ = env.step(np.ones(1))
+    assert inner.num_drawn == 21
+    assert right[:, -1].min() > 200 and right[:, :32].max() == 0  # nothing is cut off at the side
+    assert env.render_large(128).shape == (128, 128, 3)
+
+
+def test_vector_environments_import_the_module_in_their_processes():
+    envs = make_vector_env(config_of("Slider"), num_envs=2, seed=0)
+    try:
+        assert envs.reset()[0].shape == (2, 64, 64, 3)
+    finally:
+        envs.close()
+
+
+def test_module_of_a_checkpoint_is_not_imported(monkeypatch):
+    config = config_of("Slider")
+    assert imported_modules(config) == (MODULE,)
+    monkeypatch.delitem(sys.modules, MODULE)
+    with pytest.raises(UserError, match=rf"never imported .*give --env-id {MODULE}:Slider-v0"):
+        make_env(config)
+    assert imported_modules(config) == () and MODULE not in sys.modules
+    assert repeat_flag(config) == f" --env-id {MODULE}:Slider-v0"
+
+
+@pytest.mark.parametrize(
+    ("env_id", "expected"),
+    [
+        ("Reach-v0", (None, "Reach-v0")),
+        ("my_robot:Reach-v0", ("my_robot", "Reach-v0")),
+        ("my.robot:arms/Reach-v0", ("my.robot", "arms/Reach-v0")),
+    ],
+)
+def test_split_id_separates_the_module(env_id, expected):
+    assert split_id(env_id) == expected
+
+
+@pytest.mark.parametrize(
+    "text", ["", ":", "my_robot:", "my robot:Reach-v0", "../x:Reach-v0", "a:b:c", "Reach v0", "a.:R"]
+)
+def test_split_id_refuses_other_texts(text):
+    with pytest.raises(UserError, match="--env-id must be an id"):
+        split_id(text)
+
+
+def test_import_named_finds_modules_in_the_present_folder_and_explains_failures(tmp_path, monkeypatch):
+    (tmp_path / "a_robot.py").write_text("LOADED = True\n")
+    (tmp_path / "a_broken_robot.py").write_text("1 / 0\n")
+    (tmp_path / "a_poor_robot.py").write_text("import a_library_that_nobody_has\n")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "path", [place for place in sys.path if place])
+    import_named("a_robot:Reach-v0")
+    assert sys.modules.pop("a_robot").LOADED
+    for module, words in {
+        "a_broken_robot": "importing a_broken_robot raised ZeroDivisionError",
+        "a_poor_robot": "needs a_library_that_nobody_has, which is not installed",
+        "no_robot": "there is no module no_robot to import",
+    }.items():
+        with pytest.raises(UserError, match=words):
+            import_named(f"{module}:Reach-v0")
+
+
+def test_choose_env_keeps_what_is_remembered():
+    saved = config_of("odd/State", pixels="render", kwargs='{"brightness": 9}')
+    assert choose_env(saved, {}) == saved
+    assert choose_env(saved, {"id": saved.task}) == saved
+    other = choose_env(saved, {"id": "Slider-v0", "pixels": "observation"})
+    assert (other.task, other.kwargs, other.pixels) == ("Slider-v0", "{}", "observation")
+    assert choose_env(EnvConfig(), {"id": "Slider-v0"}).suite == "gymnasium"
+
+
+def test_choose_env_refuses_what_has_no_effect_or_does_not_match():
+    with pytest.raises(UserError, match="--env-kwargs has no effect in walker-walk; give --env-id too"):
+        choose_env(EnvConfig(task="walk"), {"kwargs": "{}"})
+    with pytest.raises(UserError, match="another environment than"):
+        choose_env(config_of("Slider"), {"id": "odd/State-v0"}, must_match=True)
+    with pytest.raises(UserError, match="env.kwargs must be a JSON object"):
+        choose_env(config_of("Slider"), {"kwargs": "[1]"})
+    assert EnvChoice() == EnvChoice(None, "{}", "observation")
+
+
+@pytest.mark.parametrize("text", ["", "[1]", "3", '{"a": ', "null", "{'a': 1}", "[" * 100_000])
+def test_kwargs_must_be_a_json_object(text):
+    with pytest.raises(ValueError, match="kwargs must be a JSON object such as"):
+        EnvConfig(kwargs=text)
+
+
+def test_folder_names_hold_no_separators():
+    assert as_file_name("gymnasium-my_robot:arms/Reach-v0-seed0") == "gymnasium-my_robot-arms-Reach-v0-seed0"
+
+
+def test_unknown_ids_are_answered_by_the_nearest():
+    with pytest.raises(UserError, match="unknown environment 'Slidr-v0'; did you mean 'Slider-v0'"):
+        make_env(replace(config_of("Slider"), task="Slidr-v0"))
