@@ -8,7 +8,7 @@ from torch import Tensor
 from latentplan.agents.base import ModelAgent
 from latentplan.config import Config
 from latentplan.models import State, WorldModel
-from latentplan.models.heads import sample_action
+from latentplan.models.heads import MixedActor, sample_action
 from latentplan.models.symmetry import mean_over_turns
 
 
@@ -45,5 +45,8 @@ class ActorAgent(ModelAgent):
         mean = mean_over_turns(self._mean, state)
         if not self.explore:
             return mean
+        if isinstance(self.model.actor, MixedActor):
+            noise = self.noise.draw(mean, self.generator, self._is_reset)
+            return self.model.actor.sample(state.features, noise)
         std = mean_over_turns(self._std, state)
         return sample_action(mean, std, self.noise.draw(mean, self.generator, self._is_reset))

@@ -13,6 +13,7 @@ from torch import Tensor
 from latentplan.config import Config
 from latentplan.models import State, WorldModel
 from latentplan.models.backend import FrameFunctions
+from latentplan.models.heads import MixedActor
 from latentplan.models.symmetry import TurnedModel, first_turn, flat, folded, mean_over_turns, per_turn, turned
 from latentplan.objectives.expression import Expression
 from latentplan.objectives.objective import build_goals, read_goal_image
@@ -60,7 +61,8 @@ class ModelAgent:
     Args:
         model: The world model; the agent puts it into evaluation mode and does not change its weights.
         config: Settings the model was trained with.
-        noise_std: Standard deviation of Gaussian noise added to each action, for exploration.
+        noise_std: Standard deviation of Gaussian noise added to each action, for exploration; of numbers that stand for
+            a category, the probability that the category is drawn anew, all being equally likely.
         noise_correlation: Correlation of this noise between one decision and the next, in [0, 1).
         seed: Seed of the agent's own random stream.
     """
@@ -150,7 +152,7 @@ class ModelAgent:
             action = self._choose(state)
             if self.noise_std > 0.0:
                 noise = self.noise.draw(action, self.generator, self._is_reset)
-                action = (action + self.noise_std * noise).clamp(-1.0, 1.0)
+                action = self._explore(action, noise)
             result = action.float().cpu().numpy()
             if not np.isfinite(result).all():
                 result = self._replace_actions(result)
@@ -184,6 +186,16 @@ class ModelAgent:
             )
         self.num_replaced_actions += int(is_broken.sum())
         return np.where(is_broken[:, None], last, actions).astype(np.float32)
+
+    def _explore(self, action: Tensor, noise: Tensor) -> Tensor:
+        """The action with standard normal noise, (batch, action) each; see `noise_std`."""
+        moved = (action + self.noise_std * noise).clamp(-1.0, 1.0)
+        if isinstance(self.model.actor, MixedActor):
+            places = self.model.actor.code.discrete
+            quantile, share = torch.special.ndtr(noise[:, places]), min(self.noise_std, 1.0)
+            drawn = (2.0 * quantile / share - 1.0).clamp(-1.0, 1.0)  # uniform where the quantile is below the share
+            moved[:, places] = torch.where(quantile < share, drawn, action[:, places]).to(moved.dtype)
+        return moved
 
     def _choose(self, state: State) -> Tensor:
         """The action for a belief, in [-1, 1], (batch, action)."""

@@ -21,6 +21,7 @@ from latentplan.config.commit import MANIFEST
 from latentplan.config.estimates import check_parts, estimate_search
 from latentplan.config.planner import override_planner
 from latentplan.config.reading import parse_json
+from latentplan.config.spaces import Spaces
 from latentplan.models import WorldModel
 from latentplan.models.fast import accelerate
 from latentplan.replay.memory import free_memory
@@ -65,6 +66,7 @@ ALLOWED: dict[str, tuple[Callable[[Any], bool], str]] = {
     "action_dim": _is_number(1, LARGEST_SIZE, int),
     "labels": (_are_labels, "a dictionary of scales above 0"),
     "goal_dim": (lambda value: value is None or _is_number(0, LARGEST_SIZE, int)[0](value), "a size"),
+    "spaces": _is_kind(dict, "a dictionary"),
     "config": _is_kind(object, "settings"),
     "sha256": (lambda value: isinstance(value, str) and len(value) == 64, "a text of 64 digits"),
     "distilled": _is_kind(dict, "a dictionary"),
@@ -90,6 +92,8 @@ def save_checkpoint(folder: Path, model: WorldModel, config: Config, info: dict[
         raise FloatingPointError(f"{broken} is not finite in float16: {folder} is left as it was")
     content = save(state)
     sizes = {"action_dim": model.action_dim, "labels": model.labels, "goal_dim": model.goal_dim}
+    if model.spaces != Spaces():
+        sizes["spaces"] = to_dict(model.spaces)
     facts = info | sizes | {"config": to_dict(config), "sha256": hashlib.sha256(content).hexdigest()}
     write_files(folder, {WEIGHTS: content, INFO: (json.dumps(facts, indent=1) + "\n").encode()})
 
@@ -157,8 +161,8 @@ def load_model(path: str | Path, device: str = "cpu") -> tuple[WorldModel, Confi
         config = from_dict(info["config"])
     except (AttributeError, TypeError, ValueError) as error:
         raise UserError(f"the settings in {folder / INFO} cannot be used: {error}") from None
-    sizes = info["action_dim"], info.get("labels"), info.get("goal_dim") or 0
     try:
+        sizes = info["action_dim"], info.get("labels"), info.get("goal_dim") or 0, _read_spaces(info)
         state = {name: value.float() for name, value in load(content).items()}
         with torch.device("meta"):  # compares shapes before a model is allocated whose size the file names
             WorldModel(config.model, *sizes).load_state_dict(state, assign=True)
@@ -236,6 +240,17 @@ def resolve_checkpoint(path: str | Path) -> Path:
     for sibling in filter(_find_checkpoint, siblings):
         known.setdefault(sibling.name, str(sibling))
     raise UserError(f"no checkpoint at {root}: {reason}{_suggestion(root.name, known)}")
+
+
+def _read_spaces(info: dict[str, Any]) -> Spaces:
+    """The spaces that a description names.
+
+    Raises:
+        TypeError: The description names spaces of another form.
+        ValueError: A value is not allowed.
+    """
+    given = info.get("spaces", {})
+    return Spaces(**{name: tuple(value) if isinstance(value, list) else value for name, value in given.items()})
 
 
 def _first_not_finite(state: dict[str, torch.Tensor]) -> str | None:

@@ -13,6 +13,7 @@ have any size, and the rows do not influence each other.
 
 from __future__ import annotations
 
+import copy
 import importlib.util
 import io
 import json
@@ -29,6 +30,7 @@ from latentplan.agents.checkpoint import load_model
 from latentplan.config import UserError, output_file
 from latentplan.models import Rssm, State, WorldModel
 from latentplan.models.fast import one_frame
+from latentplan.models.heads import MixedActor
 from latentplan.models.symmetry import turned
 
 FORMATS = ("pt2", "onnx")
@@ -41,9 +43,10 @@ EXAMPLE_ROWS = 2  # with a batch of 1, torch.export would fix the batch size at 
 class _Decision(nn.Module):
     """One decision: belief update and actor, with a copy of their weights."""
 
-    def __init__(self, weights: one_frame.FrameWeights, turns: int) -> None:
+    def __init__(self, model: WorldModel) -> None:
         super().__init__()
-        self._turns = turns
+        weights, self._turns = one_frame.convert_weights(model), model.config.turns
+        self._choices = copy.deepcopy(model.actor).cpu() if isinstance(model.actor, MixedActor) else None
         tensors, self._layout = tree_flatten(weights)
         self._names = [f"weight_{index}" for index in range(len(tensors))]
         for name, tensor in zip(self._names, tensors, strict=True):
@@ -56,10 +59,11 @@ class _Decision(nn.Module):
         turns, (rows, size) = self._turns, action.shape
         taken = action[:, None].expand(-1, turns, -1).reshape(rows * turns, size)
         last = State(*(part.reshape(rows * turns, part.shape[1] // turns) for part in (deter, stoch)))
-        advanced = one_frame.advance(weights, last, taken).reshape(rows, deter.shape[1])
+        read = taken if self._choices is None else self._choices.code(taken)
+        advanced = one_frame.advance(weights, last, read).reshape(rows, deter.shape[1])
         begun = torch.where(is_first[:, None], 0.0, advanced).reshape(last.deter.shape)
         state = one_frame.see(weights, begun, turned(frame, turns))
-        modes, _ = one_frame.act(weights, state)
+        modes, _ = one_frame.act(weights, state) if self._choices is None else self._choices(state.features)
         mean = modes.reshape(rows, turns, size).mean(1)
         executed = torch.where(is_first[:, None] | ~action.isfinite(), 0.0, action)
         mean = torch.where(mean.isfinite().all(1, keepdim=True), mean, executed)  # as `ModelAgent.act`
@@ -121,7 +125,7 @@ def input_sizes(model: WorldModel) -> dict[str, int]:
 
 
 def _trace_actor(model: WorldModel) -> ExportedProgram:
-    decision = _Decision(one_frame.convert_weights(model), model.config.turns).eval()
+    decision = _Decision(model).eval()
     batch = Dim("batch", min=1)
     dynamic = {name: {0: batch} for name in INPUTS}
     with torch.no_grad():

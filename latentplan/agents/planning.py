@@ -14,8 +14,22 @@ from latentplan.config import Config, PlannerConfig
 from latentplan.models import State, WorldModel
 from latentplan.models.symmetry import flat, mean_over_turns
 from latentplan.objectives.expression import Expression
-from latentplan.planning import ModelPredictiveController, make_planner
+from latentplan.planning import ModelPredictiveController, Planner, make_planner
 from latentplan.planning.objectives import Constraint, Term
+
+
+def make_search(model: WorldModel, settings: PlannerConfig, discount: float) -> Planner:
+    """The planner of these settings for a model's actions.
+
+    Args:
+        model: The world model.
+        settings: Method and options of the search.
+        discount: Discount per decision, as learned.
+    """
+    problem: dict[str, Any] = {"action_dim": model.action_dim, "discount": discount}
+    if model.has_choices:
+        problem["action_choices"] = model.spaces.action_choices
+    return make_planner(settings.method, settings, **problem)
 
 
 class PlanningAgent(ModelAgent):
@@ -52,7 +66,7 @@ class PlanningAgent(ModelAgent):
         super().__init__(model, config, noise_std=noise_std, noise_correlation=noise_correlation, seed=seed)
         settings = planner or config.planner
         self.surprise_limit, self.was_surprised = settings.surprise_limit, False
-        search = make_planner(settings.method, settings, action_dim=model.action_dim, discount=discount)
+        search = make_search(model, settings, discount)
         self.controller = ModelPredictiveController(search, self.imagined, generator=self.generator)
 
     def reset(self, mask: np.ndarray | None = None) -> None:

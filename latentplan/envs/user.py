@@ -12,6 +12,7 @@ from gymnasium.error import ResetNeeded
 
 from latentplan.config import EnvConfig, UserError
 from latentplan.envs.faults import check_picture, check_reward
+from latentplan.envs.spaces import accept_spaces
 from latentplan.envs.suite import FRAME_SIZE
 
 if TYPE_CHECKING:
@@ -30,7 +31,7 @@ def make_from(
     `gymnasium.Env` or an environment that `wrap_user_env` refuses.
 
     Args:
-        factory: Returns a new environment with image observations and a bounded Box of actions.
+        factory: Returns a new environment with spaces that `accept_spaces` accepts.
     """
 
     def build(config: EnvConfig, seed: int | None = None) -> PixelEnv:
@@ -48,7 +49,7 @@ def wrap_user_env(env: gymnasium.Env[Any, Any], action_repeat: int = 1, seed: in
     Args:
         env: A gymnasium environment. `env.observation_space` is a Box of uint8 images (height, width, 3), RGB, of any
             size; larger images are averaged down, smaller images are interpolated. `env.action_space` is a bounded Box
-            of floats (action,).
+            of any shape, Discrete, MultiDiscrete, MultiBinary, or a Dict or Tuple of them.
         action_repeat: Steps of `env` per decision, at least 1; a step of the result repeats the action for this number
             of steps of `env`, or until the episode ends, and sums the rewards.
         seed: Seed of the first reset that is called without one; None draws a seed from the system.
@@ -57,8 +58,9 @@ def wrap_user_env(env: gymnasium.Env[Any, Any], action_repeat: int = 1, seed: in
         An environment with these properties:
 
         - Observations are uint8 (64, 64, 3), each a new array.
-        - Actions are float32 (action,) in [-1, 1]. The interval is mapped linearly to the bounds of
-          `env.action_space`; values outside are clipped.
+        - Actions are float32 (action,) in [-1, 1], all numbers of `env.action_space` side by side; values outside are
+          clipped. The interval is mapped linearly to the bounds of a Box. A choice of n categories is one number: the
+          interval has n equal parts, one for each category.
         - `info["env_frames"]` of a step is the number of steps of `env` that it took; `info` of `env` is kept.
         - An environment without a time limit is truncated after 1000 decisions.
         - `step` raises `ResetNeeded` after the end of an episode, and `ValueError` for an action of another shape or
@@ -78,6 +80,7 @@ class PixelEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         action_repeat: Steps of the inner environment per decision; rewards are summed over them.
         decisions_per_episode: Decisions until the time limit of the environment's spec or of a `TimeLimit` wrapper.
             None without a time limit; then an episode is truncated after `MAX_DECISIONS` decisions.
+        spaces: What the networks have to know of actions and observations.
     """
 
     metadata = {"render_modes": ["rgb_array"]}
@@ -87,8 +90,8 @@ class PixelEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         """Checks the spaces; see `wrap_user_env`."""
         if action_repeat < 1:
             raise UserError(f"action_repeat must be at least 1, got {action_repeat}")
-        _check_observations(env.observation_space)
-        self._inner_actions = _check_actions(env.action_space)
+        accepted = accept_spaces(env.observation_space, env.action_space)
+        self._actions, self.spaces = accepted.actions, accepted.spaces
         self._env = env
         self._first_seed = seed
         self._picture = np.zeros((FRAME_SIZE, FRAME_SIZE, 3), dtype=np.uint8)
@@ -102,7 +105,7 @@ class PixelEnv(gymnasium.Env[np.ndarray, np.ndarray]):
             self.metadata = {**PixelEnv.metadata, "render_fps": rate / action_repeat}
         self.decisions_per_episode = None if limit is None else math.ceil(limit / action_repeat)
         self.observation_space = gymnasium.spaces.Box(0, 255, (FRAME_SIZE, FRAME_SIZE, 3), np.uint8)
-        self.action_space = gymnasium.spaces.Box(-1.0, 1.0, self._inner_actions.shape, np.float32)
+        self.action_space = gymnasium.spaces.Box(-1.0, 1.0, (self._actions.dim,), np.float32)
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -127,11 +130,7 @@ class PixelEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         """
         if self._needs_reset:
             raise ResetNeeded("the episode is over; call reset() first")
-        if np.shape(action) != self.action_space.shape or not np.isfinite(action).all():
-            raise ValueError(f"the action must be {self.action_space.shape} finite numbers, got {action!r}")
-        low, high = (bound.astype(np.float64) for bound in (self._inner_actions.low, self._inner_actions.high))
-        scaled = low + (np.clip(action, -1.0, 1.0) + 1.0) * 0.5 * (high - low)
-        scaled = scaled.clip(low, high).astype(self._inner_actions.dtype)
+        scaled = self.inner_action(action)
         total, env_frames, terminated, truncated = 0.0, 0, False, False
         while env_frames < self.action_repeat and not (terminated or truncated):
             picture, reward, terminated, truncated, info = self._env.step(scaled)
@@ -141,6 +140,16 @@ class PixelEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         truncated = truncated or (self.decisions_per_episode is None and self._decisions == MAX_DECISIONS)
         self._needs_reset = bool(terminated or truncated)
         return self._to_frame(picture), total, bool(terminated), bool(truncated), {**info, "env_frames": env_frames}
+
+    def inner_action(self, action: np.ndarray) -> Any:
+        """The value of the inner environment's action space for an agent's action (action,) in [-1, 1].
+
+        Raises:
+            ValueError: The action has another shape or is not finite.
+        """
+        if np.shape(action) != self.action_space.shape or not np.isfinite(action).all():
+            raise ValueError(f"the action must be {self.action_space.shape} finite numbers, got {action!r}")
+        return self._actions.value(action)
 
     def render(self) -> np.ndarray:  # type: ignore[override]
         """The last frame, a new uint8 array (64, 64, 3)."""
@@ -158,31 +167,6 @@ class PixelEnv(gymnasium.Env[np.ndarray, np.ndarray]):
     def _to_frame(self, picture: np.ndarray) -> np.ndarray:
         self._picture = check_picture(picture, self._env.observation_space.shape or ())
         return _resize(self._picture, FRAME_SIZE)
-
-
-def _check_observations(space: gymnasium.Space[Any]) -> None:
-    wanted = "observations must be a Box of uint8 images (height, width, 3)"
-    if not isinstance(space, gymnasium.spaces.Box):
-        raise UserError(f"{wanted}, got {type(space).__name__}")
-    if space.dtype != np.uint8:
-        raise UserError(f"{wanted}, got dtype {space.dtype}")
-    if len(space.shape) != 3 or space.shape[2] != 3:
-        raise UserError(f"{wanted}, got shape {space.shape}")
-
-
-def _check_actions(space: gymnasium.Space[Any]) -> gymnasium.spaces.Box:
-    wanted = "actions must be a bounded Box of floats with shape (action,)"
-    if not isinstance(space, gymnasium.spaces.Box):
-        raise UserError(f"{wanted}, got {type(space).__name__}")
-    if not np.issubdtype(space.dtype, np.floating):
-        raise UserError(f"{wanted}, got dtype {space.dtype}")
-    if len(space.shape) != 1 or space.shape[0] == 0:
-        raise UserError(f"{wanted}, got shape {space.shape}")
-    with np.errstate(over="ignore"):
-        is_bounded = bool(np.isfinite(space.high - space.low).all())
-    if not is_bounded:
-        raise UserError(f"{wanted}, got bounds {space.low} to {space.high}")
-    return space
 
 
 def _resize(picture: np.ndarray, size: int) -> np.ndarray:

@@ -15,6 +15,7 @@ from einops import rearrange
 from torch import Tensor
 
 from latentplan.models.dynamics import Gaussian, State, kl_divergence, surprise
+from latentplan.models.heads import MixedActor
 
 if TYPE_CHECKING:
     from latentplan.models.heads import Mlp, ScalarHead
@@ -131,8 +132,11 @@ class Backend:
         actions: list[Tensor] = []
         for draw in noise.unbind(1):
             with model.trunk_precision():
-                mean, std = model.actor(state.features)
-                actions.append((mean + std * draw).clamp(-1.0, 1.0))
+                if isinstance(model.actor, MixedActor):
+                    actions.append(model.actor.sample(state.features, draw))
+                else:
+                    mean, std = model.actor(state.features)
+                    actions.append((mean + std * draw).clamp(-1.0, 1.0))
                 state = _advance_by_mean(model, state, actions[-1])
         return torch.stack(actions, 1)
 
@@ -205,6 +209,29 @@ class Backend:
     ) -> tuple[Tensor, Tensor]:
         """See `Dynamics.imagine`, with the model's actor as the policy; gradients reach the actor."""
         return model.dynamics.imagine(model.actor, start, action_noise, noise, decay)
+
+    @torch.no_grad()
+    def sample(self, model: WorldModel, start: State, action_noise: Tensor, noise: Tensor) -> tuple[Tensor, Tensor]:
+        """Rollouts of a model whose actor is a `MixedActor`, with samples of actor and prior and without gradients.
+
+        Args:
+            model: The world model.
+            start: Start of every rollout, (rows, ...) each.
+            action_noise: Standard normal draws for the actions, (horizon, rows, action).
+            noise: Standard normal draws for the latents, (horizon, rows, latent).
+
+        Returns:
+            Features, the start first, (horizon + 1, rows, feature), and the actions, (horizon, rows, action).
+        """
+        assert isinstance(model.actor, MixedActor)
+        state, features, actions = start, [start.features], []
+        for action_draws, draws in zip(action_noise.unbind(), noise.unbind(), strict=True):
+            actions.append(model.actor.sample(features[-1], action_draws))
+            deter = model.dynamics.advance(state, actions[-1])
+            prior = model.dynamics.prior(deter)
+            state = State(deter, torch.addcmul(prior.mean, prior.std, draws))
+            features.append(state.features)
+        return torch.stack(features), torch.stack(actions)
 
     def apply(self, network: Mlp, features: Tensor) -> Tensor:
         """The outputs of a network, (..., out), for features (..., in); gradients reach features and weights."""

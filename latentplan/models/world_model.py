@@ -9,13 +9,15 @@ import torch
 from torch import Tensor, nn
 
 from latentplan.config import ModelConfig
+from latentplan.config.checks import UserError
 from latentplan.config.quantities import TASK_PREFIX
+from latentplan.config.spaces import Spaces
 from latentplan.models.backend import Backend
 from latentplan.models.decoder import Decoder
 from latentplan.models.dynamics import Dynamics, Rssm, State, surprise
 from latentplan.models.encoder import Encoder
 from latentplan.models.goal_heads import GoalHeads
-from latentplan.models.heads import Actor, Mlp, ScalarHead, sample_action
+from latentplan.models.heads import Actor, MixedActor, Mlp, ScalarHead, sample_action
 
 PROBE_SHARE = 3  # the probe has a third of the width of other heads, because quantities are easy to predict
 
@@ -31,6 +33,7 @@ class WorldModel(nn.Module):
         action_dim: Size of the action, taken from the environment.
         labels: Names and typical sizes of the quantities that `probe` predicts from the latent.
         goal_dim: Width of the heads for goals (`GoalHeads`), which are trained after everything else; 0 for none.
+        spaces: Which numbers of the action stand for categories; None means that all are continuous.
 
     Attributes:
         backend: Computes steps, rollouts and beliefs; the reference, or a faster one that `accelerate` chose.
@@ -39,20 +42,34 @@ class WorldModel(nn.Module):
     label_scales: Tensor
 
     def __init__(
-        self, config: ModelConfig, action_dim: int, labels: Mapping[str, float] | None = None, goal_dim: int = 0
+        self,
+        config: ModelConfig,
+        action_dim: int,
+        labels: Mapping[str, float] | None = None,
+        goal_dim: int = 0,
+        spaces: Spaces | None = None,
     ) -> None:
         super().__init__()
+        self.spaces = spaces = spaces or Spaces()
+        if spaces.choices and len(spaces.choices) != action_dim:
+            raise ValueError(f"choices {spaces.choices} must have one entry for each of {action_dim} numbers")
+        if any(spaces.choices) and config.turns > 1:
+            raise UserError("model.turns 4 needs continuous actions, whose mean over turns is an action: set it to 1")
         self.config, self.action_dim, self.labels = config, action_dim, dict(labels or {})
         embedding_dim, features = config.hidden_dim, config.deter_dim + config.latent_dim
         self.encoder = Encoder(config.encoder_channels, embedding_dim)
         self.dynamics: Dynamics = Rssm(
-            config.latent_dim, config.deter_dim, config.hidden_dim, action_dim, embedding_dim
+            config.latent_dim, config.deter_dim, config.hidden_dim, action_dim, embedding_dim, spaces.choices
         )
         self.decoder = Decoder(features, config.decoder_channels)
         self.reward_head = ScalarHead(features, config.hidden_dim, config.num_bins)
         self.continue_head = Mlp(features, config.hidden_dim, 1)
         self.value_head = ScalarHead(features, config.hidden_dim, config.num_bins)
-        self.actor = Actor(features, config.hidden_dim, action_dim)
+        self.actor: Actor | MixedActor = (
+            MixedActor(features, config.hidden_dim, spaces.choices)
+            if any(spaces.choices)
+            else Actor(features, config.hidden_dim, action_dim)
+        )
         self.backend = Backend()
         self.register_buffer("label_scales", torch.tensor(list(self.labels.values())), persistent=False)
         if self.labels:
@@ -82,6 +99,11 @@ class WorldModel(nn.Module):
         return self.label_scales.device
 
     @property
+    def has_choices(self) -> bool:
+        """Whether some numbers of the action stand for categories."""
+        return isinstance(self.actor, MixedActor)
+
+    @property
     def label_names(self) -> tuple[str, ...]:
         """The quantities that `probe` predicts, in order; empty for an environment without quantities."""
         return tuple(self.labels)
@@ -104,7 +126,10 @@ class WorldModel(nn.Module):
 
         Raises:
             ValueError: The model was trained without labels.
+            UserError: The model has discrete actions.
         """
+        if self.has_choices:
+            raise UserError("goals are learned for continuous actions only: let the planner pursue them (--objective)")
         if not self.goal_names:
             raise ValueError("this model was trained without labels, so it has no quantities that a goal could name")
         features, config = self.config.deter_dim + self.config.latent_dim, self.config
@@ -181,6 +206,11 @@ class WorldModel(nn.Module):
     def policy(self, state: State, generator: torch.Generator | None = None) -> Tensor:
         """The actor's action (rows, action): a sample when a generator is given, else its mode."""
         with self.trunk_precision():
+            if isinstance(self.actor, MixedActor) and generator is not None:
+                shape = *state.deter.shape[:-1], self.action_dim
+                return self.actor.sample(
+                    state.features, torch.randn(shape, generator=generator, device=state.deter.device)
+                )
             mean, std = self.actor(state.features)
         if generator is None:
             return mean

@@ -216,7 +216,8 @@ class _Run:
         saved: SavedRun | None = None if save is None else read_state(save)
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(derive_seed(config.run.seed, "weights"))
-            model = WorldModel(config.model, self.description.action_dim, self.description.labels).to(self.device)
+            facts = self.description
+            model = WorldModel(config.model, facts.action_dim, facts.labels, spaces=facts.spaces).to(self.device)
         accelerate(model)
         replay_device = self.device if config.replay.on_device else torch.device("cpu")
         self.replay = Replay(

@@ -87,10 +87,12 @@ class _ConvertingBackend(Backend):
 
     def rollout(self, model: WorldModel, state: State, actions: Tensor) -> tuple[Tensor, State]:
         """See `Backend.rollout`; gradients do not reach the weights."""
-        return rollouts.imagine(self._weights(model), state, actions)
+        return rollouts.imagine(self._weights(model), state, _rssm(model).read(actions))
 
     def propose(self, model: WorldModel, state: State, noise: Tensor) -> Tensor:
         """See `Backend.propose`; gradients do not reach the weights."""
+        if model.has_choices:
+            return super().propose(model, state, noise)
         return rollouts.propose(self._weights(model), state, noise)
 
     def frame_functions(self, model: WorldModel) -> FrameFunctions:
@@ -142,13 +144,13 @@ class CpuBackend(_ConvertingBackend):
         """See `Backend.observe`."""
         if not native.fits(model.dynamics):
             return super().observe(model, embeddings, actions, deter, noise)
-        return native_unroll.observe(_rssm(model), embeddings, actions, deter, noise)
+        return native_unroll.observe(_rssm(model), embeddings, _rssm(model).read(actions), deter, noise)
 
     def predict(self, model: WorldModel, start: State, actions: Tensor) -> tuple[Tensor, Gaussian]:
         """See `Backend.predict`; gradients do not reach the start."""
         if not native.fits(model.dynamics):
             return super().predict(model, start, actions)
-        return native_unroll.predict(_rssm(model), start, actions)
+        return native_unroll.predict(_rssm(model), start, _rssm(model).read(actions))
 
     def imagine(
         self, model: WorldModel, start: State, action_noise: Tensor, noise: Tensor, decay: float
@@ -213,11 +215,11 @@ class GpuBackend(_ConvertingBackend):
         self, model: WorldModel, embeddings: Tensor, actions: Tensor, deter: Tensor, noise: Tensor
     ) -> tuple[State, Gaussian]:
         """See `Backend.observe`."""
-        return unroll.observe(_rssm(model), embeddings, actions, deter, noise)
+        return unroll.observe(_rssm(model), embeddings, _rssm(model).read(actions), deter, noise)
 
     def predict(self, model: WorldModel, start: State, actions: Tensor) -> tuple[Tensor, Gaussian]:
         """See `Backend.predict`."""
-        return unroll.predict(_rssm(model), start, actions)
+        return unroll.predict(_rssm(model), start, _rssm(model).read(actions))
 
     def imagine(
         self, model: WorldModel, start: State, action_noise: Tensor, noise: Tensor, decay: float
@@ -259,4 +261,6 @@ def _convert_for_rollouts(model: WorldModel, dtype: torch.dtype) -> rollouts.Wei
 
 
 def _convert_for_frames(model: WorldModel, dtype: torch.dtype) -> FrameFunctions:
+    if model.has_choices:
+        return FrameFunctions(model)
     return NativeFrameFunctions(model) if NativeFrameFunctions.can_pack(model) else TorchFrameFunctions(model)

@@ -20,6 +20,7 @@ from latentplan.agents.modes import make_agent
 from latentplan.agents.planning import PlanningAgent
 from latentplan.agents.random import RandomAgent
 from latentplan.config import Config, EnvironmentFault, derive_seed
+from latentplan.config.spaces import Spaces
 from latentplan.config.suites import DEFAULT_SUITE
 from latentplan.envs import make_vector_env, render_info
 from latentplan.envs.faults import FrameCheck
@@ -72,6 +73,7 @@ class Description:
         render_ms: Milliseconds per rendered frame.
         renderer: Name and settings of the renderer.
         labels: Quantities that the environment reports with each frame, and the typical size of each.
+        spaces: What the networks have to know of actions and observations.
     """
 
     action_dim: int
@@ -79,6 +81,7 @@ class Description:
     render_ms: float
     renderer: dict[str, str]
     labels: dict[str, float]
+    spaces: Spaces
 
 
 class Collector:
@@ -121,7 +124,8 @@ class Collector:
         self._decisions: int | None = facts["decisions_per_episode"]
         self.discount = discount = config.learning.discount or _choose_discount(self._decisions)
         self.labels: dict[str, float] = facts["labels"] or {}
-        self.model = accelerate(WorldModel(config.model, action_dim, self.labels).to(device))
+        self.spaces: Spaces = facts["spaces"] or Spaces()
+        self.model = accelerate(WorldModel(config.model, action_dim, self.labels, spaces=self.spaces).to(device))
         noise, correlation = config.collection.noise_std, config.collection.noise_correlation
         planner, goal_planner = (
             PlanningAgent(self.model, config, discount, noise_std=noise, noise_correlation=correlation)
@@ -154,7 +158,7 @@ class Collector:
         render_ms = 1000.0 * (time.perf_counter() - started) / TIMED_FRAMES
         facts = render_info() if self._make_user_env is None else {"renderer": "the user's environment"}
         renderer = {name: str(value) for name, value in facts.items()}
-        return Description(self.model.action_dim, self.discount, render_ms, renderer, self.labels)
+        return Description(self.model.action_dim, self.discount, render_ms, renderer, self.labels, self.spaces)
 
     def collect(
         self,

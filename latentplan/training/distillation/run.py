@@ -215,6 +215,11 @@ class _Distillation:
             raise UserError(
                 f"{source} has learned goals with its present actor: run scripts/distill.py before scripts/goals.py"
             )
+        if self.model.has_choices:
+            raise UserError(
+                f"{source} has discrete actions, and only continuous actions are distilled: the actor that its run "
+                "learned acts with --mode actor"
+            )
         self.model.requires_grad_(False)
         self.planner_config = replace(planner or self.config.planner, deadline_ms=None)
         self.planning = PlanningAgent(self.model, self.config, self.info["discount"], planner=self.planner_config)
