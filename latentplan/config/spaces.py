@@ -23,7 +23,9 @@ class Spaces:
 
     def __post_init__(self) -> None:
         if not all(type(num) is int and (num == 0 or 2 <= num <= MOST_CATEGORIES) for num in self.choices):
-            raise ValueError(f"choices must be 0 or numbers of categories in [2, {MOST_CATEGORIES}], got {self.choices}")
+            raise ValueError(
+                f"choices must be 0 or numbers of categories in [2, {MOST_CATEGORIES}], got {self.choices}"
+            )
 
     @property
     def action_choices(self) -> dict[int, tuple[float, ...]] | None:

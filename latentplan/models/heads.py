@@ -187,7 +187,7 @@ class MixedActor(nn.Module):
         return self.code.join(mean, self.code.values(logits.argmax(-1))), self.code.join(std, spread)
 
     def sample(self, features: Tensor, noise: Tensor) -> Tensor:
-        """Actions in [-1, 1] for standard normal noise, float32 (..., action) each; they pass no gradient to choices."""
+        """Actions in [-1, 1] for standard normal noise, float32 (..., action) each; categories pass no gradient."""
         mean, std, logits = self._distribution(features)
         continuous = sample_action(mean, std, noise[..., self.code.continuous])
         drawn = noise[..., self.code.discrete]

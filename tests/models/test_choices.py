@@ -68,9 +68,12 @@ def test_noise_of_zero_gives_the_mode(actor):
     mode, std = actor(features)
     assert torch.equal(actor.sample(features, torch.zeros(50, 4)), mode)
     assert (std > 0.0).all()
-    assert torch.allclose(actor.score(features, mode)[0], torch.stack(
-        [actor.score(features, actor.sample(features, torch.randn(50, 4)))[0] for _ in range(100)]
-    ).amax(0).maximum(actor.score(features, mode)[0]))
+    assert torch.allclose(
+        actor.score(features, mode)[0],
+        torch.stack([actor.score(features, actor.sample(features, torch.randn(50, 4)))[0] for _ in range(100)])
+        .amax(0)
+        .maximum(actor.score(features, mode)[0]),
+    )
 
 
 def test_entropy_is_the_mean_negative_log_probability():
@@ -121,9 +124,7 @@ def test_dynamics_depend_on_the_category_alone():
 
 def test_model_satisfies_the_planners_protocol():
     model = make_model()
-    report = check_model(
-        model, model.dynamics.initial(2), action_dim=4, action_choices=Spaces(CHOICES).action_choices
-    )
+    report = check_model(model, model.dynamics.initial(2), action_dim=4, action_choices=Spaces(CHOICES).action_choices)
     assert report is None or not getattr(report, "problems", [])
 
 

@@ -19,7 +19,7 @@ from latentplan.models.fast import rollout as rollouts
 from latentplan.models.fast.library import find_fast_dtype
 from latentplan.models.fast.native_frame import NativeFrameFunctions
 from latentplan.models.fast.one_frame import TorchFrameFunctions
-from latentplan.models.heads import Mlp, ScalarHead
+from latentplan.models.heads import Actor, Mlp, ScalarHead
 from latentplan.models.world_model import WorldModel
 
 ROLLOUT_PARTS = ("dynamics", "reward_head", "value_head", "actor")
@@ -158,7 +158,7 @@ class CpuBackend(_ConvertingBackend):
         """See `Backend.imagine`; the weights of the dynamics get no gradient."""
         if not (native.fits(model.dynamics) and native.fits(model.actor)):
             return super().imagine(model, start, action_noise, noise, decay)
-        return native_unroll.imagine(_rssm(model), model.actor, start, action_noise, noise, decay)
+        return native_unroll.imagine(_rssm(model), _gaussian_actor(model), start, action_noise, noise, decay)
 
     def encode(self, model: WorldModel, frames: Tensor) -> Tensor:
         """See `Backend.encode`."""
@@ -225,7 +225,7 @@ class GpuBackend(_ConvertingBackend):
         self, model: WorldModel, start: State, action_noise: Tensor, noise: Tensor, decay: float
     ) -> tuple[Tensor, Tensor]:
         """See `Backend.imagine`; the weights of the dynamics get no gradient."""
-        return unroll.imagine(_rssm(model), model.actor, start, action_noise, noise, decay)
+        return unroll.imagine(_rssm(model), _gaussian_actor(model), start, action_noise, noise, decay)
 
     def lambda_return(self, rewards: Tensor, discounts: Tensor, values: Tensor, lambda_: float) -> Tensor:
         """See `Backend.lambda_return`."""
@@ -254,6 +254,10 @@ def _count_fused_steps() -> None:
 
 def _rssm(model: WorldModel) -> Rssm:
     return cast(Rssm, model.dynamics)  # by `can_compute`
+
+
+def _gaussian_actor(model: WorldModel) -> Actor:
+    return cast(Actor, model.actor)  # a learner calls `Backend.sample` for any other
 
 
 def _convert_for_rollouts(model: WorldModel, dtype: torch.dtype) -> rollouts.Weights:

@@ -18,7 +18,7 @@ import time
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import torch
@@ -35,6 +35,7 @@ from latentplan.envs import make_env, make_from
 from latentplan.evaluation.episodes import OnStep, Step, episode_seed, iterate_episodes
 from latentplan.evaluation.statistics import confidence_interval
 from latentplan.models import Gaussian, State
+from latentplan.models.heads import Actor
 from latentplan.training.collection.collector import EnvFactory
 from latentplan.training.console import StatusLine
 from latentplan.training.distillation.labels import Demonstrations, plan_actions, read_first_actions
@@ -227,7 +228,7 @@ class _Distillation:
         build = make_env if make_user_env is None else make_from(make_user_env)
         self.env = build(self.config.env, 0)
         self.state, self.demonstrations = DistillationState(), Demonstrations()
-        self.student = Student(self.model.actor, settings)
+        self.student = Student(cast(Actor, self.model.actor), settings)
         self.initial = self.best = copy.deepcopy(self.model.actor.state_dict())
         self.line = StatusLine()
         self.saves = _saves(folder)
