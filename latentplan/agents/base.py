@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from latentplan.config import Config
+from latentplan.config import Config, UserError
 from latentplan.models import State, WorldModel
 from latentplan.models.backend import FrameFunctions
 from latentplan.models.heads import MixedActor
@@ -43,6 +43,8 @@ class Agent(Protocol):
 
 class ModelAgent:
     """An agent with a world model: keeps a belief about each environment, from which subclasses choose the action.
+
+    Frames have another shape than (64, 64, 3) where `model.spaces` says so.
 
     The agent turns one frame (64, 64, 3) into one action (action,), or a batch with one frame of each environment
     (batch, 64, 64, 3) into actions (batch, action). The belief is a state of the world model at the posterior's mean.
@@ -228,7 +230,10 @@ class ModelAgent:
 
     def _encode_goal(self, path: str) -> Tensor:
         """The latents of an image file, one for each quarter turn of the image, (turn, latent)."""
-        return self._encode_frames(turned(self._check_frames(read_goal_image(path)[None]), self._turns))
+        if self.model.spaces.cameras > 1:
+            raise UserError("a goal image shows one camera, and this agent sees several: name quantities instead")
+        image = read_goal_image(path, self.model.spaces.frame_size)
+        return self._encode_frames(turned(self._check_frames(image[None]), self._turns))
 
     def _encode_frames(self, frames: Tensor) -> Tensor:
         """Latents of frames (batch, 64, 64, 3) at the first moment of an episode, (batch, latent)."""
@@ -263,8 +268,9 @@ class ModelAgent:
         Raises:
             ValueError: The frames have another shape or dtype.
         """
-        if frames.dtype != np.uint8 or frames.shape[1:] != (64, 64, 3):
-            raise ValueError(f"frames must be uint8 (64, 64, 3), got {frames.dtype} {frames.shape[1:]}")
+        shape = self.model.spaces.frame_shape
+        if frames.dtype != np.uint8 or frames.shape[1:] != shape:
+            raise ValueError(f"frames must be uint8 {shape}, got {frames.dtype} {frames.shape[1:]}")
         return torch.from_numpy(np.ascontiguousarray(frames)).to(self.generator.device)
 
 

@@ -4,7 +4,7 @@ One call is one decision. Inputs and outputs are plain tensors, also the belief:
 
     action, deter, stoch = program(frame, deter, stoch, action, is_first)
 
-`frame` is uint8 (batch, 64, 64, 3). `deter`, float32 (batch, deter), and `stoch`, float32 (batch, latent), are the
+`frame` is uint8 (batch, 64, 64, 3), or of the shape that the agent's frames have. `deter`, float32 (batch, deter), and `stoch`, float32 (batch, latent), are the
 belief that the last call returned; an agent with four quarter turns has the beliefs of all turns side by side.
 `action`, float32 (batch, action) in [-1, 1], is the action executed after the last call. `is_first`, bool (batch,), is
 true at the first frame of an episode, where `deter`, `stoch` and `action` are not read and may be zeros. The batch may
@@ -134,7 +134,7 @@ def _trace_actor(model: WorldModel) -> ExportedProgram:
 
 def _example_inputs(model: WorldModel) -> tuple[Tensor, ...]:
     vectors = [torch.zeros(EXAMPLE_ROWS, size) for size in input_sizes(model).values()]
-    frame = torch.zeros(EXAMPLE_ROWS, 64, 64, 3, dtype=torch.uint8)
+    frame = torch.zeros(EXAMPLE_ROWS, *model.spaces.frame_shape, dtype=torch.uint8)
     return frame, *vectors, torch.ones(EXAMPLE_ROWS, dtype=torch.bool)
 
 

@@ -13,6 +13,7 @@ from latentplan.config.checks import MAX_EPISODES, MAX_THREADS, UserError, above
 from latentplan.config.learning import CollectionConfig, LearningConfig
 from latentplan.config.planner import PlannerConfig
 from latentplan.config.removed import drop_removed
+from latentplan.config.spaces import FRAME_SIZES, MOST_CAMERAS, check_frame_size
 
 LATENT_DIM = 32
 RenderQuality = Literal["exact", "fast", "fastest"]
@@ -36,6 +37,9 @@ class EnvConfig:
         task: Task of the domain; None takes the usual task of the domain.
         action_repeat: Simulator control steps per decision.
         camera: Camera id of the MuJoCo model.
+        cameras: Several cameras, whose pictures the agent sees together: ids of the MuJoCo model, or image keys of a
+            `Dict` observation of your own environment. Empty takes `camera`, or all images of the `Dict`.
+        frame_size: Side of the pictures in pixels: 64, 84, 96 or 128.
         render_quality: `exact` is dm_control's default; `fast` has a small shadow map; `fastest` has no shadows,
             reflections or anti-aliasing, which makes learning easier.
         floor: `suite` draws the floor as the suite does, which ends two metres behind a walker's start; `endless` draws
@@ -55,8 +59,13 @@ class EnvConfig:
     num_envs: int = 1
     objective: str | None = None
     suite: str = "dm_control"
+    cameras: tuple[str, ...] = ()
+    frame_size: int = FRAME_SIZES[0]
 
     def __post_init__(self) -> None:
+        check_frame_size(self.frame_size)
+        if len(set(self.cameras)) != len(self.cameras) or len(self.cameras) > MOST_CAMERAS:
+            raise ValueError(f"cameras must be at most {MOST_CAMERAS} different ones, got {' '.join(self.cameras)}")
         within(self, action_repeat=(1, MAX_REPEAT), num_envs=(1, MAX_ENVS), camera=(-1, MAX_CAMERA))
         one_of(self, render_quality=RENDER_QUALITIES, floor=FLOORS)
 

@@ -3,17 +3,21 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
+import cv2
 import gymnasium
 import numpy as np
 from gymnasium import spaces
 
-from latentplan.config import UserError
+from latentplan.config import EnvConfig, UserError
 from latentplan.config.spaces import MOST_CATEGORIES, Spaces
+from latentplan.envs.faults import check_picture, check_unit_picture, take_keys
 
+CHANNELS = (1, 3, 4)  # gray, RGB, RGB with alpha
+PICTURES = "a picture (height, width, 3), gray or with alpha, of uint8 or of floats in [0, 1]"
 MOST_NUMBERS = 4096  # of an action, as a checkpoint may name
 
 
@@ -92,38 +96,155 @@ class Accepted:
     """An environment's spaces as agents use them.
 
     Attributes:
+        observations: Makes frames of observations.
         actions: Makes values of the action space from the numbers of an agent.
         spaces: What the networks have to know.
     """
 
+    observations: Observations
     actions: Actions
     spaces: Spaces
 
 
-def accept_spaces(observation_space: gymnasium.Space[Any], action_space: gymnasium.Space[Any]) -> Accepted:
+def accept_spaces(
+    observation_space: gymnasium.Space[Any], action_space: gymnasium.Space[Any], config: EnvConfig | None = None
+) -> Accepted:
     """Decides whether agents can learn in an environment with these spaces, before anything else is made.
 
     Args:
         observation_space: Space of the observations.
         action_space: Space of the actions.
+        config: Size of the frames and names of the cameras; None takes the defaults.
 
     Raises:
         UserError: A space is not accepted; one line names the space, what it is and the remedy.
     """
-    check_observations(observation_space)
+    config = config or EnvConfig()
+    observations = Observations(observation_space, config.frame_size, config.cameras)
     actions = Actions(action_space)
-    return Accepted(actions, Spaces(choices=actions.choices))
+    return Accepted(observations, actions, replace(observations.spaces, choices=actions.choices))
 
 
-def check_observations(space: gymnasium.Space[Any]) -> None:
-    """Refuses observations that are not pictures."""
-    wanted = "observations must be a Box of uint8 images (height, width, 3)"
+class Picture:
+    """Pictures of one space as RGB bytes.
+
+    Accepted are (height, width, channel) and (channel, height, width) with 1, 3 or 4 channels, and (height, width): of
+    whole numbers within 0 to 255, or of floats whose space has the bounds 0 and 1. Gray becomes RGB, and a picture with
+    an alpha channel is laid over black.
+
+    Args:
+        space: Space of the pictures.
+        name: Place of the space, for messages.
+
+    Raises:
+        UserError: The space is another; the message names the remedy.
+    """
+
+    def __init__(self, space: gymnasium.Space[Any], name: str) -> None:
+        if not is_picture(space):
+            raise UserError(f"{name} must be {PICTURES}, got {_describe(space)}: {_find_remedy(space)}")
+        shape: tuple[int, ...] = space.shape or ()
+        self._shape, self._is_unit = shape, np.issubdtype(space.dtype, np.floating)
+        self._is_channel_first = len(shape) == 3 and shape[2] not in CHANNELS
+
+    def read(self, value: Any) -> np.ndarray:
+        """The picture, a new uint8 array (height, width, 3).
+
+        Raises:
+            EnvironmentFault: The value is not as the space declares.
+        """
+        picture = check_unit_picture(value, self._shape) if self._is_unit else check_picture(value, self._shape)
+        if picture.ndim == 2:
+            picture = picture[..., None]
+        elif self._is_channel_first:
+            picture = np.moveaxis(picture, 0, 2)
+        if picture.shape[2] == 4:
+            seen = picture[..., :3].astype(np.uint16) * picture[..., 3:]
+            return ((seen + 127) // 255).astype(np.uint8)
+        return np.ascontiguousarray(np.broadcast_to(picture, (*picture.shape[:2], 3)))
+
+
+class Observations:
+    """Observations of an environment as the frames of an agent.
+
+    Args:
+        space: The observation space: pictures (see `Picture`), or a Dict that holds some.
+        frame_size: Side of the frames.
+        cameras: Keys of the pictures that the agent sees, in this order; empty takes all pictures of a Dict.
+
+    Raises:
+        UserError: There are no such pictures; the message names the remedy.
+
+    Attributes:
+        spaces: What the networks have to know.
+    """
+
+    def __init__(self, space: gymnasium.Space[Any], frame_size: int, cameras: Sequence[str]) -> None:
+        self._frame_size, self._keys = frame_size, list(cameras)
+        if not isinstance(space, spaces.Dict):
+            if cameras:
+                raise UserError(
+                    f"env.cameras names {', '.join(cameras)}, but observation_space is {_describe(space)}: return a Dict "
+                    "with these keys, or leave env.cameras empty"
+                )
+            self._pictures = [Picture(space, "observation_space")]
+        else:
+            images = [key for key, part in space.spaces.items() if is_picture(part)]
+            self._keys = self._keys or images
+            if not self._keys:
+                raise UserError(f"observation_space must hold {PICTURES}, got {_describe(space)}: add one to the Dict")
+            for key in self._keys:
+                if key not in space.spaces:
+                    raise UserError(
+                        f"env.cameras names {key!r}, which observation_space lacks; its images: {', '.join(images) or 'none'}"
+                    )
+            self._pictures = [Picture(space[key], f"observation_space[{key!r}]") for key in self._keys]
+        self.spaces = Spaces(frame_size=frame_size, cameras=len(self._pictures))
+
+    def read(self, observation: Any) -> tuple[np.ndarray, np.ndarray]:
+        """The frame, a new uint8 array (frame_size, frame_size, 3 * camera), and the first camera's whole picture.
+
+        Raises:
+            EnvironmentFault: The observation is not as the space declares.
+        """
+        if not self._keys:
+            picture = self._pictures[0].read(observation)
+            return resize(picture, self._frame_size), picture
+        values = take_keys(observation, self._keys)
+        pictures = [picture.read(value) for picture, value in zip(self._pictures, values, strict=True)]
+        return np.concatenate([resize(picture, self._frame_size) for picture in pictures], axis=2), pictures[0]
+
+
+def is_picture(space: gymnasium.Space[Any]) -> bool:
+    """Whether values of a space are pictures that `Picture` reads."""
+    if not isinstance(space, spaces.Box) or not 2 <= len(space.shape) <= 3 or 0 in space.shape:
+        return False
+    if len(space.shape) == 3 and space.shape[2] not in CHANNELS and space.shape[0] not in CHANNELS:
+        return False
+    if np.issubdtype(space.dtype, np.floating):
+        return bool((space.low == 0.0).all() and (space.high == 1.0).all())
+    return bool(np.issubdtype(space.dtype, np.integer) and (space.low >= 0).all() and (space.high <= 255).all())
+
+
+def _find_remedy(space: gymnasium.Space[Any]) -> str:
+    """What makes pictures of a space that holds none."""
     if not isinstance(space, spaces.Box):
-        raise UserError(f"{wanted}, got {type(space).__name__}")
-    if space.dtype != np.uint8:
-        raise UserError(f"{wanted}, got dtype {space.dtype}")
-    if len(space.shape) != 3 or space.shape[2] != 3:
-        raise UserError(f"{wanted}, got shape {space.shape}")
+        return "return pictures, for instance by gymnasium.wrappers.AddRenderObservation(env)"
+    if len(space.shape) < 2:
+        return "return pictures, for instance by gymnasium.wrappers.AddRenderObservation(env), or a Dict with a picture"
+    if len(space.shape) == 2 or (len(space.shape) == 3 and {space.shape[0], space.shape[2]} & set(CHANNELS)):
+        if space.is_bounded():
+            return "scale them, for instance by gymnasium.wrappers.RescaleObservation(env, 0.0, 1.0)"
+        return "declare their range, Box(0, 255, shape, numpy.uint8) or Box(0.0, 1.0, shape, numpy.float32)"
+    return "change their shape by gymnasium.wrappers.ReshapeObservation(env, shape), or return several in a Dict"
+
+
+def resize(picture: np.ndarray, size: int) -> np.ndarray:
+    """The picture at another size, a new uint8 array (size, size, 3)."""
+    if picture.shape[:2] == (size, size):
+        return picture.copy()
+    shrinks = picture.shape[0] >= size and picture.shape[1] >= size
+    return cv2.resize(picture, (size, size), interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR)
 
 
 def _read_parts(space: gymnasium.Space[Any], name: str) -> Iterator[_Numbers]:

@@ -5,15 +5,13 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING, Any
 
-import cv2
 import gymnasium
 import numpy as np
 from gymnasium.error import ResetNeeded
 
 from latentplan.config import EnvConfig, UserError
-from latentplan.envs.faults import check_picture, check_reward
-from latentplan.envs.spaces import accept_spaces
-from latentplan.envs.suite import FRAME_SIZE
+from latentplan.envs.faults import check_reward
+from latentplan.envs.spaces import accept_spaces, resize
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -27,7 +25,7 @@ def make_from(
 ) -> Callable[[EnvConfig, int | None], PixelEnv]:
     """A function with the signature of `make_env` that builds a user's environments.
 
-    The function reads `action_repeat` of the settings, and raises `UserError` where the factory returns no
+    The function reads `action_repeat`, `frame_size` and `cameras` of the settings, and raises `UserError` where the factory returns no
     `gymnasium.Env` or an environment that `wrap_user_env` refuses.
 
     Args:
@@ -38,26 +36,31 @@ def make_from(
         env = factory()
         if not isinstance(env, gymnasium.Env):
             raise UserError(f"make_env must return a gymnasium.Env, got {type(env).__name__}")
-        return wrap_user_env(env, config.action_repeat, seed)
+        return PixelEnv(env, config.action_repeat, seed, config)
 
     return build
 
 
-def wrap_user_env(env: gymnasium.Env[Any, Any], action_repeat: int = 1, seed: int | None = None) -> PixelEnv:
+def wrap_user_env(
+    env: gymnasium.Env[Any, Any], action_repeat: int = 1, seed: int | None = None, *, config: EnvConfig | None = None
+) -> PixelEnv:
     """A user's environment with the interface for agents: frames of 64 x 64, actions in [-1, 1], action repeat.
 
     Args:
-        env: A gymnasium environment. `env.observation_space` is a Box of uint8 images (height, width, 3), RGB, of any
-            size; larger images are averaged down, smaller images are interpolated. `env.action_space` is a bounded Box
+        env: A gymnasium environment. `env.observation_space` is a picture of any size (see
+            `latentplan.envs.spaces.Picture`), or a Dict of pictures, one for each camera; larger images are averaged
+            down, smaller images are interpolated. `env.action_space` is a bounded Box
             of any shape, Discrete, MultiDiscrete, MultiBinary, or a Dict or Tuple of them.
         action_repeat: Steps of `env` per decision, at least 1; a step of the result repeats the action for this number
             of steps of `env`, or until the episode ends, and sums the rewards.
         seed: Seed of the first reset that is called without one; None draws a seed from the system.
+        config: Size of the frames and names of the cameras, such as `agent.config.env`; None takes the defaults.
 
     Returns:
         An environment with these properties:
 
-        - Observations are uint8 (64, 64, 3), each a new array.
+        - Observations are uint8 (64, 64, 3), each a new array. Another `frame_size` and several cameras, which lie side
+          by side along the last axis, change this shape.
         - Actions are float32 (action,) in [-1, 1], all numbers of `env.action_space` side by side; values outside are
           clipped. The interval is mapped linearly to the bounds of a Box. A choice of n categories is one number: the
           interval has n equal parts, one for each category.
@@ -70,7 +73,7 @@ def wrap_user_env(env: gymnasium.Env[Any, Any], action_repeat: int = 1, seed: in
         UserError: `action_repeat` is below 1, or a space is not as described; the message names the space and the
             reason.
     """
-    return PixelEnv(env, action_repeat, seed)
+    return PixelEnv(env, action_repeat, seed, config)
 
 
 class PixelEnv(gymnasium.Env[np.ndarray, np.ndarray]):
@@ -86,15 +89,21 @@ class PixelEnv(gymnasium.Env[np.ndarray, np.ndarray]):
     metadata = {"render_modes": ["rgb_array"]}
     render_mode = "rgb_array"
 
-    def __init__(self, env: gymnasium.Env[Any, Any], action_repeat: int, seed: int | None = None) -> None:
+    def __init__(
+        self,
+        env: gymnasium.Env[Any, Any],
+        action_repeat: int,
+        seed: int | None = None,
+        config: EnvConfig | None = None,
+    ) -> None:
         """Checks the spaces; see `wrap_user_env`."""
         if action_repeat < 1:
             raise UserError(f"action_repeat must be at least 1, got {action_repeat}")
-        accepted = accept_spaces(env.observation_space, env.action_space)
-        self._actions, self.spaces = accepted.actions, accepted.spaces
+        accepted = accept_spaces(env.observation_space, env.action_space, config)
+        self._observations, self._actions, self.spaces = accepted.observations, accepted.actions, accepted.spaces
         self._env = env
         self._first_seed = seed
-        self._picture = np.zeros((FRAME_SIZE, FRAME_SIZE, 3), dtype=np.uint8)
+        self._picture = np.zeros((self.spaces.frame_size, self.spaces.frame_size, 3), dtype=np.uint8)
         self._needs_reset = True
         self._decisions = 0
         self.action_repeat = action_repeat
@@ -104,13 +113,13 @@ class PixelEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         if rate := env.metadata.get("render_fps"):
             self.metadata = {**PixelEnv.metadata, "render_fps": rate / action_repeat}
         self.decisions_per_episode = None if limit is None else math.ceil(limit / action_repeat)
-        self.observation_space = gymnasium.spaces.Box(0, 255, (FRAME_SIZE, FRAME_SIZE, 3), np.uint8)
+        self.observation_space = gymnasium.spaces.Box(0, 255, self.spaces.frame_shape, np.uint8)
         self.action_space = gymnasium.spaces.Box(-1.0, 1.0, (self._actions.dim,), np.float32)
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[np.ndarray, dict[str, Any]]:
-        """Begins an episode; returns the first frame (64, 64, 3) and the inner environment's info."""
+        """Begins an episode; returns the first frame and the inner environment's info."""
         seed, self._first_seed = self._first_seed if seed is None else seed, None
         super().reset(seed=seed)
         picture, info = self._env.reset(seed=seed, options=options)
@@ -152,26 +161,18 @@ class PixelEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         return self._actions.value(action)
 
     def render(self) -> np.ndarray:  # type: ignore[override]
-        """The last frame, a new uint8 array (64, 64, 3)."""
-        return _resize(self._picture, FRAME_SIZE)
+        """The first camera's last picture, a new uint8 array (64, 64, 3)."""
+        return resize(self._picture, self.spaces.frame_size)
 
     def render_large(self, size: int) -> np.ndarray:
         """The inner environment's rendering where it has one, else its last observation, uint8 (size, size, 3)."""
         rendered = self._env.render() if self._env.render_mode == "rgb_array" else None
-        return _resize(self._picture if rendered is None else np.asarray(rendered), size)
+        return resize(self._picture if rendered is None else np.asarray(rendered), size)
 
     def close(self) -> None:
         """Closes the inner environment."""
         self._env.close()
 
-    def _to_frame(self, picture: np.ndarray) -> np.ndarray:
-        self._picture = check_picture(picture, self._env.observation_space.shape or ())
-        return _resize(self._picture, FRAME_SIZE)
-
-
-def _resize(picture: np.ndarray, size: int) -> np.ndarray:
-    """The picture at another size, a new uint8 array (size, size, 3)."""
-    if picture.shape[:2] == (size, size):
-        return picture.copy()
-    shrinks = picture.shape[0] >= size and picture.shape[1] >= size
-    return cv2.resize(picture, (size, size), interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR)
+    def _to_frame(self, observation: Any) -> np.ndarray:
+        frame, self._picture = self._observations.read(observation)
+        return frame

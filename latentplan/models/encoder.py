@@ -19,20 +19,30 @@ class Encoder(nn.Module):
     """Patches of 4 x 4 pixels through one matrix product, strided convolutions, and one linear layer.
 
     The patches are a convolution with stride 4, written as a matrix product because CPUs compute products faster. The
-    encoder reads all 64 x 64 pixels.
+    encoder reads all pixels.
+
+    Args:
+        channels: Channels of the layers.
+        embedding_dim: Size of an embedding.
+        frame_shape: Shape of a frame: (height, width, channel).
     """
 
-    def __init__(self, channels: tuple[int, ...], embedding_dim: int) -> None:
+    def __init__(
+        self,
+        channels: tuple[int, ...],
+        embedding_dim: int,
+        frame_shape: tuple[int, int, int] = (FRAME_SIZE, FRAME_SIZE, 3),
+    ) -> None:
         super().__init__()
-        self.patches = nn.Linear(3 * PATCH * PATCH, channels[0])
+        self.patches = nn.Linear(frame_shape[2] * PATCH * PATCH, channels[0])
         self.convolutions = nn.ModuleList(
             nn.Conv2d(before, after, kernel_size=4, stride=2, padding=1) for before, after in pairwise(channels)
         )
-        side = FRAME_SIZE // PATCH // 2 ** (len(channels) - 1)
+        side = frame_shape[0] // PATCH // 2 ** (len(channels) - 1)
         self.linear = nn.Linear(channels[-1] * side * side, embedding_dim)
 
     def forward(self, frames: Tensor) -> Tensor:
-        """Embeddings, float32 (rows, embedding), of uint8 frames (rows, 64, 64, 3)."""
+        """Embeddings, float32 (rows, embedding), of uint8 frames (rows, height, width, channel)."""
         patches = rearrange(
             frames, "rows (height y) (width x) channel -> rows height width (y x channel)", y=PATCH, x=PATCH
         )

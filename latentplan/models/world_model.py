@@ -33,7 +33,7 @@ class WorldModel(nn.Module):
         action_dim: Size of the action, taken from the environment.
         labels: Names and typical sizes of the quantities that `probe` predicts from the latent.
         goal_dim: Width of the heads for goals (`GoalHeads`), which are trained after everything else; 0 for none.
-        spaces: Which numbers of the action stand for categories; None means that all are continuous.
+        spaces: Shape of frames, and which numbers of the action stand for categories; None takes the usual ones.
 
     Attributes:
         backend: Computes steps, rollouts and beliefs; the reference, or a faster one that `accelerate` chose.
@@ -57,11 +57,11 @@ class WorldModel(nn.Module):
             raise UserError("model.turns 4 needs continuous actions, whose mean over turns is an action: set it to 1")
         self.config, self.action_dim, self.labels = config, action_dim, dict(labels or {})
         embedding_dim, features = config.hidden_dim, config.deter_dim + config.latent_dim
-        self.encoder = Encoder(config.encoder_channels, embedding_dim)
+        self.encoder = Encoder(config.encoder_channels, embedding_dim, spaces.frame_shape)
         self.dynamics: Dynamics = Rssm(
             config.latent_dim, config.deter_dim, config.hidden_dim, action_dim, embedding_dim, spaces.choices
         )
-        self.decoder = Decoder(features, config.decoder_channels)
+        self.decoder = Decoder(features, config.decoder_channels, spaces.frame_shape)
         self.reward_head = ScalarHead(features, config.hidden_dim, config.num_bins)
         self.continue_head = Mlp(features, config.hidden_dim, 1)
         self.value_head = ScalarHead(features, config.hidden_dim, config.num_bins)
@@ -161,12 +161,12 @@ class WorldModel(nn.Module):
         Args:
             state: The belief before the action.
             action: Actions in [-1, 1], (rows, action).
-            frames: Frames after the actions, uint8 (rows, 64, 64, 3).
+            frames: Frames after the actions, uint8 (rows, height, width, channel).
         """
         return self.see(self.dynamics.advance(state, action), frames)
 
     def see(self, deter: Tensor, frames: Tensor) -> State:
-        """The belief with the posterior's mean for deter (rows, deter) and uint8 frames (rows, 64, 64, 3)."""
+        """The belief with the posterior's mean for deter (rows, deter) and uint8 frames (rows, height, width, channel)."""
         return State(deter, self.dynamics.posterior(deter, self.encoder(frames)).mean)
 
     def step(self, state: State, action: Tensor) -> tuple[State, Tensor]:

@@ -227,6 +227,7 @@ class _Run:
             config.env.num_envs,
             replay_device,
             len(model.labels),
+            model.spaces.frame_shape,
         )
         self.files = ReplayFiles(self.folder / SAVES_FOLDER, self.replay)
         self.saved, self.state = saved, RunState() if saved is None else saved.state

@@ -10,7 +10,7 @@ from gymnasium.spaces import Dict, Discrete
 from latentplan import load_agent
 from latentplan.envs import wrap_user_env
 from latentplan.evaluation import evaluate_agent
-from latentplan.training import train
+from latentplan.training import resume, train
 from tests.training.dot import Dot
 
 
@@ -42,3 +42,27 @@ def test_run_with_mixed_actions_repeats_with_its_seed(finished, tiny, tmp_path):
     again = train(tiny(tmp_path / "again"), Buttons)
     weights = [run.run_dir / "checkpoints" / "last" / "weights.safetensors" for run in (finished, again)]
     assert weights[0].read_bytes() == weights[1].read_bytes()
+
+
+class TwoViews(Dot):
+    """A dot that each of two cameras sees in half of its places."""
+
+    picture_space = Dot.observation_space
+    observation_space = Dict({"left": picture_space, "right": picture_space})
+
+    def picture(self):
+        whole = super().picture()
+        left, right = whole.copy(), whole.copy()
+        left[:, 8:], right[:, :8] = 0, 0
+        return {"left": left, "right": right}
+
+
+def test_run_with_two_cameras_and_larger_frames_saves_resumes_and_plays(tiny, tmp_path):
+    env = {"frame_size": 84, "action_repeat": 1}
+    run = train(tiny(tmp_path / "run", env=env, run={"frames": 60}), TwoViews)
+    run = resume(run.run_dir, frames=90, make_env=TwoViews)
+    agent = load_agent(run.run_dir, "planner")
+    assert agent.model.spaces.frame_shape == (84, 84, 6)
+    env = wrap_user_env(TwoViews(), config=agent.config.env)
+    assert 0.0 <= evaluate_agent(agent, env, seed=0, episodes=1)["mean_return"] <= 20.0
+    assert agent.imagine() is None or agent.imagine().shape == (42, 42, 3)

@@ -162,13 +162,13 @@ class CpuBackend(_ConvertingBackend):
 
     def encode(self, model: WorldModel, frames: Tensor) -> Tensor:
         """See `Backend.encode`."""
-        if not native_pictures.can_encode(model.encoder):
+        if not (model.spaces.has_usual_frames and native_pictures.can_encode(model.encoder)):
             return super().encode(model, frames)
         return native_pictures.encode(model.encoder, frames)
 
     def reconstruction_errors(self, model: WorldModel, features: Tensor, frames: Tensor) -> Tensor:
         """See `Backend.reconstruction_errors`."""
-        if not native_pictures.can_encode(model.decoder):
+        if not (model.spaces.has_usual_frames and native_pictures.can_encode(model.decoder)):
             return super().reconstruction_errors(model, features, frames)
         return native_pictures.reconstruction_errors(model.decoder, features, frames)
 
@@ -265,6 +265,6 @@ def _convert_for_rollouts(model: WorldModel, dtype: torch.dtype) -> rollouts.Wei
 
 
 def _convert_for_frames(model: WorldModel, dtype: torch.dtype) -> FrameFunctions:
-    if model.has_choices:
+    if model.has_choices or not model.spaces.has_usual_frames:
         return FrameFunctions(model)
     return NativeFrameFunctions(model) if NativeFrameFunctions.can_pack(model) else TorchFrameFunctions(model)
