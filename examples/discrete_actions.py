@@ -1,7 +1,6 @@
-"""Train with discrete actions, from pictures alone: catch balls with a paddle that moves left, stays or moves right.
+"""Train with discrete actions, from pictures alone: keep a paddle that moves left, stays or moves right below a ball.
 
-A ball that lands on the paddle gives a reward of 1. Prints the mean return of planner, actor and random actions in
-episodes of five balls.
+Prints the mean return of planned, acted and random actions in episodes of 30 steps, in which five balls fall.
 """
 
 import sys
@@ -19,7 +18,7 @@ from latentplan.training import train
 CELLS = 6  # rows and columns
 
 
-class Catch(gymnasium.Env):
+class Follow(gymnasium.Env):
     """Balls fall one row per step, each from a random column; the paddle in the last row moves one column per step."""
 
     observation_space = gymnasium.spaces.Box(0, 255, (CELLS, CELLS, 3), np.uint8)
@@ -33,13 +32,12 @@ class Catch(gymnasium.Env):
         return self.render(), {}
 
     def step(self, action: int) -> tuple[np.ndarray, float, bool, bool, dict]:
-        """Moves paddle and ball; the reward is 1 where the ball has landed on the paddle, else 0."""
+        """Moves paddle and ball; the reward is 1 where the paddle is below the ball, else 0."""
         self.paddle = int(np.clip(self.paddle + action, 0, CELLS - 1))
-        self.row += 1
-        if self.row < CELLS:
-            return self.render(), 0.0, False, False, {}
         reward = float(self.column == self.paddle)
-        self._drop()
+        self.row += 1
+        if self.row == CELLS:
+            self._drop()
         return self.render(), reward, False, False, {}
 
     def render(self) -> np.ndarray:
@@ -54,28 +52,34 @@ class Catch(gymnasium.Env):
 
 def make_env() -> gymnasium.Env:
     """The environment in episodes of five balls."""
-    return gymnasium.wrappers.TimeLimit(Catch(), 5 * CELLS)
+    return gymnasium.wrappers.TimeLimit(Follow(), 5 * CELLS)
 
 
-def main(out: str = ".", frames: str = "1500", seed: str = "0") -> None:
+def main(out: str = ".", frames: str = "1000", seed: str = "0") -> None:
     """Trains for some minutes, and evaluates."""
     config = Config(
         env=EnvConfig(action_repeat=1),
-        model=ModelConfig(deter_dim=64, hidden_dim=64, encoder_channels=(16, 16, 16), decoder_channels=8),
-        planner=PlannerConfig(horizon=6, num_samples=64, num_elites=8),
+        model=ModelConfig(deter_dim=32, hidden_dim=32, encoder_channels=(8, 8, 8)),
+        planner=PlannerConfig(horizon=5, num_samples=64, num_elites=8),
         learning=LearningConfig(
-            batch_size=8, sequence_length=8, imagination_horizon=8, imagination_starts=64,
-            model_learning_rate=3e-3, behaviour_learning_rate=1e-3,
+            batch_size=8,
+            sequence_length=8,
+            imagination_horizon=8,
+            imagination_starts=64,
+            model_learning_rate=3e-3,
+            behaviour_learning_rate=1e-3,
         ),
-        collection=CollectionConfig(prefill_decisions=300, round_decisions=150, updates_per_decision=1.0, overlap=False),
+        collection=CollectionConfig(
+            prefill_decisions=300, round_decisions=100, updates_per_decision=1.0, overlap=False
+        ),
         evaluation=EvaluationConfig(every_frames=500, video=False),
-        run=RunConfig(frames=int(frames), threads=1, seed=int(seed), run_dir=f"{out}/catch"),
+        run=RunConfig(frames=int(frames), threads=1, seed=int(seed), run_dir=f"{out}/follow"),
     )
     train(config, make_env=make_env)
     for mode in ("planner", "actor", "random"):
         env = wrap_user_env(make_env())
-        played = evaluate_agent(load_agent(f"{out}/catch", mode), env, seed=0, episodes=20)
-        print(f"{mode}: mean return {played['mean_return']:.2f} of 5")
+        played = evaluate_agent(load_agent(f"{out}/follow", mode), env, seed=0, episodes=20)
+        print(f"{mode}: mean return {played['mean_return']:.1f} of 30")
 
 
 if __name__ == "__main__":

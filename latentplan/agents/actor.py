@@ -8,6 +8,7 @@ from torch import Tensor
 from latentplan.agents.base import ModelAgent
 from latentplan.config import Config
 from latentplan.models import State, WorldModel
+from latentplan.models.encoder import Observation
 from latentplan.models.heads import MixedActor, sample_action
 from latentplan.models.symmetry import mean_over_turns
 
@@ -37,7 +38,9 @@ class ActorAgent(ModelAgent):
         super().__init__(model, config, noise_correlation=noise_correlation, seed=seed)
         self.explore = explore
 
-    def _infer(self, state: State, action: Tensor | None, frames: Tensor, is_first: Tensor | None) -> State:
+    def _infer(
+        self, state: State, action: Tensor | None, frames: Tensor | Observation, is_first: Tensor | None
+    ) -> State:
         belief, self._mean, self._std = self._frame_functions.infer_and_act(state, action, frames, is_first)
         return belief
 

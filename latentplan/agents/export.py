@@ -99,6 +99,10 @@ def export_actor(agent_or_checkpoint: ModelAgent | str | Path, path: str | Path,
         model = agent_or_checkpoint.model
     else:
         model, _, _ = load_model(agent_or_checkpoint)
+    if model.spaces.vector_dim:
+        raise UserError(
+            "only agents that see pictures alone can be exported, and this one was trained with env.vectors"
+        )
     if type(model.dynamics) is not Rssm:
         raise UserError(
             f"only agents with dynamics of the class Rssm can be exported, got {type(model.dynamics).__name__}"

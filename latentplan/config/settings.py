@@ -40,6 +40,8 @@ class EnvConfig:
         cameras: Several cameras, whose pictures the agent sees together: ids of the MuJoCo model, or image keys of a
             `Dict` observation of your own environment. Empty takes `camera`, or all images of the `Dict`.
         frame_size: Side of the pictures in pixels: 64, 84, 96 or 128.
+        vectors: What the agent sees beside the pictures: keys of vectors in a `Dict` observation of your own
+            environment; in `dm_control` keys of the task's observation, or `proprioception` for all of them.
         render_quality: `exact` is dm_control's default; `fast` has a small shadow map; `fastest` has no shadows,
             reflections or anti-aliasing, which makes learning easier.
         floor: `suite` draws the floor as the suite does, which ends two metres behind a walker's start; `endless` draws
@@ -61,9 +63,12 @@ class EnvConfig:
     suite: str = "dm_control"
     cameras: tuple[str, ...] = ()
     frame_size: int = FRAME_SIZES[0]
+    vectors: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         check_frame_size(self.frame_size)
+        if len(set(self.vectors)) != len(self.vectors):
+            raise ValueError(f"vectors must be different keys, got {' '.join(self.vectors)}")
         if len(set(self.cameras)) != len(self.cameras) or len(self.cameras) > MOST_CAMERAS:
             raise ValueError(f"cameras must be at most {MOST_CAMERAS} different ones, got {' '.join(self.cameras)}")
         within(self, action_repeat=(1, MAX_REPEAT), num_envs=(1, MAX_ENVS), camera=(-1, MAX_CAMERA))

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 FRAME_SIZES = (64, 84, 96, 128)  # sides for which encoder and decoder divide a picture without rest
 MOST_CATEGORIES = 1024
 MOST_CAMERAS = 16
+MOST_NUMBERS = 4096  # of an action, and of the vectors beside a frame
 
 
 @dataclass(frozen=True)
@@ -23,16 +24,20 @@ class Spaces:
             means that every number is continuous.
         frame_size: Side of the square pictures, in pixels; one of `FRAME_SIZES`.
         cameras: Cameras whose RGB pictures are stacked along the last axis of a frame.
+        vector_dim: Numbers that the agent sees beside each frame, such as positions of joints.
     """
 
     choices: tuple[int, ...] = ()
     frame_size: int = FRAME_SIZES[0]
     cameras: int = 1
+    vector_dim: int = 0
 
     def __post_init__(self) -> None:
         check_frame_size(self.frame_size)
         if type(self.cameras) is not int or not 1 <= self.cameras <= MOST_CAMERAS:
             raise ValueError(f"cameras must be a whole number in [1, {MOST_CAMERAS}], got {self.cameras}")
+        if type(self.vector_dim) is not int or not 0 <= self.vector_dim <= MOST_NUMBERS:
+            raise ValueError(f"vector_dim must be a whole number in [0, {MOST_NUMBERS}], got {self.vector_dim}")
         if not all(type(num) is int and (num == 0 or 2 <= num <= MOST_CATEGORIES) for num in self.choices):
             raise ValueError(
                 f"choices must be 0 or numbers of categories in [2, {MOST_CATEGORIES}], got {self.choices}"

@@ -63,6 +63,25 @@ def check_unit_picture(picture: Any, shape: tuple[int, ...]) -> np.ndarray:
     return np.rint(given * 255.0).astype(np.uint8)
 
 
+def check_vector(vector: Any, shape: tuple[int, ...]) -> np.ndarray:
+    """An observation of numbers, float32 of the shape that its space declares.
+
+    Raises:
+        EnvironmentFault: The observation is none of this, or is not finite; the message says what it is.
+    """
+    wanted = f"the environment must return vectors of finite numbers {shape}"
+    try:
+        with np.errstate(over="ignore"):
+            given = np.array(vector, dtype=np.float32)
+    except (TypeError, ValueError):
+        raise EnvironmentFault(f"{wanted}, got {shown(vector)}") from None
+    if given.shape != shape:
+        raise EnvironmentFault(f"{wanted}, got shape {given.shape}")
+    if not np.isfinite(given).all():
+        raise EnvironmentFault(f"{wanted}, got {given.dtype} {_describe_range(given)}")
+    return given
+
+
 def take_keys(observation: Any, keys: Sequence[str]) -> list[Any]:
     """The values of an observation that is a dictionary, at some of its keys.
 

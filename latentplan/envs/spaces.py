@@ -13,12 +13,11 @@ import numpy as np
 from gymnasium import spaces
 
 from latentplan.config import EnvConfig, UserError
-from latentplan.config.spaces import MOST_CATEGORIES, Spaces
-from latentplan.envs.faults import check_picture, check_unit_picture, take_keys
+from latentplan.config.spaces import MOST_CATEGORIES, MOST_NUMBERS, Spaces
+from latentplan.envs.faults import check_picture, check_unit_picture, check_vector, take_keys
 
 CHANNELS = (1, 3, 4)  # gray, RGB, RGB with alpha
 PICTURES = "a picture (height, width, 3), gray or with alpha, of uint8 or of floats in [0, 1]"
-MOST_NUMBERS = 4096  # of an action, as a checkpoint may name
 
 
 @dataclass(frozen=True)
@@ -114,13 +113,13 @@ def accept_spaces(
     Args:
         observation_space: Space of the observations.
         action_space: Space of the actions.
-        config: Size of the frames and names of the cameras; None takes the defaults.
+        config: Size of the frames, names of cameras and vectors; None takes the defaults.
 
     Raises:
         UserError: A space is not accepted; one line names the space, what it is and the remedy.
     """
     config = config or EnvConfig()
-    observations = Observations(observation_space, config.frame_size, config.cameras)
+    observations = Observations(observation_space, config.frame_size, config.cameras, config.vectors)
     actions = Actions(action_space)
     return Accepted(observations, actions, replace(observations.spaces, choices=actions.choices))
 
@@ -171,22 +170,23 @@ class Observations:
         space: The observation space: pictures (see `Picture`), or a Dict that holds some.
         frame_size: Side of the frames.
         cameras: Keys of the pictures that the agent sees, in this order; empty takes all pictures of a Dict.
+        vectors: Keys of the vectors that the agent sees beside them, in this order: Boxes of any shape.
 
     Raises:
-        UserError: There are no such pictures; the message names the remedy.
+        UserError: There are no such pictures or vectors; the message names the remedy.
 
     Attributes:
         spaces: What the networks have to know.
     """
 
-    def __init__(self, space: gymnasium.Space[Any], frame_size: int, cameras: Sequence[str]) -> None:
-        self._frame_size, self._keys = frame_size, list(cameras)
+    def __init__(
+        self, space: gymnasium.Space[Any], frame_size: int, cameras: Sequence[str] = (), vectors: Sequence[str] = ()
+    ) -> None:
+        self._frame_size, self._keys, self._vectors = frame_size, list(cameras), list(vectors)
+        self._vector_shapes = [_read_vector(space, key) for key in vectors]
         if not isinstance(space, spaces.Dict):
             if cameras:
-                raise UserError(
-                    f"env.cameras names {', '.join(cameras)}, but observation_space is {_describe(space)}: return a Dict "
-                    "with these keys, or leave env.cameras empty"
-                )
+                raise _refuse_key(space, "cameras", cameras[0])
             self._pictures = [Picture(space, "observation_space")]
         else:
             images = [key for key, part in space.spaces.items() if is_picture(part)]
@@ -195,11 +195,23 @@ class Observations:
                 raise UserError(f"observation_space must hold {PICTURES}, got {_describe(space)}: add one to the Dict")
             for key in self._keys:
                 if key not in space.spaces:
-                    raise UserError(
-                        f"env.cameras names {key!r}, which observation_space lacks; its images: {', '.join(images) or 'none'}"
-                    )
+                    raise _refuse_key(space, "cameras", key)
             self._pictures = [Picture(space[key], f"observation_space[{key!r}]") for key in self._keys]
-        self.spaces = Spaces(frame_size=frame_size, cameras=len(self._pictures))
+        vector_dim = sum(math.prod(shape) for shape in self._vector_shapes)
+        if vector_dim > MOST_NUMBERS:
+            raise UserError(
+                f"env.vectors name {vector_dim} numbers, and at most {MOST_NUMBERS} are allowed: name fewer"
+            )
+        self.spaces = Spaces(frame_size=frame_size, cameras=len(self._pictures), vector_dim=vector_dim)
+
+    def read_vectors(self, observation: Any) -> np.ndarray:
+        """The numbers beside the frame, a new float32 array (vector_dim,).
+
+        Raises:
+            EnvironmentFault: The observation is not as the space declares.
+        """
+        values = zip(take_keys(observation, self._vectors), self._vector_shapes, strict=True)
+        return np.concatenate([np.ravel(check_vector(value, shape)) for value, shape in values])
 
     def read(self, observation: Any) -> tuple[np.ndarray, np.ndarray]:
         """The frame, a new uint8 array (frame_size, frame_size, 3 * camera), and the first camera's whole picture.
@@ -213,6 +225,30 @@ class Observations:
         values = take_keys(observation, self._keys)
         pictures = [picture.read(value) for picture, value in zip(self._pictures, values, strict=True)]
         return np.concatenate([resize(picture, self._frame_size) for picture in pictures], axis=2), pictures[0]
+
+
+def _read_vector(space: gymnasium.Space[Any], key: str) -> tuple[int, ...]:
+    """The shape of the vectors at a key of a Dict."""
+    if not isinstance(space, spaces.Dict) or key not in space.spaces:
+        raise _refuse_key(space, "vectors", key)
+    part = space[key]
+    if not isinstance(part, spaces.Box) or not np.issubdtype(part.dtype, np.number):
+        raise UserError(
+            f"observation_space[{key!r}], which env.vectors names, must be a Box of numbers, got {_describe(part)}: "
+            "convert it with gymnasium.wrappers.TransformObservation"
+        )
+    return part.shape
+
+
+def _refuse_key(space: gymnasium.Space[Any], setting: str, key: str) -> UserError:
+    """The refusal of a key that a setting names and a space lacks."""
+    if not isinstance(space, spaces.Dict):
+        return UserError(
+            f"env.{setting} names {key!r}, but observation_space is {_describe(space)}: return a Dict with these keys, "
+            f"or leave env.{setting} empty"
+        )
+    fits = [name for name, part in space.spaces.items() if is_picture(part) == (setting == "cameras")]
+    return UserError(f"env.{setting} names {key!r}, which observation_space lacks; it has {', '.join(fits) or 'none'}")
 
 
 def is_picture(space: gymnasium.Space[Any]) -> bool:

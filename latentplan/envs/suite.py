@@ -26,6 +26,7 @@ if TYPE_CHECKING:
 
     from dm_control.mujoco import Physics
 
+PROPRIOCEPTION = "proprioception"  # in `EnvConfig.vectors`: all parts of a task's observation
 _UNLIMITED_EPISODE_STEPS = 1000
 
 
@@ -69,7 +70,9 @@ class SuiteEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         self._task_env = _load_task(config.domain, task)
         self._cameras = _check_cameras(self.physics, config)
         self._frame_size = config.frame_size
-        self.spaces = Spaces(frame_size=config.frame_size, cameras=len(self._cameras))
+        self._vectors = config.vectors
+        vector_dim = len(self._measure_vectors()) if self._vectors else 0
+        self.spaces = Spaces(frame_size=config.frame_size, cameras=len(self._cameras), vector_dim=vector_dim)
         if config.floor == "endless":
             draw_floor_behind(self.physics)
         self.domain, self._quality = config.domain, config.render_quality
@@ -204,11 +207,26 @@ class SuiteEnv(gymnasium.Env[np.ndarray, np.ndarray]):
 
     def _info(self, env_frames: int) -> dict[str, Any]:
         info = {"env_frames": env_frames, "labels": measure(self.domain, self.physics)}
+        if self._vectors:
+            info["vectors"] = self._measure_vectors()
         if self._recorded:
             quantities, rewards = zip(*self._recorded, strict=True)
             info |= {"quantities": np.stack(quantities), "rewards": np.array(rewards)}
             self._recorded.clear()
         return info
+
+    def _measure_vectors(self) -> np.ndarray:
+        """The parts of the task's observation that the settings name, float32 (number,).
+
+        Raises:
+            UserError: The task's observation has no such part.
+        """
+        observed = self._task_env.task.get_observation(self.physics)
+        known = {**observed, PROPRIOCEPTION: np.concatenate([np.ravel(value) for value in observed.values()])}
+        for name in self._vectors:
+            if name not in known:
+                raise UserError(f"env.vectors names {shown(name)}; the task has {', '.join(known)}")
+        return np.concatenate([np.ravel(known[name]) for name in self._vectors]).astype(np.float32)
 
     def _control_step_reward(self, reward: float) -> float:
         """The reward of the latest control step; also recorded, with the quantities, if `record_quantities` is set.

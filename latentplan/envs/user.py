@@ -25,7 +25,7 @@ def make_from(
 ) -> Callable[[EnvConfig, int | None], PixelEnv]:
     """A function with the signature of `make_env` that builds a user's environments.
 
-    The function reads `action_repeat`, `frame_size` and `cameras` of the settings, and raises `UserError` where the factory returns no
+    The function reads `action_repeat`, `frame_size`, `cameras` and `vectors` of the settings, and raises `UserError` where the factory returns no
     `gymnasium.Env` or an environment that `wrap_user_env` refuses.
 
     Args:
@@ -54,7 +54,7 @@ def wrap_user_env(
         action_repeat: Steps of `env` per decision, at least 1; a step of the result repeats the action for this number
             of steps of `env`, or until the episode ends, and sums the rewards.
         seed: Seed of the first reset that is called without one; None draws a seed from the system.
-        config: Size of the frames and names of the cameras, such as `agent.config.env`; None takes the defaults.
+        config: Size of the frames, names of cameras and of vectors, such as `agent.config.env`; None takes the defaults.
 
     Returns:
         An environment with these properties:
@@ -64,6 +64,7 @@ def wrap_user_env(
         - Actions are float32 (action,) in [-1, 1], all numbers of `env.action_space` side by side; values outside are
           clipped. The interval is mapped linearly to the bounds of a Box. A choice of n categories is one number: the
           interval has n equal parts, one for each category.
+        - `info["vectors"]` holds the numbers that `config.vectors` names, float32 (vector,), if it names any.
         - `info["env_frames"]` of a step is the number of steps of `env` that it took; `info` of `env` is kept.
         - An environment without a time limit is truncated after 1000 decisions.
         - `step` raises `ResetNeeded` after the end of an episode, and `ValueError` for an action of another shape or
@@ -124,7 +125,7 @@ class PixelEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         super().reset(seed=seed)
         picture, info = self._env.reset(seed=seed, options=options)
         self._needs_reset, self._decisions = False, 0
-        return self._to_frame(picture), {**info, "env_frames": 0}
+        return self._to_frame(picture), {**info, **self._to_vectors(picture), "env_frames": 0}
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
         """Holds an action (action,) in [-1, 1] for `action_repeat` steps of the inner environment.
@@ -148,7 +149,8 @@ class PixelEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         self._decisions += 1
         truncated = truncated or (self.decisions_per_episode is None and self._decisions == MAX_DECISIONS)
         self._needs_reset = bool(terminated or truncated)
-        return self._to_frame(picture), total, bool(terminated), bool(truncated), {**info, "env_frames": env_frames}
+        info = {**info, **self._to_vectors(picture), "env_frames": env_frames}
+        return self._to_frame(picture), total, bool(terminated), bool(truncated), info
 
     def inner_action(self, action: np.ndarray) -> Any:
         """The value of the inner environment's action space for an agent's action (action,) in [-1, 1].
@@ -172,6 +174,10 @@ class PixelEnv(gymnasium.Env[np.ndarray, np.ndarray]):
     def close(self) -> None:
         """Closes the inner environment."""
         self._env.close()
+
+    def _to_vectors(self, observation: Any) -> dict[str, np.ndarray]:
+        """The entry of an info with the numbers beside the frame, if the agent sees any."""
+        return {"vectors": self._observations.read_vectors(observation)} if self.spaces.vector_dim else {}
 
     def _to_frame(self, observation: Any) -> np.ndarray:
         frame, self._picture = self._observations.read(observation)

@@ -15,6 +15,7 @@ from einops import rearrange
 from torch import Tensor
 
 from latentplan.models.dynamics import Gaussian, State, kl_divergence, surprise
+from latentplan.models.encoder import Observation
 from latentplan.models.heads import MixedActor
 
 if TYPE_CHECKING:
@@ -36,27 +37,29 @@ class FrameFunctions:
         # A reference to the model would close a circle, because the model's backend keeps these functions.
         self._encoder, self._dynamics, self._actor = model.encoder, model.dynamics, model.actor
 
-    def infer(self, state: State, action: Tensor | None, frames: Tensor, is_first: Tensor | None = None) -> State:
+    def infer(
+        self, state: State, action: Tensor | None, frames: Tensor | Observation, is_first: Tensor | None = None
+    ) -> State:
         """The belief, with the posterior's mean, after actions and the frames that resulted.
 
         Args:
             state: The belief before the action, (rows, ...).
             action: Actions in [-1, 1], (rows, action); None if `state.deter` is the state at the frame already.
-            frames: Frames after the actions, uint8 (rows, 64, 64, 3).
+            frames: Frames after the actions, uint8 (rows, 64, 64, 3) or the model's other shape, perhaps with vectors.
             is_first: Rows whose episode begins with the frame, (rows,) bool; None stands for no row.
         """
         deter = self._find_deter(state, action, is_first)
         return State(deter, self._dynamics.posterior(deter, self._encoder(frames)).mean)
 
     def infer_and_act(
-        self, state: State, action: Tensor | None, frames: Tensor, is_first: Tensor | None = None
+        self, state: State, action: Tensor | None, frames: Tensor | Observation, is_first: Tensor | None = None
     ) -> tuple[State, Tensor, Tensor]:
         """The belief of `infer`, and mean and std of the actor's action at this belief; see `act`."""
         belief = self.infer(state, action, frames, is_first)
         return belief, *self.act(belief)
 
     def infer_and_compare(
-        self, state: State, action: Tensor | None, frames: Tensor, is_first: Tensor | None = None
+        self, state: State, action: Tensor | None, frames: Tensor | Observation, is_first: Tensor | None = None
     ) -> tuple[State, Tensor]:
         """The belief of `infer`, and KL(posterior || prior) of its latent in nats, (rows,)."""
         deter = self._find_deter(state, action, is_first)

@@ -44,7 +44,10 @@ class Decoder(nn.Module):
     def forward(self, features: Tensor) -> Tensor:
         """Patches of the pictures, pixels in about [-0.5, 0.5], (rows, 8, 8, 48) for usual frames, for features (rows, in)."""
         grid = rearrange(
-            self.tokens(features), "rows (height width channel) -> rows channel height width", height=self.grid, width=self.grid
+            self.tokens(features),
+            "rows (height width channel) -> rows channel height width",
+            height=self.grid,
+            width=self.grid,
         )
         grid = functional.silu(self.mix(functional.silu(grid)))
         return self.paint(rearrange(grid, "rows channel height width -> rows height width channel"))

@@ -235,6 +235,11 @@ def sample_action(mean: Tensor, std: Tensor, noise: Tensor) -> Tensor:
     return raw - (raw - raw.clamp(-1.0, 1.0)).detach()
 
 
+def symlog(values: Tensor) -> Tensor:
+    """sign(x) log(1 + abs(x)) of each value (Hafner et al. 2023, eq. 9)."""
+    return torch.sign(values) * torch.log1p(values.abs())
+
+
 def symexp(values: Tensor) -> Tensor:
     """The inverse of symlog, sign(x) (exp(abs(x)) - 1), of each value."""
     return torch.sign(values) * torch.expm1(values.abs())

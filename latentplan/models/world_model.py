@@ -15,7 +15,7 @@ from latentplan.config.spaces import Spaces
 from latentplan.models.backend import Backend
 from latentplan.models.decoder import Decoder
 from latentplan.models.dynamics import Dynamics, Rssm, State, surprise
-from latentplan.models.encoder import Encoder
+from latentplan.models.encoder import Encoder, Observation
 from latentplan.models.goal_heads import GoalHeads
 from latentplan.models.heads import Actor, MixedActor, Mlp, ScalarHead, sample_action
 
@@ -55,9 +55,13 @@ class WorldModel(nn.Module):
             raise ValueError(f"choices {spaces.choices} must have one entry for each of {action_dim} numbers")
         if any(spaces.choices) and config.turns > 1:
             raise UserError("model.turns 4 needs continuous actions, whose mean over turns is an action: set it to 1")
+        if spaces.vector_dim and config.turns > 1:
+            raise UserError("model.turns 4 turns pictures, and env.vectors cannot be turned: leave one of them out")
         self.config, self.action_dim, self.labels = config, action_dim, dict(labels or {})
         embedding_dim, features = config.hidden_dim, config.deter_dim + config.latent_dim
-        self.encoder = Encoder(config.encoder_channels, embedding_dim, spaces.frame_shape)
+        self.encoder = Encoder(
+            config.encoder_channels, embedding_dim, spaces.frame_shape, spaces.vector_dim, config.hidden_dim
+        )
         self.dynamics: Dynamics = Rssm(
             config.latent_dim, config.deter_dim, config.hidden_dim, action_dim, embedding_dim, spaces.choices
         )
@@ -72,6 +76,8 @@ class WorldModel(nn.Module):
         )
         self.backend = Backend()
         self.register_buffer("label_scales", torch.tensor(list(self.labels.values())), persistent=False)
+        if spaces.vector_dim:
+            self.vector_head = Mlp(features, config.hidden_dim, spaces.vector_dim)
         if self.labels:
             self.probe_head = Mlp(features, max(1, config.hidden_dim // PROBE_SHARE), len(self.labels))
         self.goal_dim = 0
@@ -126,10 +132,12 @@ class WorldModel(nn.Module):
 
         Raises:
             ValueError: The model was trained without labels.
-            UserError: The model has discrete actions.
+            UserError: The model has discrete actions, or sees vectors.
         """
         if self.has_choices:
             raise UserError("goals are learned for continuous actions only: let the planner pursue them (--objective)")
+        if self.spaces.vector_dim:
+            raise UserError("goals are learned from pictures alone, without env.vectors: let the planner pursue them")
         if not self.goal_names:
             raise ValueError("this model was trained without labels, so it has no quantities that a goal could name")
         features, config = self.config.deter_dim + self.config.latent_dim, self.config
@@ -145,6 +153,10 @@ class WorldModel(nn.Module):
         """Predictions of the quantities `goal_names` for features (..., feature), float32 (..., quantity)."""
         return self.probe(features)[..., : len(self.goal_names)].float()
 
+    def seen_vectors(self, labels: Tensor) -> Tensor:
+        """The numbers beside the frames, (..., vector), which lie behind the labels, (..., label + vector)."""
+        return labels[..., len(self.labels) :]
+
     def probe(self, features: Tensor) -> Tensor:
         """Predictions of the quantities `label_names` for features (..., feature), in their own units, (..., label).
 
@@ -155,7 +167,7 @@ class WorldModel(nn.Module):
             raise ValueError("this model was trained without labels, so it predicts no quantities")
         return self.probe_head(features) * self.label_scales
 
-    def infer(self, state: State, action: Tensor, frames: Tensor) -> State:
+    def infer(self, state: State, action: Tensor, frames: Tensor | Observation) -> State:
         """The belief, with the posterior's mean, after actions and the frames that resulted.
 
         Args:
@@ -165,7 +177,7 @@ class WorldModel(nn.Module):
         """
         return self.see(self.dynamics.advance(state, action), frames)
 
-    def see(self, deter: Tensor, frames: Tensor) -> State:
+    def see(self, deter: Tensor, frames: Tensor | Observation) -> State:
         """The belief with the posterior's mean for deter (rows, deter) and uint8 frames (rows, height, width, channel)."""
         return State(deter, self.dynamics.posterior(deter, self.encoder(frames)).mean)
 

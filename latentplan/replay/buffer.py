@@ -37,7 +37,8 @@ class Rows:
         rewards: Rewards that arrived with the next frame, float32 (n,).
         continues: 1 unless the episode ended in a terminal state with the next frame, float32 (n,).
         is_first: Whether an episode starts at this row, bool (n,).
-        labels: True quantities at each frame, float32 (n, label); (n, 0) if the simulator reports none.
+        labels: True quantities at each frame, and then the numbers that the agent sees beside the frame, float32 (n,
+            label); (n, 0) if the simulator reports none.
     """
 
     frames: np.ndarray
@@ -58,7 +59,7 @@ class Batch(NamedTuple):
         actions: actions[t] in [-1, 1] was taken at frames[t], (batch, time, action).
         rewards: rewards[t] arrived with frames[t + 1], (batch, time).
         continues: continues[t] is 0 if frames[t + 1] shows a terminal state, else 1, (batch, time).
-        labels: True quantities at each frame, (batch, time + 1, label).
+        labels: True quantities at each frame, and then the numbers beside it, (batch, time + 1, label).
         rows: Row of the replay that holds each frame, int64 (batch, time + 1); `Replay.refresh` takes these rows.
     """
 

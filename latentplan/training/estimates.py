@@ -42,7 +42,10 @@ def check_run(config: Config) -> None:
         UserError: The parts of the run do not fit into the free memory, or a decision would take minutes.
     """
     on_device = config.run.device != "cpu" and has_cuda()
-    learning = [estimate_model(config.model, LEARNING_COPIES, frame_size=config.env.frame_size), _estimate_update(config)]
+    learning = [
+        estimate_model(config.model, LEARNING_COPIES, frame_size=config.env.frame_size),
+        _estimate_update(config),
+    ]
     collecting = [_estimate_environments(config), _estimate_rounds(config)]
     search = estimate_search(config.planner, config.model, on_device and not config.collection.overlap)
     replay = [_estimate_replay(config)]

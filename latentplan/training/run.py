@@ -226,7 +226,7 @@ class _Run:
             config.model.deter_dim,
             config.env.num_envs,
             replay_device,
-            len(model.labels),
+            len(model.labels) + model.spaces.vector_dim,
             model.spaces.frame_shape,
         )
         self.files = ReplayFiles(self.folder / SAVES_FOLDER, self.replay)

@@ -98,7 +98,9 @@ def test_frames_have_the_size_of_the_settings(size):
 
 @pytest.mark.parametrize(("size", "nearest"), [(60, 64), (80, 84), (100, 96), (224, 128)])
 def test_other_frame_sizes_are_refused_with_the_nearest(size, nearest):
-    with pytest.raises(ValueError, match=f"frame_size must be one of 64, 84, 96, 128, got {size}; the nearest is {nearest}"):
+    with pytest.raises(
+        ValueError, match=f"frame_size must be one of 64, 84, 96, 128, got {size}; the nearest is {nearest}"
+    ):
         EnvConfig(frame_size=size)
 
 

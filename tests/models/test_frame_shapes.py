@@ -30,8 +30,10 @@ def draw_frames(rows, spaces):
 def test_backends_agree_with_plain_torch(spaces):
     model, plain = make_model(spaces), Backend()
     frames, features = draw_frames(4, spaces), torch.randn(4, 48)
-    for compute in (lambda backend: backend.encode(model, frames),
-                    lambda backend: backend.reconstruction_errors(model, features, frames)):
+    for compute in (
+        lambda backend: backend.encode(model, frames),
+        lambda backend: backend.reconstruction_errors(model, features, frames),
+    ):
         assert torch.allclose(compute(model.backend), compute(plain), rtol=0.05, atol=0.05)
     with torch.no_grad():
         state, action = model.dynamics.initial(4), torch.rand(4, 2)

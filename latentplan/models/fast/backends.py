@@ -265,6 +265,6 @@ def _convert_for_rollouts(model: WorldModel, dtype: torch.dtype) -> rollouts.Wei
 
 
 def _convert_for_frames(model: WorldModel, dtype: torch.dtype) -> FrameFunctions:
-    if model.has_choices or not model.spaces.has_usual_frames:
+    if model.has_choices or model.spaces.vector_dim or not model.spaces.has_usual_frames:
         return FrameFunctions(model)
     return NativeFrameFunctions(model) if NativeFrameFunctions.can_pack(model) else TorchFrameFunctions(model)

@@ -141,7 +141,7 @@ class Collector:
         self._random = RandomAgent(action_dim)
         self._episodes = Episodes(self.envs, config.run.seed)
         self._frames: np.ndarray | None = None
-        self._labels = np.zeros((config.env.num_envs, len(self.labels)), np.float32)
+        self._labels = np.zeros((config.env.num_envs, len(self.labels) + self.spaces.vector_dim), np.float32)
         self._has_ended = np.ones(config.env.num_envs, dtype=bool)
         self._returns = np.zeros(config.env.num_envs)
         self._check_rewards = RewardCheck(config.env.num_envs, discount)
@@ -222,7 +222,7 @@ class Collector:
         self.restarts.count = memory["restarts"]
         frames, labels, is_same = self._episodes.replay(memory["episodes"])
         self._frames, self._returns = frames, memory["returns"].numpy().copy()
-        if self.labels:
+        if self._labels.shape[1]:
             self._labels = np.array(labels, np.float32)
         self._has_ended = memory["has_ended"].numpy() | ~is_same
         name = memory["agent"]
@@ -311,14 +311,15 @@ class Collector:
         self._frames, info = self._episodes.restart(self._has_ended)
         if not is_new:
             agent.reset(self._has_ended)
-        if self.labels:
+        if self._labels.shape[1]:
             self._labels[self._has_ended] = np.asarray(info["labels"])[self._has_ended]
         self._returns[self._has_ended] = 0.0
 
     def _step(self, agent: ModelAgent | RandomAgent, log: _Log) -> None:
         assert self._frames is not None
         frames, labels, first = self._frames.copy(), self._labels.copy(), self._has_ended.copy()
-        actions = agent.act(frames)
+        seen = self._labels[:, len(self.labels) :].copy()
+        actions = agent.act((frames, seen) if self.spaces.vector_dim else frames)
         state = agent.state if isinstance(agent, ModelAgent) else None
         deter = None if state is None else first_turn(state).deter.float().cpu().numpy()
         self._frames, rewards, terminated, truncated, info = self._episodes.step(actions)
@@ -326,7 +327,7 @@ class Collector:
         self._check_frames(frames)
         self._has_ended = terminated | truncated
         self._returns += rewards
-        if self.labels:
+        if self._labels.shape[1]:
             self._labels = np.array(info["labels"], np.float32)
         failed = info["failed"]
         log.append(frames, deter, actions, rewards, ~terminated, first, labels, np.asarray(info["env_frames"]), failed)

@@ -221,6 +221,8 @@ class _Distillation:
                 f"{source} has discrete actions, and only continuous actions are distilled: the actor that its run "
                 "learned acts with --mode actor"
             )
+        if self.model.spaces.vector_dim:
+            raise UserError(f"{source} was trained with env.vectors, and only agents of pictures alone are distilled")
         self.model.requires_grad_(False)
         self.planner_config = replace(planner or self.config.planner, deadline_ms=None)
         self.planning = PlanningAgent(self.model, self.config, self.info["discount"], planner=self.planner_config)

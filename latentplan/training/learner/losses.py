@@ -14,7 +14,7 @@ from torch import Tensor
 
 from latentplan.config import LearningConfig
 from latentplan.models import Gaussian, State, WorldModel, kl_divergence
-from latentplan.models.heads import HALF_LOG_2_PI_E, MAX_ACTION_STD, MIN_ACTION_STD, Actor, MixedActor
+from latentplan.models.heads import HALF_LOG_2_PI_E, MAX_ACTION_STD, MIN_ACTION_STD, Actor, MixedActor, symlog
 from latentplan.replay.buffer import Batch
 from latentplan.training.learner.augmentation import random_shift
 from latentplan.training.learner.registry import BEHAVIOUR_LOSSES, WORLD_MODEL_LOSSES, register, weighted_sum
@@ -140,6 +140,8 @@ def world_model_loss(model: WorldModel, batch: Batch, config: LearningConfig, ge
     moved = random_shift(model.backend, batch.frames, config.random_shift, generator)
     with model.trunk_precision(cache=False):
         embeddings = model.backend.encode(model, moved.flatten(0, 1)).unflatten(0, (size, frames_per_sequence))
+        if model.spaces.vector_dim:
+            embeddings = embeddings + model.encoder.read_vectors(model.seen_vectors(batch.labels))
     noise = torch.randn(
         size, frames_per_sequence, model.config.latent_dim, generator=generator, device=batch.frames.device
     )
@@ -227,9 +229,22 @@ def _probe(predicted: Prediction) -> Tensor:
     model, batch, reached = predicted.model, predicted.batch, predicted.open_loop.shape[1]
     if not model.labels:
         return batch.rewards.new_zeros(())
-    errors = mean_within(_probe_errors(model, predicted.features, batch.labels), predicted.is_seen)
-    open_loop_errors = _probe_errors(model, predicted.open_loop, batch.labels[:, 1 : reached + 1])
+    labels = batch.labels[..., : len(model.labels)]
+    errors = mean_within(_probe_errors(model, predicted.features, labels), predicted.is_seen)
+    open_loop_errors = _probe_errors(model, predicted.open_loop, labels[:, 1 : reached + 1])
     return errors + mean_within(open_loop_errors, batch.within[:, :reached])
+
+
+@register(WORLD_MODEL_LOSSES, "vectors", "vector_scale", is_recorded=False)
+def _vectors(predicted: Prediction) -> Tensor:
+    """Squared error of the numbers beside the frames, in symlog units, summed over the numbers."""
+    model, batch = predicted.model, predicted.batch
+    if not model.spaces.vector_dim:
+        return batch.rewards.new_zeros(())
+    with model.trunk_precision(cache=False):
+        painted = model.backend.apply(model.vector_head, predicted.features)
+    errors = (painted - symlog(model.seen_vectors(batch.labels))).square().sum(-1)
+    return mean_within(errors, predicted.is_seen)
 
 
 @register(BEHAVIOUR_LOSSES, "actor")
