@@ -9,8 +9,16 @@ import gymnasium
 import numpy as np
 
 from latentplan import load_agent
-from latentplan.config import CollectionConfig, Config, EnvConfig, EvaluationConfig, LearningConfig, ModelConfig
-from latentplan.config import PlannerConfig, RunConfig
+from latentplan.config import (
+    CollectionConfig,
+    Config,
+    EnvConfig,
+    EvaluationConfig,
+    LearningConfig,
+    ModelConfig,
+    PlannerConfig,
+    RunConfig,
+)
 from latentplan.envs import wrap_user_env
 from latentplan.evaluation import evaluate_agent
 from latentplan.training import train

@@ -21,7 +21,6 @@ from latentplan.objectives.objective import build_goals, read_goal_image
 from latentplan.planning import Planner
 from latentplan.planning.objectives import Constraint, Term
 
-
 Seen = np.ndarray | tuple[np.ndarray, np.ndarray]
 """A frame, or a frame and the numbers beside it, float32 (vector,); a batch of both has the rows in front."""
 

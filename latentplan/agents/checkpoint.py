@@ -249,8 +249,9 @@ def _read_spaces(info: dict[str, Any]) -> Spaces:
         TypeError: The description names spaces of another form.
         ValueError: A value is not allowed.
     """
-    given = info.get("spaces", {})
-    return Spaces(**{name: tuple(value) if isinstance(value, list) else value for name, value in given.items()})
+    given: dict[str, Any] = info.get("spaces", {})
+    values: dict[str, Any] = {name: tuple(value) if isinstance(value, list) else value for name, value in given.items()}
+    return Spaces(**values)
 
 
 def _first_not_finite(state: dict[str, torch.Tensor]) -> str | None:

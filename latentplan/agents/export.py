@@ -4,11 +4,11 @@ One call is one decision. Inputs and outputs are plain tensors, also the belief:
 
     action, deter, stoch = program(frame, deter, stoch, action, is_first)
 
-`frame` is uint8 (batch, 64, 64, 3), or of the shape that the agent's frames have. `deter`, float32 (batch, deter), and `stoch`, float32 (batch, latent), are the
-belief that the last call returned; an agent with four quarter turns has the beliefs of all turns side by side.
-`action`, float32 (batch, action) in [-1, 1], is the action executed after the last call. `is_first`, bool (batch,), is
-true at the first frame of an episode, where `deter`, `stoch` and `action` are not read and may be zeros. The batch may
-have any size, and the rows do not influence each other.
+`frame` is uint8 (batch, 64, 64, 3), or of the shape that the agent's frames have. `deter`, float32 (batch, deter), and
+`stoch`, float32 (batch, latent), are the belief that the last call returned; an agent with four quarter turns has the
+beliefs of all turns side by side. `action`, float32 (batch, action) in [-1, 1], is the action executed after the last
+call. `is_first`, bool (batch,), is true at the first frame of an episode, where `deter`, `stoch` and `action` are not
+read and may be zeros. The batch may have any size, and the rows do not influence each other.
 """
 
 from __future__ import annotations

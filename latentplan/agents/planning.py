@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -14,7 +15,7 @@ from latentplan.config import Config, PlannerConfig
 from latentplan.models import State, WorldModel
 from latentplan.models.symmetry import flat, mean_over_turns
 from latentplan.objectives.expression import Expression
-from latentplan.planning import ModelPredictiveController, Planner, make_planner
+from latentplan.planning import CEMPlanner, ModelPredictiveController, Planner, make_planner
 from latentplan.planning.objectives import Constraint, Term
 
 
@@ -82,6 +83,12 @@ class PlanningAgent(ModelAgent):
         """As `ModelAgent.set_memory`, with the last plan."""
         super().set_memory(memory)
         self.controller.set_memory(memory["controller"], self.model.device)
+
+    def weigh_ends(self) -> None:
+        """From the next decision on, plans weigh rewards by the probability that the episode goes on."""
+        planner = self.controller.planner
+        if isinstance(planner, CEMPlanner):
+            self.controller.planner = replace(planner, use_continues=True)
 
     def set_objective(
         self, objective: str | Expression | Term | None = None, constraints: str | Sequence[Constraint] = ()

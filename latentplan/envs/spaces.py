@@ -323,8 +323,8 @@ def _read_box(space: spaces.Box, name: str) -> _Numbers:
     if not (is_finite and space.is_bounded()):
         raise UserError(
             f"{name} must be bounded, got {_describe(space)}: give the environment a bounded action_space, for "
-            f"instance by gymnasium.wrappers.TransformAction(env, lambda action: action, gymnasium.spaces.Box(-1.0, 1.0, "
-            f"{space.shape}))"
+            "instance by gymnasium.wrappers.TransformAction(env, lambda action: action, "
+            f"gymnasium.spaces.Box(-1.0, 1.0, {space.shape}))"
         )
     low, high = (np.ravel(bound).astype(np.float64) for bound in (space.low, space.high))
     return _Numbers(space, low, high, (0,) * len(low))

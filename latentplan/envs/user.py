@@ -25,8 +25,8 @@ def make_from(
 ) -> Callable[[EnvConfig, int | None], PixelEnv]:
     """A function with the signature of `make_env` that builds a user's environments.
 
-    The function reads `action_repeat`, `frame_size`, `cameras` and `vectors` of the settings, and raises `UserError` where the factory returns no
-    `gymnasium.Env` or an environment that `wrap_user_env` refuses.
+    The function reads `action_repeat`, `frame_size`, `cameras` and `vectors` of the settings, and raises `UserError`
+    where the factory returns no `gymnasium.Env` or an environment that `wrap_user_env` refuses.
 
     Args:
         factory: Returns a new environment with spaces that `accept_spaces` accepts.
@@ -54,7 +54,7 @@ def wrap_user_env(
         action_repeat: Steps of `env` per decision, at least 1; a step of the result repeats the action for this number
             of steps of `env`, or until the episode ends, and sums the rewards.
         seed: Seed of the first reset that is called without one; None draws a seed from the system.
-        config: Size of the frames, names of cameras and of vectors, such as `agent.config.env`; None takes the defaults.
+        config: Size of the frames, names of cameras and vectors, such as `agent.config.env`; None takes the defaults.
 
     Returns:
         An environment with these properties:

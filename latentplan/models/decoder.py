@@ -42,7 +42,7 @@ class Decoder(nn.Module):
         self.register_buffer("pool", _pooling(self.patch, frame_shape[2]), persistent=False)
 
     def forward(self, features: Tensor) -> Tensor:
-        """Patches of the pictures, pixels in about [-0.5, 0.5], (rows, 8, 8, 48) for usual frames, for features (rows, in)."""
+        """Patches of the pictures, pixels in about [-0.5, 0.5], usually (rows, 8, 8, 48), for features (rows, in)."""
         grid = rearrange(
             self.tokens(features),
             "rows (height width channel) -> rows channel height width",

@@ -178,7 +178,7 @@ class WorldModel(nn.Module):
         return self.see(self.dynamics.advance(state, action), frames)
 
     def see(self, deter: Tensor, frames: Tensor | Observation) -> State:
-        """The belief with the posterior's mean for deter (rows, deter) and uint8 frames (rows, height, width, channel)."""
+        """The belief with the posterior's mean for deter (rows, deter) and frames, as in `infer`."""
         return State(deter, self.dynamics.posterior(deter, self.encoder(frames)).mean)
 
     def step(self, state: State, action: Tensor) -> tuple[State, Tensor]:

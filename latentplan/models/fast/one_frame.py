@@ -8,7 +8,7 @@ tensors, so that `latentplan.agents.export` can trace them into a program.
 
 from __future__ import annotations
 
-from typing import NamedTuple, cast
+from typing import Any, NamedTuple, cast
 
 import torch
 from torch import Tensor, nn
@@ -63,7 +63,7 @@ class TorchFrameFunctions(FrameFunctions):
         super().__init__(model)
         self._weights = convert_weights(model)
 
-    def infer(self, state: State, action: Tensor | None, frames: Tensor, is_first: Tensor | None = None) -> State:
+    def infer(self, state: State, action: Tensor | None, frames: Any, is_first: Tensor | None = None) -> State:
         """See `FrameFunctions.infer`."""
         return see(self._weights, self._find_deter(state, action, is_first), frames)
 

@@ -146,6 +146,7 @@ class Collector:
         self._returns = np.zeros(config.env.num_envs)
         self._check_rewards = RewardCheck(config.env.num_envs, discount)
         self._check_frames = FrameCheck(config.env.num_envs)
+        self._has_seen_end = False  # an episode ended in a terminal state
         self._current_agent: ModelAgent | RandomAgent | None = None
         self.should_stop: Callable[[], bool] = lambda: False
 
@@ -220,6 +221,8 @@ class Collector:
         """
         memory = to_tensors(memory)
         self.restarts.count = memory["restarts"]
+        if memory.get("has_seen_end"):
+            self._notice_end()
         frames, labels, is_same = self._episodes.replay(memory["episodes"])
         self._frames, self._returns = frames, memory["returns"].numpy().copy()
         if self._labels.shape[1]:
@@ -244,6 +247,7 @@ class Collector:
             "returns": self._returns.copy(),
             "has_ended": self._has_ended.copy(),
             "restarts": self.restarts.count,
+            "has_seen_end": self._has_seen_end,
         }
         return to_arrays(memory)  # type: ignore[no-any-return]
 
@@ -315,6 +319,15 @@ class Collector:
             self._labels[self._has_ended] = np.asarray(info["labels"])[self._has_ended]
         self._returns[self._has_ended] = 0.0
 
+    def _notice_end(self) -> None:
+        """Lets all plans weigh rewards by the probability that the episode goes on, unless the settings decide."""
+        if self._has_seen_end or self.config.planner.use_continues is not None:
+            return
+        self._has_seen_end = True
+        for agent in (*self._agents.values(), *self._evaluation_agents.values()):
+            if isinstance(agent, PlanningAgent):
+                agent.weigh_ends()
+
     def _step(self, agent: ModelAgent | RandomAgent, log: _Log) -> None:
         assert self._frames is not None
         frames, labels, first = self._frames.copy(), self._labels.copy(), self._has_ended.copy()
@@ -325,6 +338,8 @@ class Collector:
         self._frames, rewards, terminated, truncated, info = self._episodes.step(actions)
         self._check_rewards(rewards, first)
         self._check_frames(frames)
+        if terminated.any():
+            self._notice_end()
         self._has_ended = terminated | truncated
         self._returns += rewards
         if self._labels.shape[1]:
