@@ -15,6 +15,7 @@ from latentplan.config.parsing import option
 from latentplan.config.planner import PlannerConfig
 from latentplan.config.reading import read_kwargs
 from latentplan.config.removed import drop_removed
+from latentplan.config.spaces import FRAME_SIZES, MOST_CAMERAS, check_frame_size
 
 LATENT_DIM = 32
 RenderQuality = Literal["exact", "fast", "fastest"]
@@ -40,6 +41,11 @@ class EnvConfig:
         task: Task of the domain; None takes the usual task of the domain.
         action_repeat: Simulator control steps per decision.
         camera: Camera id of the MuJoCo model.
+        cameras: Several cameras, whose pictures the agent sees together: ids of the MuJoCo model, or image keys of a
+            `Dict` observation of your own environment. Empty takes `camera`, or all images of the `Dict`.
+        frame_size: Side of the pictures in pixels: 64, 84, 96 or 128.
+        vectors: What the agent sees beside the pictures: keys of vectors in a `Dict` observation of your own
+            environment; in `dm_control` keys of the task's observation, or `proprioception` for all of them.
         render_quality: `exact` is dm_control's default; `fast` has a small shadow map; `fastest` has no shadows,
             reflections or anti-aliasing, which makes learning easier.
         floor: `suite` draws the floor as the suite does, which ends two metres behind a walker's start; `endless` draws
@@ -65,9 +71,17 @@ class EnvConfig:
     suite: str = "dm_control"
     kwargs: str = option("{}", metavar="JSON")
     pixels: Pixels = "observation"
+    cameras: tuple[str, ...] = ()
+    frame_size: int = FRAME_SIZES[0]
+    vectors: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         read_kwargs(self.kwargs)
+        check_frame_size(self.frame_size)
+        if len(set(self.vectors)) != len(self.vectors):
+            raise ValueError(f"vectors must be different keys, got {' '.join(self.vectors)}")
+        if len(set(self.cameras)) != len(self.cameras) or len(self.cameras) > MOST_CAMERAS:
+            raise ValueError(f"cameras must be at most {MOST_CAMERAS} different ones, got {' '.join(self.cameras)}")
         within(self, action_repeat=(1, MAX_REPEAT), num_envs=(1, MAX_ENVS), camera=(-1, MAX_CAMERA))
         one_of(self, render_quality=RENDER_QUALITIES, floor=FLOORS, pixels=PIXELS)
 

@@ -216,7 +216,8 @@ class _Run:
         saved: SavedRun | None = None if save is None else read_state(save)
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(derive_seed(config.run.seed, "weights"))
-            model = WorldModel(config.model, self.description.action_dim, self.description.labels).to(self.device)
+            facts = self.description
+            model = WorldModel(config.model, facts.action_dim, facts.labels, spaces=facts.spaces).to(self.device)
         accelerate(model)
         replay_device = self.device if config.replay.on_device else torch.device("cpu")
         self.replay = Replay(
@@ -225,7 +226,8 @@ class _Run:
             config.model.deter_dim,
             config.env.num_envs,
             replay_device,
-            len(model.labels),
+            len(model.labels) + model.spaces.vector_dim,
+            model.spaces.frame_shape,
         )
         self.files = ReplayFiles(self.folder / SAVES_FOLDER, self.replay)
         self.saved, self.state = saved, RunState() if saved is None else saved.state

@@ -6,6 +6,7 @@ import copy
 import shutil
 import time
 import warnings
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -129,7 +130,10 @@ class Save(lightning.Callback):
     def save_agent(self, name: str, model: WorldModel, info: dict[str, Any]) -> None:
         """Save an agent in `checkpoints/<name>`, with the facts in `info` and the facts of the run."""
         facts = self.facts | info | {"metrics": self.state.evaluations}
-        save_checkpoint(self.folder / "checkpoints" / name, model, self.config, facts)
+        planner = self.config.planner
+        if planner.use_continues is None:
+            planner = replace(planner, use_continues=bool(self.files.replay.is_end.any()))
+        save_checkpoint(self.folder / "checkpoints" / name, model, replace(self.config, planner=planner), facts)
 
     def clocks(self, learner: Learner) -> dict[str, Any]:
         """The frames, updates and minutes of the present agent."""

@@ -21,11 +21,11 @@ from latentplan.agents.modes import make_agent
 from latentplan.agents.planning import PlanningAgent
 from latentplan.agents.random import RandomAgent
 from latentplan.config import Config, EnvironmentFault, derive_seed
+from latentplan.config.spaces import Spaces
 from latentplan.config.suites import DEFAULT_SUITE
 from latentplan.envs import make_vector_env
 from latentplan.envs.faults import FrameCheck
 from latentplan.envs.registry import USERS_RENDERER, describe_renderer
-from latentplan.envs.suite import FRAME_SIZE
 from latentplan.envs.vector import Restarts, make_guarded_env
 from latentplan.evaluation.episodes import OnStep, episode_seed, run_episodes
 from latentplan.evaluation.statistics import Episode
@@ -75,6 +75,7 @@ class Description:
         render_ms: Milliseconds per rendered frame.
         renderer: Name and settings of the renderer.
         labels: Quantities that the environment reports with each frame, and the typical size of each.
+        spaces: What the networks have to know of actions and observations.
     """
 
     action_dim: int
@@ -82,6 +83,7 @@ class Description:
     render_ms: float
     renderer: dict[str, str]
     labels: dict[str, float]
+    spaces: Spaces
 
 
 class Collector:
@@ -124,7 +126,8 @@ class Collector:
         self._decisions: int | None = facts["decisions_per_episode"]
         self.discount = discount = config.learning.discount or _choose_discount(self._decisions)
         self.labels: dict[str, float] = facts["labels"] or {}
-        self.model = accelerate(WorldModel(config.model, action_dim, self.labels).to(device))
+        self.spaces: Spaces = facts["spaces"] or Spaces()
+        self.model = accelerate(WorldModel(config.model, action_dim, self.labels, spaces=self.spaces).to(device))
         noise, correlation = config.collection.noise_std, config.collection.noise_correlation
         planner, goal_planner = (
             PlanningAgent(self.model, config, discount, noise_std=noise, noise_correlation=correlation)
@@ -140,11 +143,12 @@ class Collector:
         self._random = RandomAgent(action_dim)
         self._episodes = Episodes(self.envs, config.run.seed)
         self._frames: np.ndarray | None = None
-        self._labels = np.zeros((config.env.num_envs, len(self.labels)), np.float32)
+        self._labels = np.zeros((config.env.num_envs, len(self.labels) + self.spaces.vector_dim), np.float32)
         self._has_ended = np.ones(config.env.num_envs, dtype=bool)
         self._returns = np.zeros(config.env.num_envs)
         self._check_rewards = RewardCheck(config.env.num_envs, discount)
         self._check_frames = FrameCheck(config.env.num_envs)
+        self._has_seen_end = False  # an episode ended in a terminal state
         self._current_agent: ModelAgent | RandomAgent | None = None
         self.should_stop: Callable[[], bool] = lambda: False
 
@@ -155,14 +159,15 @@ class Collector:
             warnings.simplefilter("ignore", RuntimeWarning)
             env.reset(seed=0)
             env.step(np.zeros(self.model.action_dim, np.float32))
-        draw = partial(env.render_large, FRAME_SIZE) if self.config.env.pixels == "render" else env.render
+        config = self.config.env
+        draw = partial(env.render_large, config.frame_size) if config.pixels == "render" else env.render
         started = time.perf_counter()
         for _ in range(TIMED_FRAMES):
             draw()
         render_ms = 1000.0 * (time.perf_counter() - started) / TIMED_FRAMES
         facts = describe_renderer(self.config.env) if self._make_user_env is None else USERS_RENDERER
         renderer = {name: str(value) for name, value in facts.items()}
-        return Description(self.model.action_dim, self.discount, render_ms, renderer, self.labels)
+        return Description(self.model.action_dim, self.discount, render_ms, renderer, self.labels, self.spaces)
 
     def collect(
         self,
@@ -224,9 +229,11 @@ class Collector:
         """
         memory = to_tensors(memory)
         self.restarts.count = memory["restarts"]
+        if memory.get("has_seen_end"):
+            self._notice_end()
         frames, labels, is_same = self._episodes.replay(memory["episodes"])
         self._frames, self._returns = frames, memory["returns"].numpy().copy()
-        if self.labels:
+        if self._labels.shape[1]:
             self._labels = np.array(labels, np.float32)
         self._has_ended = memory["has_ended"].numpy() | ~is_same
         name = memory["agent"]
@@ -248,6 +255,7 @@ class Collector:
             "returns": self._returns.copy(),
             "has_ended": self._has_ended.copy(),
             "restarts": self.restarts.count,
+            "has_seen_end": self._has_seen_end,
         }
         return to_arrays(memory)  # type: ignore[no-any-return]
 
@@ -315,22 +323,34 @@ class Collector:
         self._frames, info = self._episodes.restart(self._has_ended)
         if not is_new:
             agent.reset(self._has_ended)
-        if self.labels:
+        if self._labels.shape[1]:
             self._labels[self._has_ended] = np.asarray(info["labels"])[self._has_ended]
         self._returns[self._has_ended] = 0.0
+
+    def _notice_end(self) -> None:
+        """Lets all plans weigh rewards by the probability that the episode goes on, unless the settings decide."""
+        if self._has_seen_end or self.config.planner.use_continues is not None:
+            return
+        self._has_seen_end = True
+        for agent in (*self._agents.values(), *self._evaluation_agents.values()):
+            if isinstance(agent, PlanningAgent):
+                agent.weigh_ends()
 
     def _step(self, agent: ModelAgent | RandomAgent, log: _Log) -> None:
         assert self._frames is not None
         frames, labels, first = self._frames.copy(), self._labels.copy(), self._has_ended.copy()
-        actions = agent.act(frames)
+        seen = self._labels[:, len(self.labels) :].copy()
+        actions = agent.act((frames, seen) if self.spaces.vector_dim else frames)
         state = agent.state if isinstance(agent, ModelAgent) else None
         deter = None if state is None else first_turn(state).deter.float().cpu().numpy()
         self._frames, rewards, terminated, truncated, info = self._episodes.step(actions)
         self._check_rewards(rewards, first)
         self._check_frames(frames)
+        if terminated.any():
+            self._notice_end()
         self._has_ended = terminated | truncated
         self._returns += rewards
-        if self.labels:
+        if self._labels.shape[1]:
             self._labels = np.array(info["labels"], np.float32)
         failed = info["failed"]
         log.append(frames, deter, actions, rewards, ~terminated, first, labels, np.asarray(info["env_frames"]), failed)
