@@ -60,9 +60,10 @@ def check_unit_picture(picture: Any, shape: tuple[int, ...]) -> np.ndarray:
     except (TypeError, ValueError):
         raise EnvironmentFault(f"{wanted}, got {type(picture).__name__}") from None
     if given.shape != shape:
-        raise EnvironmentFault(f"{wanted}, got shape {given.shape}")
+        raise EnvironmentFault(f"{wanted}, got shape {given.shape}: declare in observation_space what it returns")
     if not (given.min() >= 0.0 and given.max() <= 1.0):  # also NaN
-        raise EnvironmentFault(f"{wanted}, got {given.dtype} {_describe_range(given)}")
+        remedy = "divide brightness by 255, or declare uint8 within 0 to 255"
+        raise EnvironmentFault(f"{wanted}, got {given.dtype} {_describe_range(given)}: {remedy}")
     return np.rint(given * 255.0).astype(np.uint8)
 
 

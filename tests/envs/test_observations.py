@@ -121,7 +121,7 @@ def test_cameras_of_a_dict_are_stacked_in_order():
 
 
 def test_cameras_that_do_not_exist_are_refused():
-    with pytest.raises(UserError, match="names 'top', which observation_space lacks; its images: left, right"):
+    with pytest.raises(UserError, match="names 'top', which observation_space lacks; it has left, right"):
         accept_spaces(CAMERAS, ACTIONS, EnvConfig(cameras=("top",)))
     with pytest.raises(UserError, match=r"observation_space\['joints'\] must be a picture"):
         accept_spaces(CAMERAS, ACTIONS, EnvConfig(cameras=("joints",)))
