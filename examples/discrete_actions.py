@@ -1,6 +1,4 @@
-"""Train with discrete actions: a paddle moves left, stays or moves right, and should stay below a lamp that jumps.
-
-Prints the mean return of planner, actor and random actions, at most 30."""
+"""Train with discrete actions: a paddle should stay below a lamp that jumps; prints mean returns, 30 at most."""
 
 import sys
 
