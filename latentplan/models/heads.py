@@ -16,6 +16,7 @@ from torch.nn import functional
 
 MIN_ACTION_STD = 0.1
 MAX_ACTION_STD = 1.0
+UNIFORM_SHARE = 0.01  # of each categorical distribution (Hafner et al. 2023), so that every category stays possible
 SYMLOG_LIMIT = 9.0
 HALF_LOG_2_PI_E = 1.4189385  # entropy of a Gaussian is log std + this, in nats
 LARGEST_SCALAR = math.exp(SYMLOG_LIMIT) - 1.0  # about 8,100; larger targets saturate
@@ -213,8 +214,9 @@ class MixedActor(nn.Module):
         """Mean and std of the continuous numbers, (..., continuous) each, and logits (..., discrete, category)."""
         raw = self.mlp(features)
         mean, std = action_distribution(raw[..., : self.num_continuous])
-        logits = raw[..., self.num_continuous :][..., self.places]
-        return mean, std, logits.masked_fill(~self.code.exists, float("-inf"))
+        logits = raw[..., self.num_continuous :][..., self.places].masked_fill(~self.code.exists, float("-inf"))
+        mixed = (1.0 - UNIFORM_SHARE) * logits.softmax(-1) + UNIFORM_SHARE / self.code.counts[:, None]
+        return mean, std, mixed.masked_fill(~self.code.exists, 1.0).log().masked_fill(~self.code.exists, float("-inf"))
 
 
 def single_or_double(values: Tensor) -> Tensor:

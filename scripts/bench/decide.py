@@ -158,7 +158,7 @@ class ExportedActor:
             self._program = torch.export.load(export_actor(agent, Path(folder) / "actor.pt2")).module()
         self._past: tuple[torch.Tensor, ...] | None = None
 
-    def act(self, frame: np.ndarray) -> np.ndarray:
+    def act(self, frame: Any) -> np.ndarray:
         """The action for frames uint8 (64, 64, 3) or (batch, 64, 64, 3)."""
         import torch
 
