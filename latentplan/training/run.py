@@ -7,6 +7,8 @@ import errno
 import json
 import logging
 import math
+import shlex
+import sys
 import warnings
 from dataclasses import dataclass, replace
 from datetime import datetime
@@ -19,12 +21,15 @@ import torch
 from lightning.pytorch.loggers import TensorBoardLogger
 from lightning.pytorch.utilities.exceptions import SIGTERMException
 
+from latentplan import __version__
 from latentplan.agents.checkpoint import INFO, load_model
 from latentplan.agents.files import is_checkpoint
 from latentplan.config import USER_DOMAIN, Config, Device, EnvironmentFault, UserError, derive_seed
 from latentplan.config.commit import Save
 from latentplan.config.files import dump_config, read_config
+from latentplan.config.origin import describe_commit, describe_hardware, library_versions
 from latentplan.config.run_folder import RUN_FILE, SAVES_FOLDER, lock_folder, read_run_config, run_saves
+from latentplan.config.run_results import METRICS_FILE, note_state
 from latentplan.envs import default_task
 from latentplan.models import WorldModel
 from latentplan.models.fast import accelerate
@@ -46,7 +51,6 @@ from latentplan.training.saving import Guard, Restore, Stop
 from latentplan.training.saving import Save as SaveRun
 from latentplan.training.signals import Signals, exit_code
 from latentplan.training.state import (
-    METRICS_FILE,
     RunState,
     SavedRun,
     read_state,
@@ -158,28 +162,44 @@ def resume(
 def _start(config: Config, folder: Path, make_env: EnvFactory | None, *, resume: bool) -> Result:
     """Runs until the end, an interruption or an error; goes back to the last save after too many skipped steps."""
     check_settings(config)
-    failed_at = -1
     with lock_folder(folder), Signals() as signals:
-        while True:
-            try:
-                return _Run(config, folder, make_env, signals, resume=resume).execute()
-            except NotFiniteError as error:
-                if error.update <= failed_at:
-                    raise  # the same again: another try would end here too
-                failed_at, resume = error.update, True
-                warnings.warn(f"{error}: the run goes back to its last save", RuntimeWarning, stacklevel=2)
-            except Stopped:  # while the run was being set up, from which nothing is lost
-                return Result(folder, exit_code(signals.received), {})
-            except WorkerEnded as error:
-                raise UserError(f"{error}; the run has stopped, and --resume {folder} continues it") from error
-            except OSError as error:
-                is_own = str(error.filename or "").startswith(str(folder))
-                if not is_own and error.errno not in DISK_ERRORS:
-                    raise
-                raise UserError(
-                    f"the run in {folder} has stopped: {error.strerror} ({error.filename or 'while writing'}); "
-                    f"when this is mended, --resume {folder} continues from its last save"
-                ) from error
+        facts = {"command": shlex.join(sys.argv), "commit": describe_commit(), "version": __version__}
+        facts |= {"hardware": describe_hardware(config.run.device != "cpu" and torch.cuda.is_available())}
+        note_state(folder, "running", **facts, libraries=library_versions())
+        try:
+            result = _run_until_end(config, folder, make_env, signals, resume=resume)
+        except BaseException as error:
+            with contextlib.suppress(OSError):  # a full disk may be the reason
+                note_state(folder, "failed", reason=" ".join(str(error).split()) or type(error).__name__)
+            raise
+        note_state(folder, "finished" if result.exit_code == 0 else "stopped")
+        return result
+
+
+def _run_until_end(
+    config: Config, folder: Path, make_env: EnvFactory | None, signals: Signals, *, resume: bool
+) -> Result:
+    failed_at = -1
+    while True:
+        try:
+            return _Run(config, folder, make_env, signals, resume=resume).execute()
+        except NotFiniteError as error:
+            if error.update <= failed_at:
+                raise  # the same again: another try would end here too
+            failed_at, resume = error.update, True
+            warnings.warn(f"{error}: the run goes back to its last save", RuntimeWarning, stacklevel=3)
+        except Stopped:  # while the run was being set up, from which nothing is lost
+            return Result(folder, exit_code(signals.received), {})
+        except WorkerEnded as error:
+            raise UserError(f"{error}; the run has stopped, and --resume {folder} continues it") from error
+        except OSError as error:
+            is_own = str(error.filename or "").startswith(str(folder))
+            if not is_own and error.errno not in DISK_ERRORS:
+                raise
+            raise UserError(
+                f"the run in {folder} has stopped: {error.strerror} ({error.filename or 'while writing'}); "
+                f"when this is mended, --resume {folder} continues from its last save"
+            ) from error
 
 
 class _Run:
@@ -388,8 +408,6 @@ class _Run:
             self.console.console.print(f"{name:<12}{line}", soft_wrap=True)
 
     def _agent_facts(self) -> dict[str, Any]:
-        from latentplan import __version__
-
         return {
             "format": 1,
             "version": __version__,
