@@ -77,6 +77,8 @@ def read_settings(folder: Path) -> Config:
     path = folder / RUN_FILE
     if not folder.is_dir():
         raise UserError(f"there is no folder {folder}")
+    if not path.exists() and (folder / STATUS_FILE).exists():
+        raise UserError(f"{folder} has no settings yet: its run is being set up, or could not begin")
     if not path.exists() and not run_saves(folder).exist():
         raise UserError(f"{folder} holds no training run: it has no {RUN_FILE}")
     try:
