@@ -6,7 +6,9 @@ import importlib.metadata
 import platform
 import subprocess
 from pathlib import Path
+from typing import Any
 
+from latentplan import __version__
 from latentplan.config.estimates import count_cores
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -41,6 +43,12 @@ def describe_commit() -> str:
     except OSError:  # no git
         return UNKNOWN
     return found.stdout.strip() or UNKNOWN
+
+
+def present_facts(on_gpu: bool) -> dict[str, Any]:
+    """Commit, version, hardware and libraries of this process, as plain values for JSON."""
+    facts = {"commit": describe_commit(), "version": __version__, "hardware": describe_hardware(on_gpu)}
+    return {**facts, "libraries": library_versions()}
 
 
 def library_versions() -> dict[str, str]:

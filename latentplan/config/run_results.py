@@ -7,7 +7,7 @@ import fcntl
 import io
 import json
 import os
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
@@ -50,6 +50,13 @@ def read_evaluations(folder: Path) -> list[Evaluation]:
     except (OSError, ValueError, TypeError) as error:
         raise UserError(f"the results in {folder} cannot be read: {error}") from None
     return [found[frames] for frames in sorted(found)]
+
+
+def read_log(info: Mapping[str, Any]) -> list[Evaluation]:
+    """The evaluations in the `info.json` of an agent, without entries that are not whole."""
+    log = info.get("metrics")
+    entries = [entry for entry in log if isinstance(entry, dict)] if isinstance(log, list) else []
+    return [Evaluation(*(entry[name] for name in Evaluation._fields)) for entry in entries if _is_whole(entry)]
 
 
 def read_progress(folder: Path) -> tuple[float, float]:
@@ -133,6 +140,10 @@ def find_state(folder: Path) -> tuple[StateName, str | None]:
     if state in ("finished", "stopped"):
         return state, None
     return ("finished" if _has_final_evaluation(folder) else "stopped"), None
+
+
+def _is_whole(entry: Mapping[str, Any]) -> bool:
+    return all(isinstance(entry.get(name), int | float) for name in Evaluation._fields)
 
 
 def _has_final_evaluation(folder: Path) -> bool:

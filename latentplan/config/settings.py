@@ -119,12 +119,14 @@ class EvaluationConfig:
         episodes: Episodes of the planner, and of the actor from the same starts, per evaluation during training.
         final_episodes: Episodes of the evaluation at the end of a run.
         video: Whether each evaluation films its first episode.
+        report: Whether a run writes `report.html` into its folder after the final evaluation.
     """
 
     every_frames: int = 10_000
     episodes: int = 2
     final_episodes: int = 10
     video: bool = True
+    report: bool = True
 
     def __post_init__(self) -> None:
         at_least(self, every_frames=1)

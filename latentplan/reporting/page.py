@@ -17,6 +17,7 @@ from latentplan.reporting.frame import Frame
 
 LARGEST_PAGE = 10_000_000  # bytes
 LARGEST_FILM = 6_000_000
+WIDEST_CARD = 48  # characters of a row in a card of one column
 MEDIA = {".webm": "video/webm", ".mp4": "video/mp4"}
 _TEMPLATE = Path(__file__).with_name("page.html")
 _NUMBER = re.compile(r"[-+]?[\d,.]+( ms| %)?|-")
@@ -80,9 +81,11 @@ def table(rows: Sequence[Sequence[str]], caption: str = "") -> str:
         return "".join(f"<{tag}{kind}>{escape(cell)}</{tag}>" for cell, kind in zip(row, kinds, strict=True))
 
     lines = "".join(f"<tr>{cells(row, 'td')}</tr>" for row in body)
+    longest = [max(len(row[column]) for row in rows) for column in range(len(head))]
+    wide = " wide" if sum(longest) > WIDEST_CARD else ""
     title = f"<caption>{escape(caption)}</caption>" if caption else ""
     return (
-        f'<div class="card scroll" tabindex="0"><table>{title}<thead><tr>{cells(head, "th")}</tr></thead>'
+        f'<div class="card scroll{wide}" tabindex="0"><table>{title}<thead><tr>{cells(head, "th")}</tr></thead>'
         f"<tbody>{lines}</tbody></table></div>"
     )
 

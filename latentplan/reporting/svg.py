@@ -8,7 +8,7 @@ import itertools
 import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import matplotlib
 import numpy as np
@@ -26,7 +26,7 @@ DASHES = ("-", "--", "-.", ":", (0, (5, 1, 1, 1)), (0, (1, 1)))
 _THEMED = {INK: "var(--ink)", FAINT: "var(--faint)"} | {
     color: f"var(--series-{index + 1})" for index, color in enumerate(COLORS)
 }
-_STYLE = {
+_STYLE: Any = {
     "svg.fonttype": "none",
     "font.size": 9.0,
     "font.family": "sans-serif",
@@ -85,13 +85,14 @@ class Labels:
     marks: Sequence[tuple[str, float]] = field(default=())
 
 
-def plot_lines(lines: Sequence[Line], labels: Labels, *, large_x: bool = False) -> str:
+def plot_lines(lines: Sequence[Line], labels: Labels, *, large_x: bool = False, whole_x: bool = False) -> str:
     """Lines with their intervals, as SVG.
 
     Args:
         lines: The lines, at most six with a colour of their own.
         labels: Labels of the figure.
         large_x: Whether the x axis counts in thousands (k) and millions (M).
+        whole_x: Whether only whole numbers stand at the x axis.
     """
 
     def draw(axes: Axes) -> None:
@@ -105,11 +106,13 @@ def plot_lines(lines: Sequence[Line], labels: Labels, *, large_x: bool = False) 
                 axes.fill_between(line.x, line.low, line.high, color=color, alpha=0.2, lw=0)
         if large_x:
             axes.xaxis.set_major_formatter(EngFormatter(sep=""))
+        if whole_x:
+            axes.xaxis.set_major_locator(MaxNLocator(integer=True))
 
     return _draw(draw, labels)
 
 
-def plot_histogram(values: Sequence[tuple[str, ArrayLike]], labels: Labels, bins: ArrayLike) -> str:
+def plot_histogram(values: Sequence[tuple[str, ArrayLike]], labels: Labels, bins: Sequence[float]) -> str:
     """Histograms over each other, each with its name, as SVG."""
 
     def draw(axes: Axes) -> None:
@@ -157,7 +160,12 @@ def _draw(draw: Callable[[Axes], None], labels: Labels) -> str:
         handles, names = axes.get_legend_handles_labels()
         if names:
             columns = 3 if max(map(len, names)) < 14 else 2 if max(map(len, names)) < 24 else 1
-            figure.legend(handles, names, loc="outside upper left", ncols=columns, fontsize=8, handlelength=1.8)
+            legend = figure.legend(
+                handles, names, loc="outside upper left", ncols=columns, fontsize=8, handlelength=1.8
+            )
+            for handle in legend.legend_handles:
+                if handle is not None:
+                    handle.set_alpha(1.0)
         return _to_svg(figure, labels.alt)
 
 

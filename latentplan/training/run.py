@@ -27,14 +27,17 @@ from latentplan.agents.files import is_checkpoint
 from latentplan.config import USER_DOMAIN, Config, Device, EnvironmentFault, UserError, derive_seed
 from latentplan.config.commit import Save
 from latentplan.config.files import dump_config, read_config
-from latentplan.config.origin import describe_commit, describe_hardware, library_versions
+from latentplan.config.origin import present_facts
 from latentplan.config.run_folder import RUN_FILE, SAVES_FOLDER, lock_folder, read_run_config, run_saves
-from latentplan.config.run_results import METRICS_FILE, note_state
+from latentplan.config.run_results import METRICS_FILE, note_state, read_evaluations, read_facts
 from latentplan.envs import default_task
+from latentplan.evaluation.statistics import confidence_interval
 from latentplan.models import WorldModel
 from latentplan.models.fast import accelerate
 from latentplan.replay.buffer import Replay
 from latentplan.replay.disk import ReplayFiles, count_saved
+from latentplan.reporting.page import write_page
+from latentplan.reporting.report import ReportData, Returns, render_report
 from latentplan.training.callbacks import Collect, Record, copy_weights
 from latentplan.training.checks import check_folder, check_settings
 from latentplan.training.collection.collector import Description, EnvFactory
@@ -63,6 +66,7 @@ from latentplan.training.state import (
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
+REPORT_FILE = "report.html"
 DISK_ERRORS = (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EIO)  # of which some do not name a file
 
 
@@ -163,9 +167,8 @@ def _start(config: Config, folder: Path, make_env: EnvFactory | None, *, resume:
     """Runs until the end, an interruption or an error; goes back to the last save after too many skipped steps."""
     check_settings(config)
     with lock_folder(folder), Signals() as signals:
-        facts = {"command": shlex.join(sys.argv), "commit": describe_commit(), "version": __version__}
-        facts |= {"hardware": describe_hardware(config.run.device != "cpu" and torch.cuda.is_available())}
-        note_state(folder, "running", **facts, libraries=library_versions())
+        facts = present_facts(config.run.device != "cpu" and torch.cuda.is_available())
+        note_state(folder, "running", command=shlex.join(sys.argv), **facts)
         try:
             result = _run_until_end(config, folder, make_env, signals, resume=resume)
         except BaseException as error:
@@ -335,7 +338,9 @@ class _Run:
         clocks = save.clocks(self.learner)
         episodes = self.config.evaluation.final_episodes
         self.console.console.print(f"final evaluation: {episodes} episodes each of planner and actor")
-        returns = self._evaluate(self.learner.averaged, film if self.config.evaluation.video else None)
+        settings = self.config.evaluation
+        returns = self._evaluate(self.learner.averaged, film if settings.video else None, record=settings.report)
+        page = self._take_recording() if settings.report else None
         summary = {mode: float(np.mean(values)) for mode, values in returns.items()}
         info = clocks | {"final_evaluation": returns}
         (self.folder / "final.json").write_text(json.dumps(info | summary, indent=1))
@@ -352,13 +357,50 @@ class _Run:
         self.state.best_return = max(best, summary["planner"])
         self.state.set_minutes(clocks["minutes"])
         save.save_run(trainer, self.learner)
+        if page is not None:
+            self._write_report(returns, page, film)
         self.console.console.print(f"run folder: {self.folder}")
         return summary
 
-    def _evaluate(self, model: WorldModel, film: Path | None = None, actor: bool = True) -> dict[str, list[float]]:
+    def _take_recording(self) -> dict[str, Any] | None:
+        """What the worker recorded in the final evaluation; None if its process has ended."""
+        try:
+            self.worker.submit("take_recording")
+            taken: dict[str, Any] = self.worker.result()
+            return taken
+        except WorkerEnded as error:
+            self.collect.replace_worker(error)
+            return None
+
+    def _write_report(self, returns: Mapping[str, list[float]], page: Mapping[str, Any], film: Path) -> None:
+        """Writes the page of the run; an error becomes a warning, because the run itself is complete."""
+        env, deadline = self.config.env, self.config.planner.deadline_ms
+        deadlines = {"deadline of the search": deadline, "period of control": page["period_ms"]}
+        data = ReportData(
+            task=f"{env.domain}-{env.task}",
+            config=self.config,
+            returns=[Returns(mode, values, confidence_interval(values)) for mode, values in returns.items()],
+            film=film if film.exists() else None,
+            recording=page["recording"],
+            decision_ms=page["decision_ms"],
+            deadlines_ms={name: value for name, value in deadlines.items() if value is not None},
+            facts={"run folder": str(self.folder), **read_facts(self.folder), "renderer": self.description.renderer},
+        )
+        try:
+            data = replace(data, evaluations=read_evaluations(self.folder))
+            path = write_page(self.folder / REPORT_FILE, render_report(data))
+        except Exception as error:
+            warnings.warn(f"no report of the run: {error}", RuntimeWarning, stacklevel=1)
+        else:
+            self.console.console.print(f"report: {path}", soft_wrap=True)
+
+    def _evaluate(
+        self, model: WorldModel, film: Path | None = None, actor: bool = True, record: bool = False
+    ) -> dict[str, list[float]]:
+        episodes = self.config.evaluation.final_episodes
         returns: dict[str, list[float]] | None = None
         while returns is None:
-            self.worker.submit("evaluate", self.config.evaluation.final_episodes, film, copy_weights(model), actor)
+            self.worker.submit("evaluate", episodes, film, copy_weights(model), actor, record)
             try:
                 returns = self.worker.result()
             except WorkerEnded as error:
