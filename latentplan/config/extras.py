@@ -14,6 +14,9 @@ EXTRAS = {
     ),
     "bench": ("rliable",),
     "jax": ("jax",),
+    "wandb": ("wandb",),
+    "trackio": ("trackio",),
+    "mlflow": ("mlflow",),
 }
 """By extra, the modules that it installs and the package without extras does not."""
 

@@ -7,6 +7,7 @@ from pathlib import Path
 
 from latentplan.config import USER_DOMAIN, Config, PlannerConfig, UserError
 from latentplan.config.checks import shown
+from latentplan.config.extras import EXTRAS, require_extra
 from latentplan.config.parsing import raise_unknown
 from latentplan.config.quantities import TASK_PREFIX, scales
 from latentplan.config.suites import DEFAULT_SUITE, check_task
@@ -24,6 +25,9 @@ def check_settings(config: Config) -> None:
     check_run(config)
     if config.run.run_dir is not None:
         check_folder(config.run.run_dir)
+    for name in config.run.logger:
+        if name in EXTRAS:
+            require_extra(f"the logger {name}", *EXTRAS[name])
     env, learning = config.env, config.learning
     if env.domain != USER_DOMAIN:
         check_task(env.suite, env.domain, env.task)

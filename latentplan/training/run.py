@@ -9,6 +9,7 @@ import logging
 import math
 import shlex
 import sys
+import uuid
 import warnings
 from dataclasses import dataclass, replace
 from datetime import datetime
@@ -18,7 +19,6 @@ from typing import TYPE_CHECKING, Any
 import lightning
 import numpy as np
 import torch
-from lightning.pytorch.loggers import TensorBoardLogger
 from lightning.pytorch.utilities.exceptions import SIGTERMException
 
 from latentplan import __version__
@@ -62,6 +62,7 @@ from latentplan.training.state import (
     restore_metrics,
     warn_of_loss,
 )
+from latentplan.training.trackers import Trackers
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -168,7 +169,8 @@ def _start(config: Config, folder: Path, make_env: EnvFactory | None, *, resume:
     check_settings(config)
     with lock_folder(folder), Signals() as signals:
         facts = present_facts(config.run.device != "cpu" and torch.cuda.is_available())
-        note_state(folder, "running", command=shlex.join(sys.argv), **facts)
+        run_id = read_facts(folder).get("run_id") or uuid.uuid4().hex[:8]
+        note_state(folder, "running", run_id=run_id, command=shlex.join(sys.argv), **facts)
         try:
             result = _run_until_end(config, folder, make_env, signals, resume=resume)
         except BaseException as error:
@@ -212,6 +214,7 @@ class _Run:
         self, config: Config, folder: Path, make_env: EnvFactory | None, signals: Signals, *, resume: bool
     ) -> None:
         self.config, self.folder, self.signals = config, folder, signals
+        self.trackers: Trackers | None = None
         self.saves = run_saves(folder)
         self.saves.remove_leftovers()
         save = self._find_save() if resume else None
@@ -268,6 +271,8 @@ class _Run:
         try:
             return self._execute()
         finally:
+            if self.trackers is not None:
+                self.trackers.close()
             self.worker.close()
 
     def _execute(self) -> Result:
@@ -281,7 +286,9 @@ class _Run:
         facts = self._agent_facts()
         save = SaveRun(self.folder, config, collect, state, self.saves, self.files, facts, optimizers)
         stop = Stop(config, state, self.signals)
-        record = Record(self.folder / METRICS_FILE, state, collect, self.console)
+        run_id = read_facts(self.folder)["run_id"]
+        self.trackers = Trackers(config.run.logger, self.folder, config, run_id)
+        record = Record(self.folder / METRICS_FILE, state, collect, self.console, self.trackers)
         callbacks = [collect, self.curriculum, record, Guard(self.folder), save, stop]
         trainer = self._trainer([Restore(optimizers), *callbacks])
         copy = self.saves.find(RUN_FILE)
@@ -295,7 +302,7 @@ class _Run:
                 with contextlib.suppress(Stopped):
                     if not state.interrupted:
                         collect.complete()
-                record.write_evaluations(trainer)
+                record.write_evaluations()
                 save.keep_best(self.learner)
                 save.save(trainer, self.learner)
             with contextlib.suppress(Stopped):
@@ -327,7 +334,7 @@ class _Run:
             devices=1,
             max_epochs=-1,
             callbacks=callbacks,
-            logger=TensorBoardLogger(self.folder, name="tensorboard", version=""),
+            logger=False,  # `Record` writes the trackers
             enable_checkpointing=False,
             enable_progress_bar=False,
             enable_model_summary=False,
@@ -357,6 +364,8 @@ class _Run:
         self.state.best_return = max(best, summary["planner"])
         self.state.set_minutes(clocks["minutes"])
         save.save_run(trainer, self.learner)
+        if self.trackers is not None:
+            self.trackers.log_film(film, step=clocks["env_frames"])
         if page is not None:
             self._write_report(returns, page, film)
         self.console.console.print(f"run folder: {self.folder}")
