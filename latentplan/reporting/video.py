@@ -161,7 +161,7 @@ def encode_gif(frames: Sequence[Frame], frame_ms: int) -> tuple[bytes, tuple[int
     """
     animation = cv2.Animation()
     animation.frames = [cv2.resize(frame[..., ::-1], None, fx=0.5, fy=0.5) for frame in frames]
-    animation.durations = np.full(len(frames), frame_ms, np.int32)
+    animation.durations = [frame_ms] * len(frames)
     _, data = cv2.imencodeanimation(".gif", animation)
     height, width = animation.frames[0].shape[:2]
     return data.tobytes(), (height, width)

@@ -84,7 +84,7 @@ class Trackers:
         shows = [logger for logger in self.loggers if not isinstance(logger, CSVLogger)]
         if not path.exists() or not shows:
             return
-        strip = tile([np.stack(pair) for pair in np.array_split(read_frames(path, STRIP_FRAMES), 2)])
+        strip = tile(np.array_split(np.stack(read_frames(path, STRIP_FRAMES)), 2))
         self._each(lambda logger: _log_film(logger, path, strip, step))
 
     def close(self) -> None:
@@ -131,8 +131,8 @@ def _make_mlflow(run: str, folder: Path, settings: Mapping[str, Any]) -> MLFlowL
     noted = folder / "mlflow-run.txt"
     known = noted.read_text().strip() if noted.exists() else None
     address = os.environ.get("MLFLOW_TRACKING_URI") or f"sqlite:///{(folder / 'mlflow.db').resolve()}"
-    places = {} if "MLFLOW_TRACKING_URI" in os.environ else {"artifact_location": str((folder / "mlflow").resolve())}
-    logger = MLFlowLogger(PROJECT, run_name=run, tracking_uri=address, run_id=known, **places)
+    place = None if "MLFLOW_TRACKING_URI" in os.environ else str((folder / "mlflow").resolve())
+    logger = MLFlowLogger(PROJECT, run_name=run, tracking_uri=address, run_id=known, artifact_location=place)
     if known is None:
         logger.log_hyperparams(dict(settings))
         noted.write_text(str(logger.run_id))
