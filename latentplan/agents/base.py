@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Sequence
-from typing import Any, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 import torch
@@ -48,6 +48,20 @@ class Agent(Protocol):
     def seed(self, seed: int) -> None:
         """Restarts the agent's own random stream."""
         ...
+
+
+class Imagined(NamedTuple):
+    """Imagined rollouts.
+
+    Attributes:
+        pictures: The decoded state after each step, uint8 (rollout, step, 32, 32, 3).
+        rewards: The predicted reward of each step, float32 (rollout, step).
+        actions: The action of each step, float32 (rollout, step, action).
+    """
+
+    pictures: np.ndarray
+    rewards: np.ndarray
+    actions: np.ndarray
 
 
 class ModelAgent:
@@ -183,6 +197,45 @@ class ModelAgent:
     def imagine(self) -> np.ndarray | None:
         """The decoded last state of the first environment's plan, uint8 (32, 32, 3); None without a plan."""
         return None
+
+    @torch.no_grad()
+    def actor_action(self) -> np.ndarray:
+        """The actor's action at the first environment's latest frame, float32 (action,), whatever the agent did."""
+        assert self.state is not None, "actor_action() needs a frame before it"
+        return self._act_by_actor(self.state)[0].float().cpu().numpy()
+
+    @torch.no_grad()
+    def surprise(self) -> float:
+        """The surprise of the first environment's latest frame in nats, mean over turns; see `WorldModel.surprise`."""
+        assert self.state is not None, "surprise() needs a frame before it"
+        return float(mean_over_turns(self._frame_functions.surprise(flat(self.state)), self.state)[0])
+
+    def belief(self) -> State:
+        """The belief about the first environment's latest frame, unrotated: `deter` (1, deter), `stoch` (1, latent)."""
+        assert self.state is not None, "belief() needs a frame before it"
+        return State(*(part[:1].float() for part in first_turn(self.state)))
+
+    @torch.no_grad()
+    def imagine_along(self, beliefs: Sequence[State], actions: np.ndarray | None, steps: int) -> Imagined:
+        """Rollouts of the model from beliefs, in pictures.
+
+        Args:
+            beliefs: Results of `belief`, one for each rollout, or a single one for all of them.
+            actions: Actions (rollout, step, action); None lets the actor act in each rollout.
+            steps: Model steps.
+        """
+        num = len(beliefs) if actions is None else len(actions)
+        state = State(*(torch.cat(parts) for parts in zip(*beliefs, strict=True)))
+        state = State(*(part.expand(num, -1).contiguous() for part in state))
+        given = None if actions is None else torch.as_tensor(actions, dtype=torch.float32, device=self.model.device)
+        pictures, rewards, taken = [], [], []
+        for step in range(steps):
+            action = self.model.policy(state).float() if given is None else given[:, step]
+            state, reward = self.model.step(state, action)
+            pictures.append(self.model.decoder.picture(state.features.float()).cpu().numpy())
+            rewards.append(reward.float().cpu().numpy())
+            taken.append(action.cpu().numpy())
+        return Imagined(*(np.stack(parts, axis=1) for parts in (pictures, rewards, taken)))
 
     def _replace_actions(self, actions: np.ndarray) -> np.ndarray:
         """The actions (batch, action), in which rows that are not finite hold the row's last action, or zeros."""

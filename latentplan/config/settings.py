@@ -9,7 +9,7 @@ import dataclasses
 from dataclasses import dataclass, field
 from typing import Any, Literal, get_args
 
-from latentplan.config.checks import MAX_EPISODES, MAX_THREADS, UserError, above_zero, at_least, one_of, within
+from latentplan.config.checks import MAX_EPISODES, MAX_THREADS, UserError, above_zero, at_least, one_of, shown, within
 from latentplan.config.learning import CollectionConfig, LearningConfig
 from latentplan.config.parsing import option
 from latentplan.config.planner import PlannerConfig
@@ -26,6 +26,7 @@ RENDER_QUALITIES = get_args(RenderQuality)
 FLOORS = get_args(Floor)
 DEVICES = get_args(Device)
 PIXELS = get_args(Pixels)
+LOGGERS = ("tensorboard", "csv", "wandb", "trackio", "mlflow")
 MAX_REPEAT = 10_000  # ten of the longest episodes of dm_control
 MAX_ENVS = 1024
 MAX_CAMERA = 1000
@@ -144,12 +145,14 @@ class EvaluationConfig:
         episodes: Episodes of the planner, and of the actor from the same starts, per evaluation during training.
         final_episodes: Episodes of the evaluation at the end of a run.
         video: Whether each evaluation films its first episode.
+        report: Whether a run writes `report.html` into its folder after the final evaluation.
     """
 
     every_frames: int = 10_000
     episodes: int = 2
     final_episodes: int = 10
     video: bool = True
+    report: bool = True
 
     def __post_init__(self) -> None:
         at_least(self, every_frames=1)
@@ -168,6 +171,7 @@ class RunConfig:
         threads: CPU threads for each half of an update (model and behaviour learn in parallel), in [1, 1024]; None
             divides all cores but one between the halves and leaves one to collection.
         run_dir: Folder of the run; None makes `runs/<domain>-<task>-seed<seed>-<date>`.
+        logger: Trackers that get scalars and films: tensorboard, csv, wandb, trackio, mlflow.
     """
 
     frames: int | None = None
@@ -176,9 +180,13 @@ class RunConfig:
     device: Device = "auto"
     threads: int | None = None
     run_dir: str | None = None
+    logger: tuple[str, ...] = option(("tensorboard",), separator=",")
 
     def __post_init__(self) -> None:
         one_of(self, device=DEVICES)
+        for name in self.logger:
+            if name not in LOGGERS:
+                raise ValueError(f"logger must be of {', '.join(LOGGERS)}, got {shown(name)}")
         at_least(self, seed=0)
         above_zero(self, "frames", "minutes")
         if self.threads is not None:

@@ -18,6 +18,7 @@ from latentplan.config import Config
 from latentplan.config.commit import Extent, Saves
 from latentplan.config.files import dump_config
 from latentplan.config.run_folder import RUN_FILE
+from latentplan.config.run_results import METRICS_FILE
 from latentplan.models import WorldModel
 from latentplan.replay.disk import ReplayFiles
 from latentplan.training.callbacks import Collect
@@ -25,7 +26,7 @@ from latentplan.training.collection.episodes import to_tensors
 from latentplan.training.learner.optimization import load_optimizer_state
 from latentplan.training.learner.skips import LONGEST_STREAK, NotFiniteError
 from latentplan.training.signals import Signals
-from latentplan.training.state import METRICS_FILE, RunState, SavedRun, write_state
+from latentplan.training.state import RunState, SavedRun, write_state
 
 if TYPE_CHECKING:
     from latentplan.training.learner.module import Learner

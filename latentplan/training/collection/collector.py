@@ -27,7 +27,7 @@ from latentplan.envs import make_vector_env
 from latentplan.envs.faults import FrameCheck
 from latentplan.envs.registry import USERS_RENDERER, describe_renderer
 from latentplan.envs.vector import Restarts, make_guarded_env
-from latentplan.evaluation.episodes import OnStep, episode_seed, run_episodes
+from latentplan.evaluation.episodes import OnStep, Step, episode_seed, run_episodes
 from latentplan.evaluation.statistics import Episode
 from latentplan.models import WorldModel
 from latentplan.models.fast import accelerate
@@ -35,6 +35,7 @@ from latentplan.models.heads import LARGEST_SCALAR
 from latentplan.models.symmetry import first_turn
 from latentplan.replay.buffer import Rows
 from latentplan.reporting.film import filming_if_possible
+from latentplan.reporting.recorder import EpisodeRecorder, GuardedRecorder
 from latentplan.training.collection.episodes import Episodes, Stopped, to_arrays, to_tensors
 
 TIMED_FRAMES = 5
@@ -150,6 +151,8 @@ class Collector:
         self._check_frames = FrameCheck(config.env.num_envs)
         self._has_seen_end = False  # an episode ended in a terminal state
         self._current_agent: ModelAgent | RandomAgent | None = None
+        self._recorder: GuardedRecorder | None = None
+        self._decision_ms = np.zeros(0)
         self.should_stop: Callable[[], bool] = lambda: False
 
     def describe(self) -> Description:
@@ -265,6 +268,7 @@ class Collector:
         film: Path | None = None,
         weights: dict[str, np.ndarray] | None = None,
         actor: bool = True,
+        record: bool = False,
     ) -> dict[str, list[float]]:
         """Returns of planner and actor, without exploration, in episodes with the same starts.
 
@@ -273,6 +277,7 @@ class Collector:
             film: Path of a film of the planner's first episode, or None. A film that cannot be written gives a warning.
             weights: State of the world model; None keeps the weights of the last round.
             actor: Whether the actor is evaluated too.
+            record: Whether the planner's first episode is recorded, for `take_recording`.
 
         Returns:
             One return per episode, under "planner" and, with `actor`, under "actor".
@@ -283,14 +288,35 @@ class Collector:
         seeds = [episode_seed(stream, index) for index in range(episodes)]
         planner = self._evaluation_agents["planner"]
         with contextlib.ExitStack() as stack:
-            on_step = None
+            watchers: list[OnStep] = []
             if film is not None:
                 every = -(-(self._decisions or 0) // FILMED_FRAMES) or 1
-                on_step = stack.enter_context(filming_if_possible(film, self._eval_env, planner, every=every))
-            played = {"planner": self._play(planner, seeds, on_step)}
+                watchers.append(stack.enter_context(filming_if_possible(film, self._eval_env, planner, every=every)))
+            if record:
+                self._recorder = GuardedRecorder(EpisodeRecorder(planner, self._decisions))
+                watchers.append(self._recorder)
+
+            def watch(step: Step) -> None:
+                for watcher in watchers:
+                    watcher(step)
+
+            played = {"planner": self._play(planner, seeds, watch if watchers else None)}
+            self._decision_ms = np.concatenate([episode.decision_ms for episode in played["planner"]])
         if actor:
             played["actor"] = self._play(self._evaluation_agents["actor"], seeds)
         return {mode: [episode.total_return for episode in rollouts] for mode, rollouts in played.items()}
+
+    def take_recording(self) -> dict[str, Any]:
+        """What a report shows of the latest evaluation that was recorded.
+
+        Returns:
+            `recording` (None where nothing was recorded), `decision_ms` (decision,) of the planner, and `period_ms`,
+            the time between two decisions in the simulated world (None where it is not known).
+        """
+        recording = None if self._recorder is None else self._recorder.recording
+        rate = self._eval_env.metadata.get("render_fps")
+        self._recorder = None
+        return {"recording": recording, "decision_ms": self._decision_ms, "period_ms": 1000.0 / rate if rate else None}
 
     def close(self) -> None:
         """Ends simulators and their processes."""
