@@ -38,6 +38,7 @@ from latentplan.reporting.film import filming_if_possible
 from latentplan.training.collection.episodes import Episodes, Stopped, to_arrays, to_tensors
 
 TIMED_FRAMES = 5
+TRIES = 2  # of the environment before a run starts
 FILMED_FRAMES = 250
 CLOSING_SECONDS = 5.0
 
@@ -151,10 +152,7 @@ class Collector:
     def describe(self) -> Description:
         """Facts of the environment that the learner needs; renders a few frames to time them."""
         env = self._eval_env
-        with warnings.catch_warnings():  # a fault ends the run before it starts, so no restart needs a warning
-            warnings.simplefilter("ignore", RuntimeWarning)
-            env.reset(seed=0)
-            env.step(np.zeros(self.model.action_dim, np.float32))
+        self._try_environment()
         draw = partial(env.render_large, FRAME_SIZE) if self.config.env.pixels == "render" else env.render
         started = time.perf_counter()
         for _ in range(TIMED_FRAMES):
@@ -163,6 +161,23 @@ class Collector:
         facts = describe_renderer(self.config.env) if self._make_user_env is None else USERS_RENDERER
         renderer = {name: str(value) for name, value in facts.items()}
         return Description(self.model.action_dim, self.discount, render_ms, renderer, self.labels)
+
+    def _try_environment(self) -> None:
+        """Resets and steps once, so that a mistake of the environment ends the run before it starts.
+
+        Raises:
+            EnvironmentFault: The environment failed twice; a single failure costs a restart.
+        """
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", RuntimeWarning)  # of the restart
+            for seed in range(TRIES):
+                try:
+                    self._eval_env.reset(seed=seed)
+                    self._eval_env.step(np.zeros(self.model.action_dim, np.float32))
+                    return
+                except EnvironmentFault:
+                    if seed == TRIES - 1:
+                        raise
 
     def collect(
         self,
