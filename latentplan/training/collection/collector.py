@@ -39,6 +39,7 @@ from latentplan.reporting.recorder import EpisodeRecorder, GuardedRecorder
 from latentplan.training.collection.episodes import Episodes, Stopped, to_arrays, to_tensors
 
 TIMED_FRAMES = 5
+TRIES = 2  # of the environment before a run starts
 FILMED_FRAMES = 250
 CLOSING_SECONDS = 5.0
 
@@ -158,10 +159,7 @@ class Collector:
     def describe(self) -> Description:
         """Facts of the environment that the learner needs; renders a few frames to time them."""
         env = self._eval_env
-        with warnings.catch_warnings():  # a fault ends the run before it starts, so no restart needs a warning
-            warnings.simplefilter("ignore", RuntimeWarning)
-            env.reset(seed=0)
-            env.step(np.zeros(self.model.action_dim, np.float32))
+        self._try_environment()
         config = self.config.env
         draw = partial(env.render_large, config.frame_size) if config.pixels == "render" else env.render
         started = time.perf_counter()
@@ -171,6 +169,23 @@ class Collector:
         facts = describe_renderer(self.config.env) if self._make_user_env is None else USERS_RENDERER
         renderer = {name: str(value) for name, value in facts.items()}
         return Description(self.model.action_dim, self.discount, render_ms, renderer, self.labels, self.spaces)
+
+    def _try_environment(self) -> None:
+        """Resets and steps once, so that a mistake of the environment ends the run before it starts.
+
+        Raises:
+            EnvironmentFault: The environment failed twice; a single failure costs a restart.
+        """
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", RuntimeWarning)  # of the restart
+            for seed in range(TRIES):
+                try:
+                    self._eval_env.reset(seed=seed)
+                    self._eval_env.step(np.zeros(self.model.action_dim, np.float32))
+                    return
+                except EnvironmentFault:
+                    if seed == TRIES - 1:
+                        raise
 
     def collect(
         self,

@@ -1,5 +1,6 @@
 """A run survives environments that fail, up to a budget; then it saves and stops."""
 
+import contextlib
 import csv
 import json
 import shutil
@@ -61,16 +62,17 @@ def test_round_that_fails_too_often_returns_what_it_collected(collect):
 
 
 class Late(Faulty):
-    """Fails from its first step or reset on, but not at the reset with seed 0, with which a run times the pictures."""
+    """Fails from its first step or reset on, but not in the episode of seed 0, in which a run tries the environment."""
 
     def reset(self, *, seed=None, options=None):
+        self.is_tried = seed == 0
         if self.kind == "reset" and seed == 0:
             self.steps, self.start = 0, 0
             return self.picture(), {}
         return super().reset(seed=seed, options=options)
 
     def step(self, action):
-        if self.kind != "reset" and self.is_due():
+        if self.kind != "reset" and not self.is_tried and self.is_due():
             raise ZeroDivisionError("no step")
         return super().step(action)
 
@@ -85,6 +87,14 @@ def test_run_that_fails_before_its_first_decision_says_why_and_can_be_resumed(ki
     saved = read_state(tmp_path / "run")
     assert saved["run"]["rounds"] == 0 and saved["requests"]["collect"]["counter"] == 0  # asked for again
     assert resume(tmp_path / "run", make_env=dot).exit_code == 0
+
+
+@pytest.mark.parametrize(("times", "is_refused"), [(1, False), (99, True)])
+def test_run_starts_unless_the_environment_fails_twice(times, is_refused, tiny, tmp_path):
+    collector = Collector(tiny("", collection={"max_restarts": 5}), partial(Faulty, "reset", tmp_path, times), "cpu")
+    with pytest.raises(EnvironmentFault, match="no start") if is_refused else contextlib.nullcontext():
+        assert collector.describe().action_dim == 1
+    collector.close()
 
 
 def test_round_that_fails_too_often_ends_its_episodes(tiny, faulty, recwarn):
