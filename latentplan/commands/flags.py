@@ -55,6 +55,8 @@ class Flag:
         shown = "|".join(self.setting.choices) or _METAVARS.get(getattr(kind, "__origin__", kind), "VALUE")
         if "separator" in self.setting.options:
             shown = self.setting.options["separator"].join(["A", "B", "..."])
+        if "several" in self.setting.options:
+            shown = "NAME"  # argparse adds dots
         return str(self.setting.options.get("metavar", shown))
 
     @property
@@ -162,13 +164,14 @@ class _Parser(argparse.ArgumentParser):
         )
         for flag in flags:
             join = flag.setting.options.get("join")
+            several = {"nargs": "+"} if flag.setting.options.get("several") else {}
             self.add_argument(
                 *flag.names,
                 dest=flag.setting.key,
                 metavar=flag.metavar,
                 default=argparse.SUPPRESS,
                 help=flag.help.replace("%", "%%"),
-                **({"action": _Join, "const": join} if join else {}),
+                **({"action": _Join, "const": join} if join else several),
             )
 
     def error(self, message: str) -> Any:
@@ -222,6 +225,9 @@ def _read_texts(flags: Sequence[Flag], argv: Sequence[str]) -> dict[str, Any]:
         separator = flag.setting.options.get("separator")
         if separator and flag.setting.key in texts:
             texts[flag.setting.key] = _split(flag.names[0], texts[flag.setting.key], separator)
+        if flag.setting.options.get("several") and flag.setting.key in texts:
+            words = texts[flag.setting.key]
+            texts[flag.setting.key] = words[0] if len(words) == 1 and words[0].startswith("[") else words
     return texts
 
 

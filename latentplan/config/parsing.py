@@ -66,8 +66,9 @@ def option(default: Any = dataclasses.MISSING, **options: Any) -> Any:
         default: The default; without one the flag must be given.
         options: `choices` (a function that returns the allowed words, for text), `metavar` (the placeholder for the
             value in `--help`), `join` (text between the values of a repeated flag), `separator` (text between the items
-            of a tuple), `is_output` (the flag names a file to be written), `is_rare` (only `--help-all` shows the flag)
-            and `is_last` (`--help` shows the flag after the others).
+            of a tuple), `several` (the items of a tuple are words of their own), `is_output` (the flag names a file to
+            be written), `is_rare` (only `--help-all` shows the flag) and `is_last` (`--help` shows the flag after the
+            others).
     """
     return dataclasses.field(default=default, metadata=options)
 

@@ -12,6 +12,7 @@ from typing import Any, Literal, get_args
 from latentplan.config.checks import MAX_EPISODES, MAX_THREADS, UserError, above_zero, at_least, one_of, within
 from latentplan.config.learning import CollectionConfig, LearningConfig
 from latentplan.config.planner import PlannerConfig
+from latentplan.config.parsing import option
 from latentplan.config.removed import drop_removed
 from latentplan.config.spaces import FRAME_SIZES, MOST_CAMERAS, check_frame_size
 
@@ -61,9 +62,9 @@ class EnvConfig:
     num_envs: int = 1
     objective: str | None = None
     suite: str = "dm_control"
-    cameras: tuple[str, ...] = ()
+    cameras: tuple[str, ...] = option((), several=True)
     frame_size: int = FRAME_SIZES[0]
-    vectors: tuple[str, ...] = ()
+    vectors: tuple[str, ...] = option((), several=True)
 
     def __post_init__(self) -> None:
         check_frame_size(self.frame_size)
