@@ -258,7 +258,8 @@ def _read_texts(flags: Sequence[Flag], argv: Sequence[str]) -> dict[str, Any]:
         separator = flag.setting.options.get("separator")
         if separator and flag.setting.key in texts:
             text = separator.join(texts[flag.setting.key])
-            texts[flag.setting.key] = _split(flag.names[0], text, separator)
+            is_yaml = text.startswith("[")  # a list as YAML writes it
+            texts[flag.setting.key] = text if is_yaml else _split(flag.names[0], text, separator)
     return texts
 
 

@@ -72,9 +72,9 @@ class EnvConfig:
     suite: str = "dm_control"
     kwargs: str = option("{}", metavar="JSON")
     pixels: Pixels = "observation"
-    cameras: tuple[str, ...] = ()
+    cameras: tuple[str, ...] = option((), separator=",")
     frame_size: int = FRAME_SIZES[0]
-    vectors: tuple[str, ...] = ()
+    vectors: tuple[str, ...] = option((), separator=",")
 
     def __post_init__(self) -> None:
         read_kwargs(self.kwargs)

@@ -57,7 +57,7 @@ def test_background_agent_chooses_categories(checkpoint, film):
 
 def test_description_names_the_choices_and_refuses_others(checkpoint, tmp_path):
     info = json.loads((checkpoint / "info.json").read_text())
-    assert info["spaces"] == {"choices": [0, 4]}
+    assert info["spaces"]["choices"] == [0, 4]
     for spaces, message in (({"choices": [0, 5]}, "does not fit"), ({"other": 1}, "does not fit"), (3, "dictionary")):
         (tmp_path / "info.json").write_text(json.dumps(info | {"spaces": spaces}))
         (tmp_path / "weights.safetensors").write_bytes((checkpoint / "weights.safetensors").read_bytes())

@@ -202,3 +202,24 @@ def fuzz(seed, rounds):
                 assert isinstance(read_request(request, argv), request)
             except UserError as error:
                 assert str(error)
+
+
+@dataclass
+class Viewing:
+    """What an agent sees.
+
+    Attributes:
+        cameras: Names.
+        seed: Seed.
+    """
+
+    cameras: tuple[str, ...] = option((), separator=",")
+    seed: int = 0
+
+
+@pytest.mark.parametrize("words", [["0", "left"], ["0,left"], ['["0", "left"]']])
+def test_several_words_are_the_items_of_a_flag(words):
+    for line in (["--cameras", *words, "--seed", "3"], ["--seed", "3", "--cameras", *words]):
+        assert read_request(Viewing, line) == Viewing(("0", "left"), 3)
+    with pytest.raises(UserError, match="--cameras needs a value"):
+        read_request(Viewing, ["--cameras", "--seed", "3"])
