@@ -11,8 +11,8 @@ from typing import Any, Literal, get_args
 
 from latentplan.config.checks import MAX_EPISODES, MAX_THREADS, UserError, above_zero, at_least, one_of, within
 from latentplan.config.learning import CollectionConfig, LearningConfig
-from latentplan.config.planner import PlannerConfig
 from latentplan.config.parsing import option
+from latentplan.config.planner import PlannerConfig
 from latentplan.config.removed import drop_removed
 from latentplan.config.spaces import FRAME_SIZES, MOST_CAMERAS, check_frame_size
 
