@@ -13,10 +13,7 @@ from latentplan.config.checks import MAX_EPISODES, MAX_THREADS, UserError, above
 from latentplan.config.learning import CollectionConfig, LearningConfig
 from latentplan.config.parsing import option
 from latentplan.config.planner import PlannerConfig
-<<<<<<< HEAD
 from latentplan.config.reading import read_kwargs
-=======
->>>>>>> spaces
 from latentplan.config.removed import drop_removed
 from latentplan.config.spaces import FRAME_SIZES, MOST_CAMERAS, check_frame_size
 
