@@ -8,7 +8,8 @@ from torch import Tensor
 from latentplan.agents.base import ModelAgent
 from latentplan.config import Config
 from latentplan.models import State, WorldModel
-from latentplan.models.heads import sample_action
+from latentplan.models.encoder import Observation
+from latentplan.models.heads import MixedActor, sample_action
 from latentplan.models.symmetry import mean_over_turns
 
 
@@ -37,7 +38,9 @@ class ActorAgent(ModelAgent):
         super().__init__(model, config, noise_correlation=noise_correlation, seed=seed)
         self.explore = explore
 
-    def _infer(self, state: State, action: Tensor | None, frames: Tensor, is_first: Tensor | None) -> State:
+    def _infer(
+        self, state: State, action: Tensor | None, frames: Tensor | Observation, is_first: Tensor | None
+    ) -> State:
         belief, self._mean, self._std = self._frame_functions.infer_and_act(state, action, frames, is_first)
         return belief
 
@@ -45,5 +48,8 @@ class ActorAgent(ModelAgent):
         mean = mean_over_turns(self._mean, state)
         if not self.explore:
             return mean
+        if isinstance(self.model.actor, MixedActor):
+            noise = self.noise.draw(mean, self.generator, self._is_reset)
+            return self.model.actor.sample(state.features, noise)
         std = mean_over_turns(self._std, state)
         return sample_action(mean, std, self.noise.draw(mean, self.generator, self._is_reset))

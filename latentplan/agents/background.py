@@ -12,11 +12,12 @@ import torch
 from torch import Tensor
 
 from latentplan.agents.base import ModelAgent
+from latentplan.agents.planning import make_search
 from latentplan.config import Config, PlannerConfig
 from latentplan.models import State, WorldModel
 from latentplan.models.symmetry import TurnedModel
 from latentplan.objectives.expression import Expression
-from latentplan.planning import BackgroundPlanner, Plan, PlanExecutor, Planner, PlanScheduler, make_planner
+from latentplan.planning import BackgroundPlanner, Plan, PlanExecutor, Planner, PlanScheduler
 from latentplan.planning.objectives import Constraint, Term
 
 
@@ -77,7 +78,7 @@ class BackgroundAgent(ModelAgent):
     ) -> None:
         super().__init__(model, config, seed=seed)
         settings = planner or config.planner
-        search = make_planner(settings.method, settings, action_dim=model.action_dim, discount=discount)
+        search = make_search(model, settings, discount)
         if make_executor is None:
             executor: PlanExecutor = BackgroundPlanner(LatentPlanner(search), self.imagined, worker=worker)
         else:

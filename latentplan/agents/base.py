@@ -4,20 +4,30 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Sequence
-from typing import Any, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from latentplan.config import Config
+from latentplan.config import Config, UserError
 from latentplan.models import State, WorldModel
 from latentplan.models.backend import FrameFunctions
+from latentplan.models.encoder import Observation
+from latentplan.models.heads import MixedActor
 from latentplan.models.symmetry import TurnedModel, first_turn, flat, folded, mean_over_turns, per_turn, turned
 from latentplan.objectives.expression import Expression
 from latentplan.objectives.objective import build_goals, read_goal_image
 from latentplan.planning import Planner
 from latentplan.planning.objectives import Constraint, Term
+
+Seen = np.ndarray | tuple[np.ndarray, np.ndarray]
+"""A frame, or a frame and the numbers beside it, float32 (vector,); a batch of both has the rows in front."""
+
+
+def frame_of(seen: Seen) -> np.ndarray:
+    """The frame, or the batch of frames, of what an agent sees."""
+    return seen[0] if isinstance(seen, tuple) else seen
 
 
 class Agent(Protocol):
@@ -27,8 +37,8 @@ class Agent(Protocol):
     an older plan) or "actor". The actions of an agent without the attribute are counted as "actor".
     """
 
-    def act(self, frame: np.ndarray) -> np.ndarray:
-        """The action, float32 (action,), for a frame, uint8 (height, width, channel)."""
+    def act(self, frame: Seen) -> np.ndarray:
+        """The action, float32 (action,), for a frame, uint8 (height, width, channel), perhaps with vectors."""
         ...
 
     def reset(self) -> None:
@@ -40,8 +50,24 @@ class Agent(Protocol):
         ...
 
 
+class Imagined(NamedTuple):
+    """Imagined rollouts.
+
+    Attributes:
+        pictures: The decoded state after each step, uint8 (rollout, step, 32, 32, 3).
+        rewards: The predicted reward of each step, float32 (rollout, step).
+        actions: The action of each step, float32 (rollout, step, action).
+    """
+
+    pictures: np.ndarray
+    rewards: np.ndarray
+    actions: np.ndarray
+
+
 class ModelAgent:
     """An agent with a world model: keeps a belief about each environment, from which subclasses choose the action.
+
+    Frames have another shape than (64, 64, 3) where `model.spaces` says so.
 
     The agent turns one frame (64, 64, 3) into one action (action,), or a batch with one frame of each environment
     (batch, 64, 64, 3) into actions (batch, action). The belief is a state of the world model at the posterior's mean.
@@ -60,7 +86,8 @@ class ModelAgent:
     Args:
         model: The world model; the agent puts it into evaluation mode and does not change its weights.
         config: Settings the model was trained with.
-        noise_std: Standard deviation of Gaussian noise added to each action, for exploration.
+        noise_std: Standard deviation of Gaussian noise added to each action, for exploration; of numbers that stand for
+            a category, the probability that the category is drawn anew, all being equally likely.
         noise_correlation: Correlation of this noise between one decision and the next, in [0, 1).
         seed: Seed of the agent's own random stream.
     """
@@ -129,11 +156,13 @@ class ModelAgent:
         self._is_reset = None if is_reset is None else is_reset.to(device)
         self.noise.last = None if noise is None else noise.to(device)
 
-    def act(self, frame: np.ndarray) -> np.ndarray:
+    def act(self, frame: Seen) -> np.ndarray:
         """The action for a new frame.
 
         Args:
-            frame: uint8 (64, 64, 3), or (batch, 64, 64, 3) with one frame of each environment.
+            frame: uint8 (64, 64, 3), or (batch, 64, 64, 3) with one frame of each environment. An agent that learned
+                with `env.vectors` takes a pair: the frame, and `info["vectors"]` of the environment, (vector,) or
+                (batch, vector).
 
         Returns:
             The action in [-1, 1], float32 (action,) or (batch, action). It is always finite: where the weights
@@ -142,15 +171,15 @@ class ModelAgent:
         Raises:
             ValueError: The frame has another shape or dtype, or the batch changed without a reset.
         """
-        single = frame.ndim == 3
+        single = frame_of(frame).ndim == 3
         with self._without_gradients():
-            frames = self._check_frames(frame[None] if single else frame)
+            frames = self._check_seen(frame, single)
             self._frame_functions = self.model.backend.frame_functions(self.model)
             state = self._update_belief(frames)
             action = self._choose(state)
             if self.noise_std > 0.0:
                 noise = self.noise.draw(action, self.generator, self._is_reset)
-                action = (action + self.noise_std * noise).clamp(-1.0, 1.0)
+                action = self._explore(action, noise)
             result = action.float().cpu().numpy()
             if not np.isfinite(result).all():
                 result = self._replace_actions(result)
@@ -159,15 +188,54 @@ class ModelAgent:
         return result[0] if single else result
 
     @torch.no_grad()
-    def encode(self, frame: np.ndarray) -> np.ndarray:
+    def encode(self, frame: Seen) -> np.ndarray:
         """The latent of a frame at the first moment of an episode, float32 (32,), or (batch, 32) for several frames."""
-        single = frame.ndim == 3
-        latent = self._encode_frames(self._check_frames(frame[None] if single else frame)).cpu().numpy()
+        single = frame_of(frame).ndim == 3
+        latent = self._encode_frames(self._check_seen(frame, single)).cpu().numpy()
         return latent[0] if single else latent
 
     def imagine(self) -> np.ndarray | None:
         """The decoded last state of the first environment's plan, uint8 (32, 32, 3); None without a plan."""
         return None
+
+    @torch.no_grad()
+    def actor_action(self) -> np.ndarray:
+        """The actor's action at the first environment's latest frame, float32 (action,), whatever the agent did."""
+        assert self.state is not None, "actor_action() needs a frame before it"
+        return self._act_by_actor(self.state)[0].float().cpu().numpy()
+
+    @torch.no_grad()
+    def surprise(self) -> float:
+        """The surprise of the first environment's latest frame in nats, mean over turns; see `WorldModel.surprise`."""
+        assert self.state is not None, "surprise() needs a frame before it"
+        return float(mean_over_turns(self._frame_functions.surprise(flat(self.state)), self.state)[0])
+
+    def belief(self) -> State:
+        """The belief about the first environment's latest frame, unrotated: `deter` (1, deter), `stoch` (1, latent)."""
+        assert self.state is not None, "belief() needs a frame before it"
+        return State(*(part[:1].float() for part in first_turn(self.state)))
+
+    @torch.no_grad()
+    def imagine_along(self, beliefs: Sequence[State], actions: np.ndarray | None, steps: int) -> Imagined:
+        """Rollouts of the model from beliefs, in pictures.
+
+        Args:
+            beliefs: Results of `belief`, one for each rollout, or a single one for all of them.
+            actions: Actions (rollout, step, action); None lets the actor act in each rollout.
+            steps: Model steps.
+        """
+        num = len(beliefs) if actions is None else len(actions)
+        state = State(*(torch.cat(parts) for parts in zip(*beliefs, strict=True)))
+        state = State(*(part.expand(num, -1).contiguous() for part in state))
+        given = None if actions is None else torch.as_tensor(actions, dtype=torch.float32, device=self.model.device)
+        pictures, rewards, taken = [], [], []
+        for step in range(steps):
+            action = self.model.policy(state).float() if given is None else given[:, step]
+            state, reward = self.model.step(state, action)
+            pictures.append(self.model.decoder.picture(state.features.float()).cpu().numpy())
+            rewards.append(reward.float().cpu().numpy())
+            taken.append(action.cpu().numpy())
+        return Imagined(*(np.stack(parts, axis=1) for parts in (pictures, rewards, taken)))
 
     def _replace_actions(self, actions: np.ndarray) -> np.ndarray:
         """The actions (batch, action), in which rows that are not finite hold the row's last action, or zeros."""
@@ -184,6 +252,16 @@ class ModelAgent:
             )
         self.num_replaced_actions += int(is_broken.sum())
         return np.where(is_broken[:, None], last, actions).astype(np.float32)
+
+    def _explore(self, action: Tensor, noise: Tensor) -> Tensor:
+        """The action with standard normal noise, (batch, action) each; see `noise_std`."""
+        moved = (action + self.noise_std * noise).clamp(-1.0, 1.0)
+        if isinstance(self.model.actor, MixedActor):
+            places = self.model.actor.code.discrete
+            quantile, share = torch.special.ndtr(noise[:, places]), min(self.noise_std, 1.0)
+            drawn = (2.0 * quantile / share - 1.0).clamp(-1.0, 1.0)  # uniform where the quantile is below the share
+            moved[:, places] = torch.where(quantile < share, drawn, action[:, places]).to(moved.dtype)
+        return moved
 
     def _choose(self, state: State) -> Tensor:
         """The action for a belief, in [-1, 1], (batch, action)."""
@@ -216,13 +294,33 @@ class ModelAgent:
 
     def _encode_goal(self, path: str) -> Tensor:
         """The latents of an image file, one for each quarter turn of the image, (turn, latent)."""
-        return self._encode_frames(turned(self._check_frames(read_goal_image(path)[None]), self._turns))
+        if self.model.spaces.cameras > 1 or self.model.spaces.vector_dim:
+            raise UserError("a goal image shows one camera, and this agent sees more: name quantities instead")
+        image = read_goal_image(path, self.model.spaces.frame_size)
+        return self._encode_frames(turned(self._check_frames(image[None]), self._turns))
 
-    def _encode_frames(self, frames: Tensor) -> Tensor:
+    def _check_seen(self, seen: Seen, single: bool) -> Tensor | Observation:
+        """What the encoder reads, (batch, ...), on the model's device.
+
+        Raises:
+            ValueError: Frames or vectors have another shape or dtype, or are missing.
+        """
+        frame, size = frame_of(seen), self.model.spaces.vector_dim
+        frames = self._check_frames(frame[None] if single else frame)
+        if not size and not isinstance(seen, tuple):
+            return frames
+        vectors = np.asarray(seen[1], np.float32) if isinstance(seen, tuple) else np.zeros((0, 0), np.float32)
+        vectors = vectors[None] if single and vectors.ndim == 1 else vectors
+        if not size or vectors.shape != (len(frames), size):
+            wanted = f'act((frame, info["vectors"])) with {size} numbers' if size else "act(frame) without vectors"
+            raise ValueError(f"this agent takes {wanted}, got vectors of shape {vectors.shape}")
+        return Observation(frames, torch.from_numpy(vectors).to(self.generator.device))
+
+    def _encode_frames(self, frames: Tensor | Observation) -> Tensor:
         """Latents of frames (batch, 64, 64, 3) at the first moment of an episode, (batch, latent)."""
         return self.model.see(self.model.dynamics.initial(len(frames)).deter, frames).stoch
 
-    def _update_belief(self, frames: Tensor) -> State:
+    def _update_belief(self, frames: Tensor | Observation) -> State:
         """The belief after new frames (batch, 64, 64, 3), from the last belief and the action executed since.
 
         Raises:
@@ -230,13 +328,17 @@ class ModelAgent:
         """
         if self.state is not None and len(self.state.deter) != len(frames):
             raise ValueError(f"got {len(frames)} frames after {len(self.state.deter)}: call reset() between batches")
-        frames, turns = turned(frames, self._turns), self._turns
+        turns = self._turns
+        if not isinstance(frames, Observation):
+            frames = turned(frames, turns)
         if self.state is None or self._action is None:
             return folded(self._infer(self.model.dynamics.initial(len(frames)), None, frames, None), turns)
         is_first = None if self._is_reset is None else per_turn(self._is_reset, turns)
         return folded(self._infer(flat(self.state), per_turn(self._action, turns), frames, is_first), turns)
 
-    def _infer(self, state: State, action: Tensor | None, frames: Tensor, is_first: Tensor | None) -> State:
+    def _infer(
+        self, state: State, action: Tensor | None, frames: Tensor | Observation, is_first: Tensor | None
+    ) -> State:
         """The belief of `FrameFunctions.infer`; subclasses read more from the same call."""
         return self._frame_functions.infer(state, action, frames, is_first)
 
@@ -251,8 +353,9 @@ class ModelAgent:
         Raises:
             ValueError: The frames have another shape or dtype.
         """
-        if frames.dtype != np.uint8 or frames.shape[1:] != (64, 64, 3):
-            raise ValueError(f"frames must be uint8 (64, 64, 3), got {frames.dtype} {frames.shape[1:]}")
+        shape = self.model.spaces.frame_shape
+        if frames.dtype != np.uint8 or frames.shape[1:] != shape:
+            raise ValueError(f"frames must be uint8 {shape}, got {frames.dtype} {frames.shape[1:]}")
         return torch.from_numpy(np.ascontiguousarray(frames)).to(self.generator.device)
 
 

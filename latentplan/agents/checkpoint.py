@@ -20,6 +20,7 @@ from latentplan.config.checks import shown
 from latentplan.config.commit import MANIFEST
 from latentplan.config.estimates import check_parts, estimate_search
 from latentplan.config.planner import override_planner
+from latentplan.config.spaces import Spaces
 from latentplan.models import WorldModel
 from latentplan.models.fast import accelerate
 from latentplan.replay.memory import free_memory
@@ -44,6 +45,8 @@ def save_checkpoint(folder: Path, model: WorldModel, config: Config, info: dict[
         raise FloatingPointError(f"{broken} is not finite in float16: {folder} is left as it was")
     content = save(state)
     sizes = {"action_dim": model.action_dim, "labels": model.labels, "goal_dim": model.goal_dim}
+    if model.spaces != Spaces():
+        sizes["spaces"] = to_dict(model.spaces)
     facts = info | sizes | {"config": to_dict(config), "sha256": hashlib.sha256(content).hexdigest()}
     write_files(folder, {WEIGHTS: content, INFO: (json.dumps(facts, indent=1) + "\n").encode()})
 
@@ -80,8 +83,8 @@ def load_model(path: str | Path, device: str = "cpu") -> tuple[WorldModel, Confi
         config = from_dict(info["config"])
     except (AttributeError, TypeError, ValueError) as error:
         raise UserError(f"the settings in {folder / INFO} cannot be used: {error}") from None
-    sizes = info["action_dim"], info.get("labels"), info.get("goal_dim") or 0
     try:
+        sizes = info["action_dim"], info.get("labels"), info.get("goal_dim") or 0, _read_spaces(info)
         state = {name: value.float() for name, value in load(content).items()}
         with torch.device("meta"):  # compares shapes before a model is allocated whose size the file names
             WorldModel(config.model, *sizes).load_state_dict(state, assign=True)
@@ -140,6 +143,18 @@ def load_agent(path: str | Path, mode: str = "planner", device: str = "cpu", **s
     if wait_until_ready is not None:
         wait_until_ready()  # without a ready worker, the actor alone would decide in the first episode
     return agent
+
+
+def _read_spaces(info: dict[str, Any]) -> Spaces:
+    """The spaces that a description names.
+
+    Raises:
+        TypeError: The description names spaces of another form.
+        ValueError: A value is not allowed.
+    """
+    given: dict[str, Any] = info.get("spaces", {})
+    values: dict[str, Any] = {name: tuple(value) if isinstance(value, list) else value for name, value in given.items()}
+    return Spaces(**values)
 
 
 def _first_not_finite(state: dict[str, torch.Tensor]) -> str | None:

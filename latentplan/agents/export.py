@@ -4,15 +4,16 @@ One call is one decision. Inputs and outputs are plain tensors, also the belief:
 
     action, deter, stoch = program(frame, deter, stoch, action, is_first)
 
-`frame` is uint8 (batch, 64, 64, 3). `deter`, float32 (batch, deter), and `stoch`, float32 (batch, latent), are the
-belief that the last call returned; an agent with four quarter turns has the beliefs of all turns side by side.
-`action`, float32 (batch, action) in [-1, 1], is the action executed after the last call. `is_first`, bool (batch,), is
-true at the first frame of an episode, where `deter`, `stoch` and `action` are not read and may be zeros. The batch may
-have any size, and the rows do not influence each other.
+`frame` is uint8 (batch, 64, 64, 3), or of the shape that the agent's frames have. `deter`, float32 (batch, deter), and
+`stoch`, float32 (batch, latent), are the belief that the last call returned; an agent with four quarter turns has the
+beliefs of all turns side by side. `action`, float32 (batch, action) in [-1, 1], is the action executed after the last
+call. `is_first`, bool (batch,), is true at the first frame of an episode, where `deter`, `stoch` and `action` are not
+read and may be zeros. The batch may have any size, and the rows do not influence each other.
 """
 
 from __future__ import annotations
 
+import copy
 import importlib.util
 import io
 import json
@@ -29,6 +30,7 @@ from latentplan.agents.checkpoint import load_model
 from latentplan.config import UserError, output_file
 from latentplan.models import Rssm, State, WorldModel
 from latentplan.models.fast import one_frame
+from latentplan.models.heads import MixedActor
 from latentplan.models.symmetry import turned
 
 FORMATS = ("pt2", "onnx")
@@ -41,9 +43,10 @@ EXAMPLE_ROWS = 2  # with a batch of 1, torch.export would fix the batch size at 
 class _Decision(nn.Module):
     """One decision: belief update and actor, with a copy of their weights."""
 
-    def __init__(self, weights: one_frame.FrameWeights, turns: int) -> None:
+    def __init__(self, model: WorldModel) -> None:
         super().__init__()
-        self._turns = turns
+        weights, self._turns = one_frame.convert_weights(model), model.config.turns
+        self._choices = copy.deepcopy(model.actor).cpu() if isinstance(model.actor, MixedActor) else None
         tensors, self._layout = tree_flatten(weights)
         self._names = [f"weight_{index}" for index in range(len(tensors))]
         for name, tensor in zip(self._names, tensors, strict=True):
@@ -56,10 +59,11 @@ class _Decision(nn.Module):
         turns, (rows, size) = self._turns, action.shape
         taken = action[:, None].expand(-1, turns, -1).reshape(rows * turns, size)
         last = State(*(part.reshape(rows * turns, part.shape[1] // turns) for part in (deter, stoch)))
-        advanced = one_frame.advance(weights, last, taken).reshape(rows, deter.shape[1])
+        read = taken if self._choices is None else self._choices.code(taken)
+        advanced = one_frame.advance(weights, last, read).reshape(rows, deter.shape[1])
         begun = torch.where(is_first[:, None], 0.0, advanced).reshape(last.deter.shape)
         state = one_frame.see(weights, begun, turned(frame, turns))
-        modes, _ = one_frame.act(weights, state)
+        modes, _ = one_frame.act(weights, state) if self._choices is None else self._choices(state.features)
         mean = modes.reshape(rows, turns, size).mean(1)
         executed = torch.where(is_first[:, None] | ~action.isfinite(), 0.0, action)
         mean = torch.where(mean.isfinite().all(1, keepdim=True), mean, executed)  # as `ModelAgent.act`
@@ -95,6 +99,10 @@ def export_actor(agent_or_checkpoint: ModelAgent | str | Path, path: str | Path,
         model = agent_or_checkpoint.model
     else:
         model, _, _ = load_model(agent_or_checkpoint)
+    if model.spaces.vector_dim:
+        raise UserError(
+            "only agents that see pictures alone can be exported, and this one was trained with env.vectors"
+        )
     if type(model.dynamics) is not Rssm:
         raise UserError(
             f"only agents with dynamics of the class Rssm can be exported, got {type(model.dynamics).__name__}"
@@ -121,7 +129,7 @@ def input_sizes(model: WorldModel) -> dict[str, int]:
 
 
 def _trace_actor(model: WorldModel) -> ExportedProgram:
-    decision = _Decision(one_frame.convert_weights(model), model.config.turns).eval()
+    decision = _Decision(model).eval()
     batch = Dim("batch", min=1)
     dynamic = {name: {0: batch} for name in INPUTS}
     with torch.no_grad():
@@ -130,7 +138,7 @@ def _trace_actor(model: WorldModel) -> ExportedProgram:
 
 def _example_inputs(model: WorldModel) -> tuple[Tensor, ...]:
     vectors = [torch.zeros(EXAMPLE_ROWS, size) for size in input_sizes(model).values()]
-    frame = torch.zeros(EXAMPLE_ROWS, 64, 64, 3, dtype=torch.uint8)
+    frame = torch.zeros(EXAMPLE_ROWS, *model.spaces.frame_shape, dtype=torch.uint8)
     return frame, *vectors, torch.ones(EXAMPLE_ROWS, dtype=torch.bool)
 
 

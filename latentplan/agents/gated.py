@@ -11,9 +11,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from latentplan.agents.base import Seen, frame_of
 from latentplan.agents.planning import PlanningAgent
 from latentplan.config import Config, PlannerConfig
 from latentplan.models import State, WorldModel
+from latentplan.models.encoder import Observation
 from latentplan.objectives.expression import Expression
 from latentplan.planning.objectives import Constraint, Term, apply_view
 
@@ -118,14 +120,14 @@ class GatedAgent(PlanningAgent):
         source = self.last_source if isinstance(self.last_source, str) else self.last_source[0]
         return super().imagine() if source == "plan" else None
 
-    def act(self, frame: np.ndarray) -> np.ndarray:
+    def act(self, frame: Seen) -> np.ndarray:
         """The action in [-1, 1], float32 (action,) or (batch, action), for uint8 frame(s); see `ModelAgent.act`."""
         action = super().act(frame)
-        if frame.ndim == 3:
+        if frame_of(frame).ndim == 3:
             self.last_source = self.last_source[0]
         return action
 
-    def _update_belief(self, frames: Tensor) -> State:
+    def _update_belief(self, frames: Tensor | Observation) -> State:
         if self.state is None:
             self._is_first, self._drift = torch.ones(len(frames), dtype=torch.bool), None
         else:
@@ -134,7 +136,9 @@ class GatedAgent(PlanningAgent):
             )
         return super()._update_belief(frames)
 
-    def _infer(self, state: State, action: Tensor | None, frames: Tensor, is_first: Tensor | None) -> State:
+    def _infer(
+        self, state: State, action: Tensor | None, frames: Tensor | Observation, is_first: Tensor | None
+    ) -> State:
         belief, mismatch = self._frame_functions.infer_and_compare(state, action, frames, is_first)
         self._mismatch = mismatch.unflatten(0, (-1, self._turns)).mean(1)
         self._drift = self._mismatch if self._drift is None else self._drift + self._mismatch

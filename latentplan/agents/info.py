@@ -52,6 +52,7 @@ ALLOWED: dict[str, tuple[Callable[[Any], bool], str]] = {
     "action_dim": _is_number(1, LARGEST_SIZE, int),
     "labels": (_are_labels, "a dictionary of scales above 0"),
     "goal_dim": (lambda value: value is None or _is_number(0, LARGEST_SIZE, int)[0](value), "a size"),
+    "spaces": _is_kind(dict, "a dictionary"),
     "config": _is_kind(object, "settings"),
     "sha256": (lambda value: isinstance(value, str) and len(value) == 64, "a text of 64 digits"),
     "distilled": _is_kind(dict, "a dictionary"),

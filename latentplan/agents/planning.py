@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -14,8 +15,22 @@ from latentplan.config import Config, PlannerConfig
 from latentplan.models import State, WorldModel
 from latentplan.models.symmetry import flat, mean_over_turns
 from latentplan.objectives.expression import Expression
-from latentplan.planning import ModelPredictiveController, make_planner
+from latentplan.planning import CEMPlanner, ModelPredictiveController, Planner, make_planner
 from latentplan.planning.objectives import Constraint, Term
+
+
+def make_search(model: WorldModel, settings: PlannerConfig, discount: float) -> Planner:
+    """The planner of these settings for a model's actions.
+
+    Args:
+        model: The world model.
+        settings: Method and options of the search.
+        discount: Discount per decision, as learned.
+    """
+    problem: dict[str, Any] = {"action_dim": model.action_dim, "discount": discount}
+    if model.has_choices:
+        problem["action_choices"] = model.spaces.action_choices
+    return make_planner(settings.method, settings, **problem)
 
 
 class PlanningAgent(ModelAgent):
@@ -52,7 +67,7 @@ class PlanningAgent(ModelAgent):
         super().__init__(model, config, noise_std=noise_std, noise_correlation=noise_correlation, seed=seed)
         settings = planner or config.planner
         self.surprise_limit, self.was_surprised = settings.surprise_limit, False
-        search = make_planner(settings.method, settings, action_dim=model.action_dim, discount=discount)
+        search = make_search(model, settings, discount)
         self.controller = ModelPredictiveController(search, self.imagined, generator=self.generator)
 
     def reset(self, mask: np.ndarray | None = None) -> None:
@@ -68,6 +83,12 @@ class PlanningAgent(ModelAgent):
         """As `ModelAgent.set_memory`, with the last plan."""
         super().set_memory(memory)
         self.controller.set_memory(memory["controller"], self.model.device)
+
+    def weigh_ends(self) -> None:
+        """From the next decision on, plans weigh rewards by the probability that the episode goes on."""
+        planner = self.controller.planner
+        if isinstance(planner, CEMPlanner):
+            self.controller.planner = replace(planner, use_continues=True)
 
     def set_objective(
         self, objective: str | Expression | Term | None = None, constraints: str | Sequence[Constraint] = ()

@@ -6,6 +6,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from latentplan.agents.base import Seen, frame_of
+
 if TYPE_CHECKING:
     from latentplan.config import Config
     from latentplan.models import WorldModel
@@ -35,8 +37,9 @@ class RandomAgent:
     def imagine(self) -> None:
         """Returns None, because the agent has no plan."""
 
-    def act(self, frame: np.ndarray) -> np.ndarray:
+    def act(self, frame: Seen) -> np.ndarray:
         """A random action, float32 (action,), or (batch, action) for several frames."""
+        frame = frame_of(frame)
         shape = (self.num_actions,) if frame.ndim == 3 else (len(frame), self.num_actions)
         return self._rng.uniform(-1.0, 1.0, shape).astype(np.float32)
 

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING
 
 from latentplan.config import RENDER_QUALITIES, EnvConfig, UserError
 from latentplan.config.estimates import count_cores
+from latentplan.config.origin import processor_name
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
@@ -83,17 +84,6 @@ def run(request: Request) -> int:
     if not problems:
         print("everything works")
     return int(any(finding.fatal for finding in problems))
-
-
-def processor_name() -> str:
-    """Model name of the processor."""
-    try:
-        for line in Path("/proc/cpuinfo").read_text().splitlines():
-            if line.startswith("model name"):
-                return line.partition(":")[2].strip()
-    except OSError:
-        pass  # only Linux has this file
-    return platform.processor() or platform.machine()
 
 
 def _guarded(check: Callable[[], Iterator[Finding]]) -> Iterator[Finding]:

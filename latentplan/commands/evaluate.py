@@ -9,6 +9,7 @@ import contextlib
 import dataclasses
 import json
 import os
+import shlex
 import sys
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,13 +20,20 @@ from latentplan.commands.shell import ComputeRequest, check_search, saved_config
 from latentplan.config import EnvConfig, PlannerConfig, UserError, to_dict
 from latentplan.config.checks import MAX_EPISODES, above_zero, at_least, one_of, within
 from latentplan.config.env_id import ENV_FLAGS, EnvChoice, choose_env, is_by_id
+from latentplan.config.origin import present_facts
 from latentplan.config.parsing import option
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from latentplan.envs.suite import SuiteEnv
     from latentplan.evaluation.clock import VirtualClock
+    from latentplan.evaluation.episodes import OnStep, Step
     from latentplan.evaluation.goals import Goals, ScoredEnv
     from latentplan.evaluation.statistics import Episode
+    from latentplan.reporting.recorder import EpisodeRecorder
+
+PAGE_FRAMES = 250  # of the film in a page
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -41,6 +49,7 @@ class Request(ComputeRequest):
         planning_budget: Share of its decisions that a gated agent may plan, in [0, 1]; None takes the agent's own.
         video: Film of the first episode, .mp4 or .webm.
         json: Result as JSON.
+        report: Page with film, returns, training curves, decision times, imagination and searches.
         control_hz: Decisions per second of a world that goes on while the agent computes; None makes the world wait.
         latency: Time that a decision takes in a world that does not wait: `measured`, or a file of milliseconds.
         seed: Seed of the starts: episode i starts from a state that depends only on the seed and i.
@@ -58,6 +67,7 @@ class Request(ComputeRequest):
     planning_budget: float | None = None
     video: Path | None = option(None, metavar="FILE", is_output=True)
     json: Path | None = option(None, metavar="FILE", is_output=True)
+    report: Path | None = option(None, metavar="FILE.html", is_output=True)
     control_hz: float | None = None
     latency: str | None = option(None, metavar="measured|FILE")
     seed: int = 0
@@ -203,29 +213,114 @@ def _play_and_report(
     seeds = [episode_seed(request.seed, index) for index in range(request.episodes)]
     episodes: list[Episode] = []
     interrupted = False
-    with contextlib.ExitStack() as stack:
-        on_step = None
-        if request.video is not None:
-            from latentplan.reporting.film import filming
-
-            planner = agent if request.mode in planning_modes() else None
-            on_step = stack.enter_context(filming(request.video, env, planner, goals=scored))
-        try:
-            for episode in iterate_timed_episodes(env, agent, seeds, clock, on_step=on_step):
-                episodes.append(episode)
-                print(f"episode {len(episodes)} of {len(seeds)}: return {episode.total_return:.1f}", flush=True)
-        except KeyboardInterrupt:
-            interrupted = True
-            print(f"\ninterrupted after {len(episodes)} of {len(seeds)} episodes", flush=True)
-        if episodes:
-            scores = {} if scored is None else scored.summarize(len(episodes))
-            result = {**about, **summarize_timed(episodes, clock), **scores}
-            if request.mode == "gated":  # an action of an older plan needed no search
-                result["planned_fraction"] = result["action_source"]["plan"] / sum(result["action_source"].values())
-            if request.mode == "planner" and agent.surprise_limit is not None:
-                result["surprised"] = sum(episode.surprised for episode in episodes)
-            _report(request, result)
+    with contextlib.ExitStack() as outputs:
+        film, recorder = _page_parts(request, env, agent, clock, outputs)
+        with contextlib.ExitStack() as stack:
+            on_step = _watch(request, env, agent, film, recorder, stack)
+            try:
+                for episode in iterate_timed_episodes(env, agent, seeds, clock, on_step=on_step):
+                    episodes.append(episode)
+                    print(f"episode {len(episodes)} of {len(seeds)}: return {episode.total_return:.1f}", flush=True)
+            except KeyboardInterrupt:
+                interrupted = True
+                print(f"\ninterrupted after {len(episodes)} of {len(seeds)} episodes", flush=True)
+            if episodes:
+                scores = {} if scored is None else scored.summarize(len(episodes))
+                result = {**about, **summarize_timed(episodes, clock), **scores}
+                if request.mode == "gated":  # an action of an older plan needed no search
+                    result["planned_fraction"] = result["action_source"]["plan"] / sum(result["action_source"].values())
+                if request.mode == "planner" and agent.surprise_limit is not None:
+                    result["surprised"] = sum(episode.surprised for episode in episodes)
+                _report(request, result)
+        if episodes and request.report is not None:
+            _write_page(request, env, result, episodes, film, recorder)
     return 130 if interrupted else 0
+
+
+def _page_parts(
+    request: Request, env: Any, agent: Any, clock: VirtualClock, outputs: contextlib.ExitStack
+) -> tuple[Path | None, EpisodeRecorder | None]:
+    """The film that is made, and the recorder of the first episode, if a page is asked for."""
+    if request.report is None:
+        return request.video, None
+    import tempfile
+
+    from latentplan.reporting.recorder import EpisodeRecorder
+
+    goals = env if hasattr(env, "objective_scores") else None
+    length = getattr(env.unwrapped, "decisions_per_episode", None)
+    recorder = EpisodeRecorder(agent, length, goals=goals, waits=clock.control_hz is None)
+    if request.video is not None:
+        return request.video, recorder
+    return Path(outputs.enter_context(tempfile.TemporaryDirectory())) / "film.webm", recorder
+
+
+def _watch(
+    request: Request,
+    env: Any,
+    agent: Any,
+    film: Path | None,
+    recorder: EpisodeRecorder | None,
+    stack: contextlib.ExitStack,
+) -> OnStep | None:
+    """The callback of every step, which films and records; None where nothing is watched."""
+    if film is None:
+        return None
+    from latentplan.reporting.film import filming
+
+    planner = agent if request.mode in planning_modes() else None
+    length = getattr(env.unwrapped, "decisions_per_episode", None) or 0
+    every = 1 if request.video is not None else -(-length // PAGE_FRAMES) or 1
+    goals = env if hasattr(env, "objective_scores") else None
+    write = stack.enter_context(filming(film, env, planner, every=every, goals=goals))
+
+    def watch(step: Step) -> None:
+        write(step)
+        if recorder is not None:
+            recorder(step)
+
+    return watch
+
+
+def _write_page(
+    request: Request,
+    env: Any,
+    result: dict[str, Any],
+    episodes: Sequence[Episode],
+    film: Path | None,
+    recorder: EpisodeRecorder | None,
+) -> None:
+    import numpy as np
+
+    from latentplan.agents.checkpoint import read_info
+    from latentplan.config.run_results import read_log
+    from latentplan.evaluation.statistics import confidence_interval
+    from latentplan.reporting.page import write_page
+    from latentplan.reporting.report import ReportData, Returns, render_report
+
+    assert request.report is not None
+    info = read_info(request.checkpoint)
+    rate, deadline = env.unwrapped.metadata.get("render_fps"), result.get("planner", {}).get("deadline_ms")
+    deadlines = {"deadline of the search": deadline, "period of control": 1000.0 / rate if rate else None}
+    if request.control_hz is not None:
+        deadlines["period of control"] = 1000.0 / request.control_hz
+    facts = {"command": shlex.join(sys.argv), **present_facts(request.device != "cpu")}
+    trained = {name: info[name] for name in ("version", "env_frames", "updates", "minutes") if name in info}
+    own = {name: result[name] for name in ("seed", "renderer", "render_quality", "floor")}
+    data = ReportData(
+        task=f"{result['domain']}-{result['task']}",
+        config=saved_config(request.checkpoint, info),
+        returns=[Returns(request.mode, result["returns"], confidence_interval(result["returns"]))],
+        film=film,
+        evaluations=read_log(info),
+        recording=None if recorder is None else recorder.recording,
+        decision_ms=np.concatenate([episode.decision_ms for episode in episodes]),
+        deadlines_ms={name: value for name, value in deadlines.items() if value is not None},
+        facts={"checkpoint": str(request.checkpoint), **facts, **own, "trained": trained}
+        | ({"search": result["planner"]} if "planner" in result else {}),
+    )
+    write_page(request.report, render_report(data))
+    print(f"report: {request.report}", flush=True)
 
 
 def _describe(

@@ -49,6 +49,11 @@ class Flag:
         return self.setting.default is dataclasses.MISSING
 
     @property
+    def is_positional(self) -> bool:
+        """Whether the values are given as words without a flag."""
+        return bool(self.setting.options.get("is_positional"))
+
+    @property
     def metavar(self) -> str:
         """The placeholder for the value in `--help`."""
         kind = alternatives(self.setting.hint)[0]
@@ -87,7 +92,8 @@ def list_flags(request: type) -> list[Flag]:
     for setting in list_settings(request):
         kind = setting.options.get("overrides")
         if kind is None:
-            flags.append(Flag((_spelled(setting.key),), setting, not setting.options.get("is_rare")))
+            name = setting.options["metavar"] if setting.options.get("is_positional") else _spelled(setting.key)
+            flags.append(Flag((name,), setting, not setting.options.get("is_rare")))
             continue
         for inner in list_settings(kind):
             dotted = setting.options["prefix"] + inner.key
@@ -114,7 +120,8 @@ def read_request(request: type[Request], argv: Sequence[str]) -> Request:
     _check_outputs(flags, values)
     for flag in flags:
         if flag.is_required and flag.setting.key not in values:
-            raise UserError(f"flag {flag.names[0]} is missing; give the {_begin_small(flag.setting.meaning)}")
+            kind = "word" if flag.is_positional else "flag"
+            raise UserError(f"{kind} {flag.names[0]} is missing; give the {_begin_small(flag.setting.meaning)}")
     nested: dict[str, Any] = {}
     for key, value in values.items():
         *path, name = key.split(".")
@@ -142,12 +149,16 @@ def format_flags(request: type, program: str, summary: str, every_flag: bool) ->
         every_flag: Whether the flags that are rarely used are shown too.
     """
     flags = list_flags(request)
-    needed = [f"{flag.names[0]} {flag.metavar}" for flag in flags if flag.is_required]
+    needed = [f"{flag.names[0]} {flag.metavar}" for flag in flags if flag.is_required and not flag.is_positional]
+    needed += [_usage(flag) for flag in flags if flag.is_positional]
     parser = _Parser(
         [flag for flag in flags if flag.is_common or every_flag],
         usage=" ".join([program, *needed, "[--name value ...]"]),
     )
     parser.description = summary
+    for flag in flags:
+        if flag.is_positional:
+            parser.add_argument(flag.setting.key, metavar=flag.metavar, help=flag.help.replace("%", "%%"))
     for name, meaning in GENERAL_FLAGS.items():
         parser.add_argument(name, action="store_true", help=meaning)
     notes = vars(request).get("NOTES", "")
@@ -163,8 +174,11 @@ class _Parser(argparse.ArgumentParser):
         super().__init__(
             usage=usage, add_help=False, allow_abbrev=False, exit_on_error=False, formatter_class=_HelpFormatter
         )
+        self.positional = next((flag for flag in flags if flag.is_positional), None)
         for flag in flags:
             options = flag.setting.options
+            if flag.is_positional:
+                continue
             several: dict[str, Any] = {"action": _Join, "const": options["join"]} if "join" in options else {}
             if "separator" in options:  # `0 1` is the list `0,1`
                 several = {"nargs": "+"}
@@ -187,6 +201,10 @@ class _Parser(argparse.ArgumentParser):
             found, others = self.parse_known_args(args, namespace)
         except argparse.ArgumentError as error:
             raise UserError(f"flag {str(error.argument_name).split('/')[0]} needs a value") from None
+        if others and self.positional is not None:
+            is_list = _takes_several(self.positional)
+            setattr(found, self.positional.setting.key, others if is_list else others.pop(0))
+            others = [] if is_list else others
         if others:
             raise UserError(f"unexpected argument {others[0]!r}; settings are given as --name value")
         return found
@@ -217,8 +235,20 @@ class _HelpFormatter(argparse.HelpFormatter):
         super().__init__(prog, max_help_position=34, width=_WIDTH)
 
     def _format_action_invocation(self, action: argparse.Action) -> str:
+        if not action.option_strings:
+            return str(action.metavar)
         metavar = f" {action.metavar}" if action.metavar else ""
         return f"{', '.join(action.option_strings)}{metavar}"
+
+
+def _takes_several(flag: Flag) -> bool:
+    return getattr(flag.setting.hint, "__origin__", None) is tuple
+
+
+def _usage(flag: Flag) -> str:
+    """The words of a positional flag, as the first line of the help shows them."""
+    words = f"{flag.metavar} [{flag.metavar} ...]" if _takes_several(flag) else flag.metavar
+    return words if flag.is_required else f"[{words}]"
 
 
 def _read_texts(flags: Sequence[Flag], argv: Sequence[str]) -> dict[str, Any]:

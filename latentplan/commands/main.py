@@ -39,6 +39,9 @@ COMMANDS = {
     "eval": Command("latentplan.commands.evaluate", "play a trained agent: return, decision latency, film"),
     "distill": Command("latentplan.commands.distill", "teach a trained agent's actor to act as its planner does"),
     "goals": Command("latentplan.commands.goals", "teach a trained agent to pursue goals that are named later"),
+    "runs": Command("latentplan.commands.runs", "list training runs: task, frames, minutes, returns and state"),
+    "watch": Command("latentplan.commands.watch", "show the progress of a training run until it ends"),
+    "compare": Command("latentplan.commands.compare", "compare training runs: curves, settings that differ, films"),
     "export": Command("latentplan.commands.export", "write the actor as a program that runs without this package"),
     "envs": Command("latentplan.commands.envs", "list the environments that there are, by suite"),
     "check-env": Command("latentplan.commands.check_env", "test an environment before an agent learns in it"),
@@ -133,7 +136,8 @@ def completion_script(program: str, commands: Mapping[str, Command], shell: str)
         for flag in list_flags(importlib.import_module(command.module).Request):
             hint = flag.setting.hint
             words = ("true", "false") if hint is bool else flag.setting.choices
-            argument: Any = part.add_argument(*flag.names, help=flag.help.replace("%", "%%"), choices=words or None)
+            dest = (flag.setting.key,) if flag.is_positional else flag.names
+            argument: Any = part.add_argument(*dest, help=flag.help.replace("%", "%%"), choices=words or None)
             if Path in alternatives(hint):
                 argument.complete = shtab.DIRECTORY if flag.metavar == "DIR" else shtab.FILE
     return str(shtab.complete(parser, shell))

@@ -23,6 +23,7 @@ SHORT_FLAGS = {
     "run.device": "--device",
     "run.seed": "--seed",
     "run.run_dir": "--run-dir",
+    "run.logger": "--logger",
 }
 
 

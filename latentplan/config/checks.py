@@ -105,6 +105,12 @@ def output_file(path: Path, flag: str) -> Path:
     import tempfile  # imported here because every command imports this module, and few write files
 
     given = str(path)
+    try:
+        path.lstat()
+    except (FileNotFoundError, NotADirectoryError):
+        pass
+    except OSError as error:  # such as a name that is too long
+        raise UserError(f"{flag} {given!r} cannot be written: {error.strerror}; give another name") from None
     if path.is_symlink():  # the link stays and its target is replaced
         path = Path(os.path.realpath(path))
         if path.is_symlink() or not path.parent.is_dir():

@@ -40,11 +40,11 @@ class Part:
     advice: str
 
 
-def count_parameters(model: ModelConfig, action_dim: int = 1) -> int:
-    """The number of weights of a world model, without biases and the scales of norms."""
+def count_parameters(model: ModelConfig, action_dim: int = 1, frame_size: int = 64) -> int:
+    """The number of weights of a world model for one camera, without biases and the scales of norms."""
     features, hidden, deter = model.deter_dim + model.latent_dim, model.hidden_dim, model.deter_dim
     channels = model.encoder_channels
-    side = 16 // 2 ** (len(channels) - 1)
+    side = frame_size // 4 // 2 ** (len(channels) - 1)
     encoder = 48 * channels[0] + sum(16 * before * after for before, after in pairwise(channels))
     encoder += channels[-1] * side * side * hidden
     dynamics = (model.latent_dim + action_dim) * hidden + (hidden + deter) * 3 * deter + 2 * deter * hidden
@@ -79,10 +79,10 @@ def estimate_search(search: SearchOptions, model: ModelConfig, on_device: bool =
     return Part("a search", num_bytes, seconds, advice)
 
 
-def estimate_model(model: ModelConfig, copies: int = 1, action_dim: int = 1) -> Part:
+def estimate_model(model: ModelConfig, copies: int = 1, action_dim: int = 1, frame_size: int = 64) -> Part:
     """Memory of a world model and its copies."""
     sizes = "--model.deter_dim, --model.hidden_dim, --model.num_bins, --model.encoder_channels or the decoder's"
-    return Part("the model", _FLOAT * copies * count_parameters(model, action_dim), 0.0, sizes)
+    return Part("the model", _FLOAT * copies * count_parameters(model, action_dim, frame_size), 0.0, sizes)
 
 
 def check_parts(parts: list[Part], free: float, place: str = "main memory") -> None:

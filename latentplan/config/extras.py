@@ -16,6 +16,9 @@ EXTRAS = {
     "jax": ("jax",),
     "gymnasium": ("imageio", "pygame"),
     "robotics": ("gymnasium_robotics",),
+    "wandb": ("wandb",),
+    "trackio": ("trackio",),
+    "mlflow": ("mlflow",),
 }
 """By extra, the modules that it installs and the package without extras does not."""
 

@@ -34,6 +34,7 @@ class LearningConfig:
         overshooting_scale: Weight of the KL that moves open-loop predictions towards the posterior.
         overshooting_horizon: Decisions that an open-loop prediction spans.
         reward_scale: Weight of the reward loss.
+        vector_scale: Weight of the squared error of the numbers that `env.vectors` names, summed over them.
         imagination_horizon: Model steps of each imagined rollout.
         imagination_starts: Imagined rollouts per update; their starts are drawn from the states of the batch.
         gradient_decay: Share of the actor's gradient that each imagined step passes back to the step before, in [0, 1].
@@ -65,6 +66,7 @@ class LearningConfig:
     overshooting_scale: float = 0.1
     overshooting_horizon: int = 8
     reward_scale: float = 1.0
+    vector_scale: float = 1.0
     imagination_horizon: int = 15
     imagination_starts: int = 128
     gradient_decay: float = 1.0
@@ -83,7 +85,9 @@ class LearningConfig:
             self, batch_size=1, sequence_length=1, imagination_horizon=1, imagination_starts=1, overshooting_horizon=1
         )
         at_least(self, reconstruction_scale=0.0, dynamics_scale=0.0, representation_scale=0.0, free_nats=0.0)
-        at_least(self, overshooting_scale=0.0, reward_scale=0.0, replay_value_scale=0.0, entropy_scale=0.0)
+        at_least(
+            self, overshooting_scale=0.0, reward_scale=0.0, vector_scale=0.0, replay_value_scale=0.0, entropy_scale=0.0
+        )
         at_least(self, curriculum_frames=0)
         within(self, random_shift=(0, 64))
         above_zero(

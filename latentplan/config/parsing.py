@@ -67,6 +67,7 @@ def option(default: Any = dataclasses.MISSING, **options: Any) -> Any:
         options: `choices` (a function that returns the allowed words, for text), `metavar` (the placeholder for the
             value in `--help`), `join` (text between the values of a repeated flag), `separator` (text between the items
             of a tuple, which may also be words of their own), `is_output` (the flag names a file to be written),
+            `is_positional` (the values are words without a flag; `metavar` is needed),
             `is_rare` (only `--help-all` shows the flag) and `is_last` (`--help` shows the flag after the others).
     """
     return dataclasses.field(default=default, metadata=options)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import fcntl
 import os
+import time
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -89,10 +90,19 @@ def lock_folder(folder: Path, holder: str = "another process learns") -> Iterato
         raise UserError(f"cannot write to {folder}: {error.strerror}; choose another") from None
     try:
         with contextlib.suppress(OSError):
-            try:
-                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except BlockingIOError:
-                raise UserError(f"{holder} in {folder}: end it first, or choose another folder") from None
+            if not _try_lock(lock):
+                raise UserError(f"{holder} in {folder}: end it first, or choose another folder")
         yield
     finally:
         os.close(lock)
+
+
+def _try_lock(lock: int) -> bool:
+    """Locks an open file; whoever asks whether the file is locked holds it for an instant, so a few tries are made."""
+    for pause_s in (0.02, 0.05, 0.0):
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            return True
+        except BlockingIOError:
+            time.sleep(pause_s)
+    return False

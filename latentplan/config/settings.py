@@ -9,12 +9,13 @@ import dataclasses
 from dataclasses import dataclass, field
 from typing import Any, Literal, get_args
 
-from latentplan.config.checks import MAX_EPISODES, MAX_THREADS, UserError, above_zero, at_least, one_of, within
+from latentplan.config.checks import MAX_EPISODES, MAX_THREADS, UserError, above_zero, at_least, one_of, shown, within
 from latentplan.config.learning import CollectionConfig, LearningConfig
 from latentplan.config.parsing import option
 from latentplan.config.planner import PlannerConfig
 from latentplan.config.reading import read_kwargs
 from latentplan.config.removed import drop_removed
+from latentplan.config.spaces import FRAME_SIZES, MOST_CAMERAS, check_frame_size
 
 LATENT_DIM = 32
 RenderQuality = Literal["exact", "fast", "fastest"]
@@ -25,6 +26,7 @@ RENDER_QUALITIES = get_args(RenderQuality)
 FLOORS = get_args(Floor)
 DEVICES = get_args(Device)
 PIXELS = get_args(Pixels)
+LOGGERS = ("tensorboard", "csv", "wandb", "trackio", "mlflow")
 MAX_REPEAT = 10_000  # ten of the longest episodes of dm_control
 MAX_ENVS = 1024
 MAX_CAMERA = 1000
@@ -40,6 +42,11 @@ class EnvConfig:
         task: Task of the domain; None takes the usual task of the domain.
         action_repeat: Simulator control steps per decision.
         camera: Camera id of the MuJoCo model.
+        cameras: Several cameras, whose pictures the agent sees together: ids of the MuJoCo model, or image keys of a
+            `Dict` observation of your own environment. Empty takes `camera`, or all images of the `Dict`.
+        frame_size: Side of the pictures in pixels: 64, 84, 96 or 128.
+        vectors: What the agent sees beside the pictures: keys of vectors in a `Dict` observation of your own
+            environment; in `dm_control` keys of the task's observation, or `proprioception` for all of them.
         render_quality: `exact` is dm_control's default; `fast` has a small shadow map; `fastest` has no shadows,
             reflections or anti-aliasing, which makes learning easier.
         floor: `suite` draws the floor as the suite does, which ends two metres behind a walker's start; `endless` draws
@@ -65,9 +72,17 @@ class EnvConfig:
     suite: str = "dm_control"
     kwargs: str = option("{}", metavar="JSON")
     pixels: Pixels = "observation"
+    cameras: tuple[str, ...] = ()
+    frame_size: int = FRAME_SIZES[0]
+    vectors: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         read_kwargs(self.kwargs)
+        check_frame_size(self.frame_size)
+        if len(set(self.vectors)) != len(self.vectors):
+            raise ValueError(f"vectors must be different keys, got {' '.join(self.vectors)}")
+        if len(set(self.cameras)) != len(self.cameras) or len(self.cameras) > MOST_CAMERAS:
+            raise ValueError(f"cameras must be at most {MOST_CAMERAS} different ones, got {' '.join(self.cameras)}")
         within(self, action_repeat=(1, MAX_REPEAT), num_envs=(1, MAX_ENVS), camera=(-1, MAX_CAMERA))
         one_of(self, render_quality=RENDER_QUALITIES, floor=FLOORS, pixels=PIXELS)
 
@@ -130,12 +145,14 @@ class EvaluationConfig:
         episodes: Episodes of the planner, and of the actor from the same starts, per evaluation during training.
         final_episodes: Episodes of the evaluation at the end of a run.
         video: Whether each evaluation films its first episode.
+        report: Whether a run writes `report.html` into its folder after the final evaluation.
     """
 
     every_frames: int = 10_000
     episodes: int = 2
     final_episodes: int = 10
     video: bool = True
+    report: bool = True
 
     def __post_init__(self) -> None:
         at_least(self, every_frames=1)
@@ -154,6 +171,7 @@ class RunConfig:
         threads: CPU threads for each half of an update (model and behaviour learn in parallel), in [1, 1024]; None
             divides all cores but one between the halves and leaves one to collection.
         run_dir: Folder of the run; None makes `runs/<domain>-<task>-seed<seed>-<date>`.
+        logger: Trackers that get scalars and films: tensorboard, csv, wandb, trackio, mlflow.
     """
 
     frames: int | None = None
@@ -162,9 +180,13 @@ class RunConfig:
     device: Device = "auto"
     threads: int | None = None
     run_dir: str | None = None
+    logger: tuple[str, ...] = option(("tensorboard",), separator=",")
 
     def __post_init__(self) -> None:
         one_of(self, device=DEVICES)
+        for name in self.logger:
+            if name not in LOGGERS:
+                raise ValueError(f"logger must be of {', '.join(LOGGERS)}, got {shown(name)}")
         at_least(self, seed=0)
         above_zero(self, "frames", "minutes")
         if self.threads is not None:

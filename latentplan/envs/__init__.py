@@ -8,6 +8,7 @@ require_extra("latentplan.envs", "gymnasium", "mujoco", "cv2")
 
 from latentplan.envs.gl import choose_backend, render_info  # noqa: E402
 from latentplan.envs.registry import default_task, make_env  # noqa: E402
+from latentplan.envs.spaces import accept_spaces  # noqa: E402
 from latentplan.envs.suite import SuiteEnv  # noqa: E402
 from latentplan.envs.threads import single_threaded_children  # noqa: E402
 from latentplan.envs.user import PixelEnv, make_from, wrap_user_env  # noqa: E402
@@ -16,6 +17,7 @@ from latentplan.envs.vector import make_vector_env  # noqa: E402
 __all__ = [
     "PixelEnv",
     "SuiteEnv",
+    "accept_spaces",
     "default_task",
     "make_env",
     "make_from",

@@ -15,7 +15,6 @@ from latentplan.config.extras import extra_of
 from latentplan.config.reading import read_kwargs
 from latentplan.envs.faults import describe_failure
 from latentplan.envs.rendered import MODE
-from latentplan.envs.suite import FRAME_SIZE
 from latentplan.envs.user import PixelEnv, make_from
 
 
@@ -56,7 +55,7 @@ def make_inner(config: EnvConfig) -> gymnasium.Env[Any, Any]:
             reason = str(error).partition(" was raised from")[0]
             raise UserError(f"cannot make {name} with --env-kwargs {config.kwargs}: {reason}; correct them") from None
         raise describe_failure(error) from error
-    _draw_small(env, kwargs)
+    _draw_small(env, kwargs, config.frame_size)
     return env
 
 
@@ -80,8 +79,8 @@ def find_id(config: EnvConfig) -> str:
     return name
 
 
-def _draw_small(env: gymnasium.Env[Any, Any], kwargs: dict[str, Any]) -> None:
+def _draw_small(env: gymnasium.Env[Any, Any], kwargs: dict[str, Any], size: int) -> None:
     """Makes gymnasium's MuJoCo renderer draw at the size of a frame, which takes a tenth of the time of 480 x 480."""
     renderer = getattr(env.unwrapped, "mujoco_renderer", None)
     if renderer is not None and not {"width", "height"} & set(kwargs):
-        renderer.width = renderer.height = FRAME_SIZE
+        renderer.width = renderer.height = size

@@ -17,7 +17,6 @@ from latentplan.config.checks import EnvironmentFault
 from latentplan.config.env_id import is_by_id
 from latentplan.envs.by_id import make_inner
 from latentplan.envs.faults import FrameCheck
-from latentplan.envs.suite import FRAME_SIZE
 from latentplan.envs.user import MAX_DECISIONS, describe_refusals, wrap_user_env
 from latentplan.envs.vector import GuardedEnv, make_guarded_env
 
@@ -113,7 +112,7 @@ def _accepts_spaces(config: EnvConfig, report: Report) -> bool:
             report.facts["observations"] = f"pictures of render(), in place of {report.facts['observations']}"
             wrap_user_env(inner, config.action_repeat, config=config)
         else:
-            report.problems += describe_refusals(inner)
+            report.problems += describe_refusals(inner, config)
     finally:
         inner.close()
     return not report.problems
@@ -164,7 +163,7 @@ def _play(env: Any, config: EnvConfig, decisions: int, report: Report) -> None:
         "speed": f"{env_frames / seconds:.0f} steps/s, {1e3 * seconds / played:.1f} ms per decision",
     }
     if config.pixels == "render" or not is_by_id(config):
-        draw = partial(env.render_large, FRAME_SIZE) if config.pixels == "render" else env.render
+        draw = partial(env.render_large, config.frame_size) if config.pixels == "render" else env.render
         report.facts["pictures"] = f"{_time_pictures(draw):.1f} ms per frame"
     if max(rewards) == min(rewards):
         report.notes.append(f"every reward is {rewards[0]:g}: there may be nothing to learn from so few decisions")

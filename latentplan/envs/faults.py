@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import traceback
 import warnings
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -45,6 +46,59 @@ def check_picture(picture: Any, shape: tuple[int, ...]) -> np.ndarray:
     if given.min() < 0 or given.max() > 255:
         raise EnvironmentFault(f"{wanted}, got values {given.min()} to {given.max()}: scale them to 0 to 255")
     return given.astype(np.uint8)
+
+
+def check_unit_picture(picture: Any, shape: tuple[int, ...]) -> np.ndarray:
+    """An observation of floats in [0, 1] as an array of its own, uint8 of the shape that its space declares.
+
+    Raises:
+        EnvironmentFault: The observation is none of this; the message says what it is.
+    """
+    wanted = f"the environment must return frames of floats in [0, 1] {shape}"
+    try:
+        given = np.asarray(picture, dtype=np.float32)
+    except (TypeError, ValueError):
+        raise EnvironmentFault(f"{wanted}, got {type(picture).__name__}") from None
+    if given.shape != shape:
+        raise EnvironmentFault(f"{wanted}, got shape {given.shape}: declare in observation_space what it returns")
+    if not (given.min() >= 0.0 and given.max() <= 1.0):  # also NaN
+        remedy = "divide brightness by 255, or declare uint8 within 0 to 255"
+        raise EnvironmentFault(f"{wanted}, got {given.dtype} {_describe_range(given)}: {remedy}")
+    return np.rint(given * 255.0).astype(np.uint8)
+
+
+def check_vector(vector: Any, shape: tuple[int, ...]) -> np.ndarray:
+    """An observation of numbers, float32 of the shape that its space declares.
+
+    Raises:
+        EnvironmentFault: The observation is none of this, or is not finite; the message says what it is.
+    """
+    wanted = f"the environment must return vectors of finite numbers {shape}"
+    try:
+        with np.errstate(over="ignore"):
+            given = np.array(vector, dtype=np.float32)
+    except (TypeError, ValueError):
+        raise EnvironmentFault(f"{wanted}, got {shown(vector)}") from None
+    if given.shape != shape:
+        raise EnvironmentFault(f"{wanted}, got shape {given.shape}")
+    if not np.isfinite(given).all():
+        raise EnvironmentFault(f"{wanted}, got {given.dtype} {_describe_range(given)}")
+    return given
+
+
+def take_keys(observation: Any, keys: Sequence[str]) -> list[Any]:
+    """The values of an observation that is a dictionary, at some of its keys.
+
+    Raises:
+        EnvironmentFault: The observation is none, or lacks a key.
+    """
+    wanted = f"the environment must return observations that are dictionaries with {', '.join(map(repr, keys))}"
+    if not isinstance(observation, Mapping):
+        raise EnvironmentFault(f"{wanted}, got {type(observation).__name__}")
+    for key in keys:
+        if key not in observation:
+            raise EnvironmentFault(f"{wanted}, got {', '.join(map(repr, observation)) or 'no key'}")
+    return [observation[key] for key in keys]
 
 
 def check_reward(reward: Any) -> float:

@@ -14,6 +14,9 @@ one), and returns a `gymnasium.Env` with these spaces and values:
 optional; each of them enables one feature:
 
     decisions_per_episode   decisions until the time limit (the discount is derived from it)
+    spaces                  `latentplan.config.spaces.Spaces`: the shape of frames where it is another, and
+                            the numbers of the action that stand for categories
+                            `info["vectors"]` then holds the numbers that the agent sees beside the frame, if any
     labels                  scale of each named quantity; `info["labels"]` then holds the values, float32 (label,)
     render_large(size)      a larger picture, uint8 (size, size, 3), for films
     substeps_per_decision, step_schedule    actions that change within a decision, for worlds that do not wait

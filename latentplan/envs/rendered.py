@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from typing import Any
 
-import cv2
 import gymnasium
 import numpy as np
 
 from latentplan.config import UserError
 from latentplan.config.checks import EnvironmentFault
 from latentplan.envs.faults import describe_failure
+from latentplan.envs.spaces import resize
 
 MODE = "rgb_array"
 
@@ -67,17 +67,4 @@ class _Picture:
             raise EnvironmentFault(
                 f"render() must return pictures uint8 (height, width, 3), got {what}: correct the environment's render"
             )
-        return fit(picture, self._env.observation_space.shape[0])  # type: ignore[index]
-
-
-def fit(picture: np.ndarray, size: int) -> np.ndarray:
-    """The picture at another size, a new uint8 array (size, size, 3); a larger one is averaged, a smaller interpolated.
-
-    Args:
-        picture: The picture, uint8 (height, width, 3).
-        size: Height and width of the result, in pixels.
-    """
-    if picture.shape[:2] == (size, size):
-        return picture.copy()
-    shrinks = picture.shape[0] >= size and picture.shape[1] >= size
-    return cv2.resize(picture, (size, size), interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR)
+        return resize(picture, self._env.observation_space.shape[0])  # type: ignore[index]

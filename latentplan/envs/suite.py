@@ -12,7 +12,9 @@ import numpy as np
 from gymnasium.error import ResetNeeded
 
 from latentplan.config import EnvConfig, UserError
+from latentplan.config.checks import shown
 from latentplan.config.quantities import scales
+from latentplan.config.spaces import Spaces
 from latentplan.envs.gl import explain_gl_errors, require_backend
 from latentplan.envs.registry import default_task
 from latentplan.envs.render import FrameRenderer, draw_floor_behind
@@ -24,7 +26,7 @@ if TYPE_CHECKING:
 
     from dm_control.mujoco import Physics
 
-FRAME_SIZE = 64
+PROPRIOCEPTION = "proprioception"  # in `EnvConfig.vectors`: all parts of a task's observation
 _UNLIMITED_EPISODE_STEPS = 1000
 
 
@@ -44,6 +46,7 @@ class SuiteEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         record_quantities: Whether the `info` of a step holds the true values after each of its control steps:
             `quantities`, float64 (control step, quantity) in the order of `scales(domain)`, and `rewards`, float64
             (control step,).
+        spaces: What the networks have to know of actions and observations.
         labels: Names of the quantities in `info["labels"]`, each with its scale.
         substeps_per_decision: Steps of the simulator per decision: the finest resolution at which actions change.
     """
@@ -65,12 +68,16 @@ class SuiteEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         self._objective = None if config.objective is None else ObjectiveReward(config.objective, config.domain)
         task = default_task(config.domain) if config.task is None else config.task
         self._task_env = _load_task(config.domain, task)
-        self._camera = _check_camera(self.physics, config)
+        self._cameras = _check_cameras(self.physics, config)
+        self._frame_size = config.frame_size
+        self._vectors = config.vectors
+        vector_dim = len(self._measure_vectors()) if self._vectors else 0
+        self.spaces = Spaces(frame_size=config.frame_size, cameras=len(self._cameras), vector_dim=vector_dim)
         if config.floor == "endless":
             draw_floor_behind(self.physics)
         self.domain, self._quality = config.domain, config.render_quality
         self.labels = scales(config.domain)
-        self._renderers: dict[int, FrameRenderer] = {}
+        self._renderers: dict[tuple[int, int], FrameRenderer] = {}
         self._needs_reset = True
         self._steps_left = 0
         # An episode lasts for the first whole number of steps that reaches dm_control's limit.
@@ -87,7 +94,7 @@ class SuiteEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         bounded = self.physics.model.actuator_ctrllimited.astype(bool)
         self._action_low = np.where(bounded, spec.minimum, -1.0)
         self._action_high = np.where(bounded, spec.maximum, 1.0)
-        self.observation_space = gymnasium.spaces.Box(0, 255, (FRAME_SIZE, FRAME_SIZE, 3), np.uint8)
+        self.observation_space = gymnasium.spaces.Box(0, 255, self.spaces.frame_shape, np.uint8)
         self.action_space = gymnasium.spaces.Box(-1.0, 1.0, spec.shape, np.float32)
         self._seed_task(seed)
 
@@ -120,7 +127,7 @@ class SuiteEnv(gymnasium.Env[np.ndarray, np.ndarray]):
             renderer.refresh_terrain()
         self._steps_left = self._steps_per_episode
         self._needs_reset = False
-        return self.render(), self._info(0)
+        return self._observe(), self._info(0)
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
         """Holds an action for `action_repeat` control steps.
@@ -170,17 +177,25 @@ class SuiteEnv(gymnasium.Env[np.ndarray, np.ndarray]):
             self._needs_reset = outcome.last() or self._steps_left <= 0
             if self._needs_reset:
                 break
-        return self.render(), reward, terminated, self._needs_reset and not terminated, self._info(env_frames)
+        return self._observe(), reward, terminated, self._needs_reset and not terminated, self._info(env_frames)
 
     def render(self) -> np.ndarray:  # type: ignore[override]
-        """The agent's frame of the present state, a new uint8 array (64, 64, 3)."""
-        return self.render_large(FRAME_SIZE)
+        """The first camera's picture of the present state, a new uint8 array (64, 64, 3)."""
+        return self.render_large(self._frame_size)
 
     def render_large(self, size: int) -> np.ndarray:
-        """The present state through the same camera at another resolution, a new uint8 array (size, size, 3)."""
-        if size not in self._renderers:
-            self._renderers[size] = FrameRenderer(self.physics, size, self._camera, self._quality)
-        return self._renderers[size].render()
+        """The present state through the first camera at another resolution, a new uint8 array (size, size, 3)."""
+        return self._draw(size, self._cameras[0])
+
+    def _draw(self, size: int, camera: int) -> np.ndarray:
+        if (size, camera) not in self._renderers:
+            self._renderers[size, camera] = FrameRenderer(self.physics, size, camera, self._quality)
+        return self._renderers[size, camera].render()
+
+    def _observe(self) -> np.ndarray:
+        """The agent's frame of the present state, a new uint8 array (64, 64, 3 * camera)."""
+        pictures = [self._draw(self._frame_size, camera) for camera in self._cameras]
+        return pictures[0] if len(pictures) == 1 else np.concatenate(pictures, axis=2)
 
     def close(self) -> None:
         """Frees OpenGL contexts and simulator; the environment cannot be used afterwards."""
@@ -192,11 +207,26 @@ class SuiteEnv(gymnasium.Env[np.ndarray, np.ndarray]):
 
     def _info(self, env_frames: int) -> dict[str, Any]:
         info = {"env_frames": env_frames, "labels": measure(self.domain, self.physics)}
+        if self._vectors:
+            info["vectors"] = self._measure_vectors()
         if self._recorded:
             quantities, rewards = zip(*self._recorded, strict=True)
             info |= {"quantities": np.stack(quantities), "rewards": np.array(rewards)}
             self._recorded.clear()
         return info
+
+    def _measure_vectors(self) -> np.ndarray:
+        """The parts of the task's observation that the settings name, float32 (number,).
+
+        Raises:
+            UserError: The task's observation has no such part.
+        """
+        observed = self._task_env.task.get_observation(self.physics)
+        known = {**observed, PROPRIOCEPTION: np.concatenate([np.ravel(value) for value in observed.values()])}
+        for name in self._vectors:
+            if name not in known:
+                raise UserError(f"env.vectors names {shown(name)}; the task has {', '.join(known)}")
+        return np.concatenate([np.ravel(known[name]) for name in self._vectors]).astype(np.float32)
 
     def _control_step_reward(self, reward: float) -> float:
         """The reward of the latest control step; also recorded, with the quantities, if `record_quantities` is set.
@@ -251,7 +281,18 @@ def _quiet_model_compiler() -> Iterator[None]:
         logger.setLevel(before)
 
 
-def _check_camera(physics: Physics, config: EnvConfig) -> int:
-    if config.camera >= physics.model.ncam:
-        raise UserError(f"camera {config.camera} does not exist; {config.domain} has {physics.model.ncam} cameras")
-    return config.camera
+def _check_cameras(physics: Physics, config: EnvConfig) -> list[int]:
+    """The ids of the cameras that the settings name.
+
+    Raises:
+        UserError: One of them does not exist.
+    """
+    count = physics.model.ncam
+    for name in config.cameras:
+        if not name.isdecimal():
+            raise UserError(f"--env.cameras takes camera ids of {config.domain}, 0 to {count - 1}, got {shown(name)}")
+    cameras = [int(name) for name in config.cameras] or [config.camera]
+    for camera in cameras:
+        if camera >= count:
+            raise UserError(f"camera {camera} does not exist; {config.domain} has {count} cameras")
+    return cameras

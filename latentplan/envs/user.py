@@ -10,9 +10,9 @@ import numpy as np
 from gymnasium.error import ResetNeeded
 
 from latentplan.config import EnvConfig, UserError
-from latentplan.envs.faults import check_picture, check_reward
-from latentplan.envs.rendered import MODE, RenderedEnv, fit
-from latentplan.envs.suite import FRAME_SIZE
+from latentplan.envs.faults import check_reward
+from latentplan.envs.rendered import MODE, RenderedEnv
+from latentplan.envs.spaces import Actions, Observations, accept_spaces, resize
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -27,11 +27,11 @@ def make_from(
 ) -> Callable[[EnvConfig, int | None], PixelEnv]:
     """A function with the signature of `make_env` that builds a user's environments.
 
-    The function reads `action_repeat` and `pixels` of the settings, and raises `UserError` where the factory returns no
-    `gymnasium.Env` or an environment that `wrap_user_env` refuses.
+    The function reads `action_repeat`, `pixels`, `frame_size`, `cameras` and `vectors` of the settings, and raises
+    `UserError` where the factory returns no `gymnasium.Env` or an environment that `wrap_user_env` refuses.
 
     Args:
-        factory: Returns a new environment with image observations and a bounded Box of actions.
+        factory: Returns a new environment with spaces that `accept_spaces` accepts.
     """
 
     def build(config: EnvConfig, seed: int | None = None) -> PixelEnv:
@@ -49,21 +49,26 @@ def wrap_user_env(
     """A user's environment with the interface for agents: frames of 64 x 64, actions in [-1, 1], action repeat.
 
     Args:
-        env: A gymnasium environment. `env.observation_space` is a Box of uint8 images (height, width, 3), RGB, of any
-            size; larger images are averaged down, smaller images are interpolated. `env.action_space` is a bounded Box
-            of floats (action,).
+        env: A gymnasium environment. `env.observation_space` is a picture of any size (see
+            `latentplan.envs.spaces.Picture`), or a Dict of pictures, one for each camera; larger images are averaged
+            down, smaller images are interpolated. `env.action_space` is a bounded Box
+            of any shape, Discrete, MultiDiscrete, MultiBinary, or a Dict or Tuple of them.
         action_repeat: Steps of `env` per decision, at least 1; a step of the result repeats the action for this number
             of steps of `env`, or until the episode ends, and sums the rewards.
         seed: Seed of the first reset that is called without one; None draws a seed from the system.
-        config: Its `pixels` says where the frames come from; None takes `observation`. With `render` they are what
-            `env.render()` draws, which needs `env.render_mode` "rgb_array", and the observations may be anything.
+        config: Size of the frames, names of cameras and vectors, such as `agent.config.env`; None takes the defaults.
+            With `pixels` "render" the frames are what `env.render()` draws, which needs `env.render_mode` "rgb_array",
+            and the observations may be anything.
 
     Returns:
         An environment with these properties:
 
-        - Observations are uint8 (64, 64, 3), each a new array.
-        - Actions are float32 (action,) in [-1, 1]. The interval is mapped linearly to the bounds of
-          `env.action_space`; values outside are clipped.
+        - Observations are uint8 (64, 64, 3), each a new array. Another `frame_size` and several cameras, which lie side
+          by side along the last axis, change this shape.
+        - Actions are float32 (action,) in [-1, 1], all numbers of `env.action_space` side by side; values outside are
+          clipped. The interval is mapped linearly to the bounds of a Box. A choice of n categories is one number: the
+          interval has n equal parts, one for each category.
+        - `info["vectors"]` holds the numbers that `config.vectors` names, float32 (vector,), if it names any.
         - `info["env_frames"]` of a step is the number of steps of `env` that it took; `info` of `env` is kept.
         - An environment without a time limit is truncated after 1000 decisions.
         - `step` raises `ResetNeeded` after the end of an episode, and `ValueError` for an action of another shape or
@@ -73,9 +78,10 @@ def wrap_user_env(
         UserError: `action_repeat` is below 1, or a space is not as described; the message names the space and the
             reason and the remedy.
     """
-    env = RenderedEnv(env, FRAME_SIZE) if config is not None and config.pixels == "render" else env
-    refuse_spaces(env)
-    return PixelEnv(env, action_repeat, seed)
+    config = config or EnvConfig()
+    env = RenderedEnv(env, config.frame_size) if config.pixels == "render" else env
+    refuse_spaces(env, config)
+    return PixelEnv(env, action_repeat, seed, config)
 
 
 class PixelEnv(gymnasium.Env[np.ndarray, np.ndarray]):
@@ -85,20 +91,27 @@ class PixelEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         action_repeat: Steps of the inner environment per decision; rewards are summed over them.
         decisions_per_episode: Decisions until the time limit of the environment's spec or of a `TimeLimit` wrapper.
             None without a time limit; then an episode is truncated after `MAX_DECISIONS` decisions.
+        spaces: What the networks have to know of actions and observations.
     """
 
     metadata = {"render_modes": ["rgb_array"]}
     render_mode = "rgb_array"
 
-    def __init__(self, env: gymnasium.Env[Any, Any], action_repeat: int, seed: int | None = None) -> None:
+    def __init__(
+        self,
+        env: gymnasium.Env[Any, Any],
+        action_repeat: int,
+        seed: int | None = None,
+        config: EnvConfig | None = None,
+    ) -> None:
         """Checks the spaces; see `wrap_user_env`."""
         if action_repeat < 1:
             raise UserError(f"action_repeat must be at least 1, got {action_repeat}")
-        _check_observations(env.observation_space)
-        self._inner_actions = _check_actions(env.action_space)
+        accepted = accept_spaces(env.observation_space, env.action_space, config)
+        self._observations, self._actions, self.spaces = accepted.observations, accepted.actions, accepted.spaces
         self._env = env
         self._first_seed = seed
-        self._picture = np.zeros((FRAME_SIZE, FRAME_SIZE, 3), dtype=np.uint8)
+        self._picture = np.zeros((self.spaces.frame_size, self.spaces.frame_size, 3), dtype=np.uint8)
         self._needs_reset = True
         self._decisions = 0
         self.action_repeat = action_repeat
@@ -108,18 +121,18 @@ class PixelEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         if rate := env.metadata.get("render_fps"):
             self.metadata = {**PixelEnv.metadata, "render_fps": rate / action_repeat}
         self.decisions_per_episode = None if limit is None else math.ceil(limit / action_repeat)
-        self.observation_space = gymnasium.spaces.Box(0, 255, (FRAME_SIZE, FRAME_SIZE, 3), np.uint8)
-        self.action_space = gymnasium.spaces.Box(-1.0, 1.0, self._inner_actions.shape, np.float32)
+        self.observation_space = gymnasium.spaces.Box(0, 255, self.spaces.frame_shape, np.uint8)
+        self.action_space = gymnasium.spaces.Box(-1.0, 1.0, (self._actions.dim,), np.float32)
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[np.ndarray, dict[str, Any]]:
-        """Begins an episode; returns the first frame (64, 64, 3) and the inner environment's info."""
+        """Begins an episode; returns the first frame and the inner environment's info."""
         seed, self._first_seed = self._first_seed if seed is None else seed, None
         super().reset(seed=seed)
         picture, info = self._env.reset(seed=seed, options=options)
         self._needs_reset, self._decisions = False, 0
-        return self._to_frame(picture), {**info, "env_frames": 0}
+        return self._to_frame(picture), {**info, **self._to_vectors(picture), "env_frames": 0}
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
         """Holds an action (action,) in [-1, 1] for `action_repeat` steps of the inner environment.
@@ -134,11 +147,7 @@ class PixelEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         """
         if self._needs_reset:
             raise ResetNeeded("the episode is over; call reset() first")
-        if np.shape(action) != self.action_space.shape or not np.isfinite(action).all():
-            raise ValueError(f"the action must be {self.action_space.shape} finite numbers, got {action!r}")
-        low, high = (bound.astype(np.float64) for bound in (self._inner_actions.low, self._inner_actions.high))
-        scaled = low + (np.clip(action, -1.0, 1.0) + 1.0) * 0.5 * (high - low)
-        scaled = scaled.clip(low, high).astype(self._inner_actions.dtype)
+        scaled = self.inner_action(action)
         total, env_frames, terminated, truncated = 0.0, 0, False, False
         while env_frames < self.action_repeat and not (terminated or truncated):
             picture, reward, terminated, truncated, info = self._env.step(scaled)
@@ -147,83 +156,57 @@ class PixelEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         self._decisions += 1
         truncated = truncated or (self.decisions_per_episode is None and self._decisions == MAX_DECISIONS)
         self._needs_reset = bool(terminated or truncated)
-        return self._to_frame(picture), total, bool(terminated), bool(truncated), {**info, "env_frames": env_frames}
+        info = {**info, **self._to_vectors(picture), "env_frames": env_frames}
+        return self._to_frame(picture), total, bool(terminated), bool(truncated), info
+
+    def inner_action(self, action: np.ndarray) -> Any:
+        """The value of the inner environment's action space for an agent's action (action,) in [-1, 1].
+
+        Raises:
+            ValueError: The action has another shape or is not finite.
+        """
+        if np.shape(action) != self.action_space.shape or not np.isfinite(action).all():
+            raise ValueError(f"the action must be {self.action_space.shape} finite numbers, got {action!r}")
+        return self._actions.value(action)
 
     def render(self) -> np.ndarray:  # type: ignore[override]
-        """The last frame, a new uint8 array (64, 64, 3)."""
-        return fit(self._picture, FRAME_SIZE)
+        """The first camera's last picture, a new uint8 array (64, 64, 3)."""
+        return resize(self._picture, self.spaces.frame_size)
 
     def render_large(self, size: int) -> np.ndarray:
         """The inner environment's rendering where it has one, else its last observation, uint8 (size, size, 3)."""
         rendered = self._env.render() if self._env.render_mode == "rgb_array" else None
-        return fit(self._picture if rendered is None else np.asarray(rendered), size)
+        return resize(self._picture if rendered is None else np.asarray(rendered), size)
 
     def close(self) -> None:
         """Closes the inner environment."""
         self._env.close()
 
-    def _to_frame(self, picture: np.ndarray) -> np.ndarray:
-        self._picture = check_picture(picture, self._env.observation_space.shape or ())
-        return fit(self._picture, FRAME_SIZE)
+    def _to_vectors(self, observation: Any) -> dict[str, np.ndarray]:
+        """The entry of an info with the numbers beside the frame, if the agent sees any."""
+        return {"vectors": self._observations.read_vectors(observation)} if self.spaces.vector_dim else {}
+
+    def _to_frame(self, observation: Any) -> np.ndarray:
+        frame, self._picture = self._observations.read(observation)
+        return frame
 
 
-def _check_observations(space: gymnasium.Space[Any]) -> None:
-    wanted = "observations must be a Box of uint8 images (height, width, 3)"
-    if not isinstance(space, gymnasium.spaces.Box):
-        remedy = "return one picture, by a gymnasium.ObservationWrapper"
-        raise UserError(f"{wanted}, got {type(space).__name__}: {remedy}")
-    if len(space.shape) != 3 or space.shape[2] != 3:
-        remedy = "return a picture with its three colours last, by a gymnasium.ObservationWrapper"
-        raise UserError(f"{wanted}, got shape {space.shape}: {remedy}")
-    if space.dtype != np.uint8:
-        raise UserError(f"{wanted}, got dtype {space.dtype}: return brightness 0 to 255 as np.uint8")
-
-
-def _check_actions(space: gymnasium.Space[Any]) -> gymnasium.spaces.Box:
-    wanted = "actions must be a bounded Box of floats with shape (action,)"
-    if not isinstance(space, gymnasium.spaces.Box):
-        remedy = "declare a Box and translate it, by a gymnasium.ActionWrapper"
-        raise UserError(f"{wanted}, got {type(space).__name__}: {remedy}")
-    if not np.issubdtype(space.dtype, np.floating):
-        raise UserError(f"{wanted}, got dtype {space.dtype}: declare np.float32, and round in step")
-    if len(space.shape) != 1 or space.shape[0] == 0:
-        raise UserError(f"{wanted}, got shape {space.shape}: flatten it, by gymnasium.wrappers.TransformAction")
-    with np.errstate(over="ignore", invalid="ignore"):
-        is_bounded = bool(np.isfinite(space.high - space.low).all())
-    if not is_bounded:
-        bounds = f"{space.low} to {space.high}"
-        raise UserError(f"{wanted}, got bounds {bounds}: declare finite low and high in action_space")
-    return space
-
-
-def accept_spaces(observation_space: gymnasium.Space[Any], action_space: gymnasium.Space[Any]) -> None:
-    """Decides whether agents can learn in an environment with these spaces.
-
-    Raises:
-        UserError: A space is not accepted; the message names the space, what it is and the remedy.
-    """
-    _check_observations(observation_space)
-    _check_actions(action_space)
-
-
-def describe_refusals(env: gymnasium.Env[Any, Any]) -> list[str]:
+def describe_refusals(env: gymnasium.Env[Any, Any], config: EnvConfig | None = None) -> list[str]:
     """One line for each space of an environment that agents cannot learn with, with its remedy; empty without one.
 
     Args:
         env: The environment.
+        config: Size of the frames, names of cameras and vectors; None takes the defaults.
     """
-    pictures = gymnasium.spaces.Box(0, 255, (FRAME_SIZE, FRAME_SIZE, 3), np.uint8)
-    numbers = gymnasium.spaces.Box(-1.0, 1.0, (1,), np.float32)
-    problems = []
+    config, space, problems = config or EnvConfig(), env.action_space, []
     try:
-        accept_spaces(env.observation_space, numbers)
+        Observations(env.observation_space, config.frame_size, config.cameras, config.vectors)
     except UserError as error:
         can_render = MODE in env.metadata.get("render_modes", ())
         shows = f"; --env.pixels render takes what its render() draws instead (render_mode '{MODE}')"
         problems.append(f"{error}{shows if can_render else ''}")
     try:
-        accept_spaces(pictures, env.action_space)
-        space = env.action_space
+        Actions(space)
         if isinstance(space, gymnasium.spaces.Box) and np.ptp([space.low, space.high], axis=0).max() > LARGEST_RANGE:
             raise UserError(
                 f"actions range from {space.low.min():g} to {space.high.max():g}, further than {LARGEST_RANGE:g}: "
@@ -234,12 +217,12 @@ def describe_refusals(env: gymnasium.Env[Any, Any]) -> list[str]:
     return problems
 
 
-def refuse_spaces(env: gymnasium.Env[Any, Any]) -> None:
+def refuse_spaces(env: gymnasium.Env[Any, Any], config: EnvConfig) -> None:
     """Refuses an environment that agents cannot learn in.
 
     Raises:
         UserError: See `describe_refusals`.
     """
-    problems = describe_refusals(env)
+    problems = describe_refusals(env, config)
     if problems:
         raise UserError("; ".join(problems))

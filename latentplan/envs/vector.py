@@ -56,6 +56,7 @@ def make_vector_env(
 
     Returns:
         A gymnasium vector environment: observations uint8 (env, 64, 64, 3); rewards, terminated and truncated (env,).
+        The entry `labels` of its info holds the labels of each environment and then its vectors, (env, number).
 
     Raises:
         UserError: The environment cannot be built.
@@ -236,7 +237,8 @@ class GuardedVectorEnv(VectorEnv[np.ndarray, np.ndarray, Any]):
 
     def _keep(self, index: int, frame: Any, info: dict[str, Any]) -> None:
         self._frames[index] = frame
-        self._labels[index] = info.get("labels")
+        known = [info[name] for name in ("labels", "vectors") if info.get(name) is not None]
+        self._labels[index] = np.concatenate(known) if known else None
 
     def _info(self, env_frames: np.ndarray, failed: np.ndarray) -> dict[str, Any]:
         info: dict[str, Any] = {"env_frames": env_frames, "failed": failed}
@@ -349,15 +351,19 @@ class EnvMaker:
 
 
 class _WithoutInfo(gymnasium.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarray]):
-    """A user's environment with `env_frames` as its only info, because other entries may not fit into one array."""
+    """A user's environment without infos of its own, because their entries may not fit into one array."""
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         frame, info = self.env.reset(seed=seed, options=options)
-        return frame, {"env_frames": info["env_frames"]}
+        return frame, _known(info)
 
     def step(self, action: np.ndarray) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
         frame, reward, terminated, truncated, info = self.env.step(action)
-        return frame, reward, terminated, truncated, {"env_frames": info["env_frames"]}
+        return frame, reward, terminated, truncated, _known(info)
+
+
+def _known(info: dict[str, Any]) -> dict[str, Any]:
+    return {name: info[name] for name in ("env_frames", "vectors") if name in info}
 
 
 def _derive_env_seed(seed: int | None, index: int) -> int | None:

@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from latentplan.agents.base import Agent
+from latentplan.agents.base import Agent, Seen
 from latentplan.config import derive_seed
 from latentplan.config.latency import MEASURED, read_durations
 from latentplan.planning.model import State, state_device
@@ -59,7 +59,7 @@ class VirtualClock:
         """A duration as a number of periods of the world; 0 in a world that waits."""
         return 0.0 if self.control_hz is None else duration_ms * self.control_hz / 1000.0
 
-    def decide(self, agent: Agent, frame: NDArray[np.uint8]) -> tuple[NDArray[np.float32], float]:
+    def decide(self, agent: Agent, frame: Seen) -> tuple[NDArray[np.float32], float]:
         """The agent's action, (action,), for the present frame, and the milliseconds charged for the decision."""
         self._decision_began, self._plan_ms = time.perf_counter(), 0.0
         action = agent.act(frame)

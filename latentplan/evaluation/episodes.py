@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, Protocol, SupportsFloat
 import numpy as np
 from numpy.typing import NDArray
 
-from latentplan.agents.base import Agent
+from latentplan.agents.base import Agent, Seen
 from latentplan.config import UserError, derive_seed
 from latentplan.evaluation.statistics import Episode, EpisodeRecord, summarize
 
@@ -134,7 +134,7 @@ class World(Protocol):
         """Prepares an episode; called after the reset of environment and agent."""
         ...
 
-    def decide(self, agent: Agent, frame: Frame) -> Action:
+    def decide(self, agent: Agent, frame: Seen) -> Action:
         """The agent's latest action, (action,): for this frame, or for an earlier frame while the agent is busy."""
         ...
 
@@ -156,7 +156,7 @@ class WaitingWorld:
     def begin(self, seed: int) -> None:
         """Does nothing: no time passes in this world."""
 
-    def decide(self, agent: Agent, frame: Frame) -> Action:
+    def decide(self, agent: Agent, frame: Seen) -> Action:
         """The action that the agent chooses for a frame; its decision time is recorded."""
         started = time.perf_counter()
         self._action = agent.act(frame)
@@ -182,13 +182,13 @@ def play_episode(env: Any, agent: Agent, index: int, seed: int, world: World, on
     Raises:
         UserError: The environment gave a reward that is not finite.
     """
-    frame, _ = env.reset(seed=seed)
+    frame, info = env.reset(seed=seed)
     agent.reset()
     agent.seed(derive_seed(seed, "agent"))  # independent of the stream of the start
     world.begin(seed)
     record, decision, is_over = world.record, 0, False
     while not is_over:
-        action = world.decide(agent, frame)
+        action = world.decide(agent, see(frame, info))
         if on_step is not None:
             on_step(Step(index, decision, record.total_return, frame, action))
         frame, reward, terminated, truncated, info = world.step()
@@ -198,6 +198,11 @@ def play_episode(env: Any, agent: Agent, index: int, seed: int, world: World, on
     if on_step is not None:
         on_step(Step(index, decision, record.total_return, frame, None))
     return record.episode()
+
+
+def see(frame: Frame, info: dict[str, Any]) -> Seen:
+    """What an agent sees: the frame, and the numbers beside it where the environment reports some."""
+    return (frame, info["vectors"]) if "vectors" in info else frame
 
 
 def _check_reward(reward: SupportsFloat) -> float:

@@ -23,12 +23,12 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from latentplan.agents.base import Agent
+from latentplan.agents.base import Agent, Seen
 from latentplan.agents.checkpoint import load_agent
 from latentplan.agents.modes import MODES
 from latentplan.config import UserError
 from latentplan.evaluation.clock import VirtualClock, VirtualExecutor
-from latentplan.evaluation.episodes import Action, Frame, OnStep, Outcome, play_episode
+from latentplan.evaluation.episodes import Action, Frame, OnStep, Outcome, play_episode, see
 from latentplan.evaluation.statistics import Episode, EpisodeRecord, latency_percentiles, summarize
 
 WARM_UP_DECISIONS = 2
@@ -168,7 +168,7 @@ class RunningWorld:
         """Restarts the clock."""
         self.clock.restart(seed)
 
-    def decide(self, agent: Agent, frame: Frame) -> Action:
+    def decide(self, agent: Agent, frame: Seen) -> Action:
         """The agent's latest action, (action,): a new action unless the agent is still deciding on an earlier frame."""
         self.clock.advance(self._periods)
         if self._actions.is_waiting:
@@ -208,7 +208,7 @@ def _zero_action(env: ScheduledEnv) -> Action:
 
 def _warm_up(env: ScheduledEnv, agent: Agent, seed: int) -> None:
     """Makes a few decisions that are not counted, because the first calls of libraries are slow."""
-    frame, _ = env.reset(seed=seed)
+    frame, info = env.reset(seed=seed)
     agent.reset()
     for _ in range(WARM_UP_DECISIONS):
-        agent.act(frame)
+        agent.act(see(frame, info))

@@ -15,6 +15,8 @@ from einops import rearrange
 from torch import Tensor
 
 from latentplan.models.dynamics import Gaussian, State, kl_divergence, surprise
+from latentplan.models.encoder import Observation
+from latentplan.models.heads import MixedActor
 
 if TYPE_CHECKING:
     from latentplan.models.heads import Mlp, ScalarHead
@@ -35,27 +37,29 @@ class FrameFunctions:
         # A reference to the model would close a circle, because the model's backend keeps these functions.
         self._encoder, self._dynamics, self._actor = model.encoder, model.dynamics, model.actor
 
-    def infer(self, state: State, action: Tensor | None, frames: Tensor, is_first: Tensor | None = None) -> State:
+    def infer(
+        self, state: State, action: Tensor | None, frames: Tensor | Observation, is_first: Tensor | None = None
+    ) -> State:
         """The belief, with the posterior's mean, after actions and the frames that resulted.
 
         Args:
             state: The belief before the action, (rows, ...).
             action: Actions in [-1, 1], (rows, action); None if `state.deter` is the state at the frame already.
-            frames: Frames after the actions, uint8 (rows, 64, 64, 3).
+            frames: Frames after the actions, uint8 (rows, 64, 64, 3) or the model's other shape, perhaps with vectors.
             is_first: Rows whose episode begins with the frame, (rows,) bool; None stands for no row.
         """
         deter = self._find_deter(state, action, is_first)
         return State(deter, self._dynamics.posterior(deter, self._encoder(frames)).mean)
 
     def infer_and_act(
-        self, state: State, action: Tensor | None, frames: Tensor, is_first: Tensor | None = None
+        self, state: State, action: Tensor | None, frames: Tensor | Observation, is_first: Tensor | None = None
     ) -> tuple[State, Tensor, Tensor]:
         """The belief of `infer`, and mean and std of the actor's action at this belief; see `act`."""
         belief = self.infer(state, action, frames, is_first)
         return belief, *self.act(belief)
 
     def infer_and_compare(
-        self, state: State, action: Tensor | None, frames: Tensor, is_first: Tensor | None = None
+        self, state: State, action: Tensor | None, frames: Tensor | Observation, is_first: Tensor | None = None
     ) -> tuple[State, Tensor]:
         """The belief of `infer`, and KL(posterior || prior) of its latent in nats, (rows,)."""
         deter = self._find_deter(state, action, is_first)
@@ -131,8 +135,11 @@ class Backend:
         actions: list[Tensor] = []
         for draw in noise.unbind(1):
             with model.trunk_precision():
-                mean, std = model.actor(state.features)
-                actions.append((mean + std * draw).clamp(-1.0, 1.0))
+                if isinstance(model.actor, MixedActor):
+                    actions.append(model.actor.sample(state.features, draw))
+                else:
+                    mean, std = model.actor(state.features)
+                    actions.append((mean + std * draw).clamp(-1.0, 1.0))
                 state = _advance_by_mean(model, state, actions[-1])
         return torch.stack(actions, 1)
 
@@ -205,6 +212,29 @@ class Backend:
     ) -> tuple[Tensor, Tensor]:
         """See `Dynamics.imagine`, with the model's actor as the policy; gradients reach the actor."""
         return model.dynamics.imagine(model.actor, start, action_noise, noise, decay)
+
+    @torch.no_grad()
+    def sample(self, model: WorldModel, start: State, action_noise: Tensor, noise: Tensor) -> tuple[Tensor, Tensor]:
+        """Rollouts of a model whose actor is a `MixedActor`, with samples of actor and prior and without gradients.
+
+        Args:
+            model: The world model.
+            start: Start of every rollout, (rows, ...) each.
+            action_noise: Standard normal draws for the actions, (horizon, rows, action).
+            noise: Standard normal draws for the latents, (horizon, rows, latent).
+
+        Returns:
+            Features, the start first, (horizon + 1, rows, feature), and the actions, (horizon, rows, action).
+        """
+        assert isinstance(model.actor, MixedActor)
+        state, features, actions = start, [start.features], []
+        for action_draws, draws in zip(action_noise.unbind(), noise.unbind(), strict=True):
+            actions.append(model.actor.sample(features[-1], action_draws))
+            deter = model.dynamics.advance(state, actions[-1])
+            prior = model.dynamics.prior(deter)
+            state = State(deter, torch.addcmul(prior.mean, prior.std, draws))
+            features.append(state.features)
+        return torch.stack(features), torch.stack(actions)
 
     def apply(self, network: Mlp, features: Tensor) -> Tensor:
         """The outputs of a network, (..., out), for features (..., in); gradients reach features and weights."""

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from latentplan.models.heads import NormedLinear, sample_action, single_or_double
+from latentplan.models.heads import ActionCode, NormedLinear, sample_action, single_or_double
 
 MIN_STD = 0.1
 UPDATE_SHIFT = 1.0  # subtracted before the update gate's sigmoid, so that untrained states change slowly
@@ -144,12 +144,32 @@ class Dynamics(nn.Module):
 
 
 class Rssm(Dynamics):
-    """A GRU with a layer norm on its gates beside a Gaussian latent."""
+    """A GRU with a layer norm on its gates beside a Gaussian latent.
 
-    def __init__(self, latent_dim: int, deter_dim: int, hidden_dim: int, action_dim: int, embedding_dim: int) -> None:
+    Args:
+        latent_dim: Size of the latent.
+        deter_dim: Size of the GRU's state.
+        hidden_dim: Width of the hidden layers.
+        action_dim: Size of the action.
+        embedding_dim: Size of an embedding.
+        choices: Numbers of the action that stand for categories, which are read as one-hot vectors; see
+            `latentplan.config.spaces.Spaces`.
+    """
+
+    def __init__(
+        self,
+        latent_dim: int,
+        deter_dim: int,
+        hidden_dim: int,
+        action_dim: int,
+        embedding_dim: int,
+        choices: Sequence[int] = (),
+    ) -> None:
         super().__init__()
         self.latent_dim, self.deter_dim = latent_dim, deter_dim
-        self.input = NormedLinear(latent_dim + action_dim, hidden_dim)
+        self.code = ActionCode(choices) if any(choices) else None
+        code_dim = action_dim if self.code is None else self.code.size
+        self.input = NormedLinear(latent_dim + code_dim, hidden_dim)
         self.gates = nn.Linear(hidden_dim + deter_dim, 3 * deter_dim, bias=False)
         self.gates_norm = nn.LayerNorm(3 * deter_dim)
         self.prior_hidden = NormedLinear(deter_dim, hidden_dim)
@@ -160,9 +180,13 @@ class Rssm(Dynamics):
 
     def advance(self, state: State, action: Tensor) -> Tensor:
         """See `Dynamics.advance`."""
-        hidden = self.input(torch.cat([state.stoch, action], -1))
+        hidden = self.input(torch.cat([state.stoch, self.read(action)], -1))
         gates = self.gates_norm(self.gates(torch.cat([hidden, state.deter.to(hidden.dtype)], -1)))
         return next_deter(gates, state.deter)
+
+    def read(self, actions: Tensor) -> Tensor:
+        """The inputs of the GRU, (..., input), for actions (..., action): the actions, with categories as one-hot."""
+        return actions if self.code is None else self.code(actions)
 
     def prior(self, deter: Tensor) -> Gaussian:
         """See `Dynamics.prior`."""

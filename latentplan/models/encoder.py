@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from itertools import pairwise
 
 import torch
@@ -9,30 +10,70 @@ from einops import rearrange
 from torch import Tensor, nn
 from torch.nn import functional
 
-from latentplan.models.heads import single_or_double
+from latentplan.models.heads import Mlp, single_or_double, symlog
 
 FRAME_SIZE = 64
 PATCH = 4
+
+
+@dataclass(frozen=True)
+class Observation:
+    """Frames, and numbers beside them.
+
+    Attributes:
+        frames: uint8 (rows, height, width, channel).
+        vectors: float32 (rows, vector).
+    """
+
+    frames: Tensor
+    vectors: Tensor
+
+    def __len__(self) -> int:
+        """The number of rows."""
+        return len(self.frames)
 
 
 class Encoder(nn.Module):
     """Patches of 4 x 4 pixels through one matrix product, strided convolutions, and one linear layer.
 
     The patches are a convolution with stride 4, written as a matrix product because CPUs compute products faster. The
-    encoder reads all 64 x 64 pixels.
+    encoder reads all pixels.
+
+    Args:
+        channels: Channels of the layers.
+        embedding_dim: Size of an embedding.
+        frame_shape: Shape of a frame: (height, width, channel).
+        vector_dim: Numbers beside a frame; an MLP reads them, and its output is added to the embedding.
+        hidden_dim: Width of the hidden layers of the MLP.
     """
 
-    def __init__(self, channels: tuple[int, ...], embedding_dim: int) -> None:
+    def __init__(
+        self,
+        channels: tuple[int, ...],
+        embedding_dim: int,
+        frame_shape: tuple[int, int, int] = (FRAME_SIZE, FRAME_SIZE, 3),
+        vector_dim: int = 0,
+        hidden_dim: int = 1,
+    ) -> None:
         super().__init__()
-        self.patches = nn.Linear(3 * PATCH * PATCH, channels[0])
+        self.patches = nn.Linear(frame_shape[2] * PATCH * PATCH, channels[0])
         self.convolutions = nn.ModuleList(
             nn.Conv2d(before, after, kernel_size=4, stride=2, padding=1) for before, after in pairwise(channels)
         )
-        side = FRAME_SIZE // PATCH // 2 ** (len(channels) - 1)
+        side = frame_shape[0] // PATCH // 2 ** (len(channels) - 1)
         self.linear = nn.Linear(channels[-1] * side * side, embedding_dim)
+        if vector_dim:
+            self.vectors = Mlp(vector_dim, hidden_dim, embedding_dim)
 
-    def forward(self, frames: Tensor) -> Tensor:
-        """Embeddings, float32 (rows, embedding), of uint8 frames (rows, 64, 64, 3)."""
+    def read_vectors(self, vectors: Tensor) -> Tensor:
+        """What numbers (..., vector) add to the embedding, float32 (..., embedding)."""
+        return self.vectors(symlog(vectors))
+
+    def forward(self, frames: Tensor | Observation) -> Tensor:
+        """Embeddings, float32 (rows, embedding), of uint8 frames (rows, height, width, channel)."""
+        if isinstance(frames, Observation):
+            embeddings: Tensor = self(frames.frames) + self.read_vectors(frames.vectors)
+            return embeddings
         patches = rearrange(
             frames, "rows (height y) (width x) channel -> rows height width (y x channel)", y=PATCH, x=PATCH
         )

@@ -7,6 +7,8 @@ bfloat16 step is larger than the differences that a planner has to distinguish.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -14,7 +16,9 @@ from torch.nn import functional
 
 MIN_ACTION_STD = 0.1
 MAX_ACTION_STD = 1.0
+UNIFORM_SHARE = 0.01  # of each categorical distribution (Hafner et al. 2023), so that every category stays possible
 SYMLOG_LIMIT = 9.0
+HALF_LOG_2_PI_E = 1.4189385  # entropy of a Gaussian is log std + this, in nats
 LARGEST_SCALAR = math.exp(SYMLOG_LIMIT) - 1.0  # about 8,100; larger targets saturate
 
 
@@ -92,6 +96,129 @@ class Actor(nn.Module):
         return action_distribution(self.mlp(features))
 
 
+class ActionCode(nn.Module):
+    """Actions as inputs of a network: continuous numbers as they are, and a one-hot vector for each category.
+
+    Args:
+        choices: See `latentplan.config.spaces.Spaces`; at least one number stands for a category.
+
+    Attributes:
+        size: Numbers of a code.
+        continuous: Places of the continuous numbers in an action, (continuous,).
+        discrete: Places of the numbers that stand for a category, (discrete,).
+        exists: Whether each discrete number has each category, bool (discrete, category).
+    """
+
+    continuous: Tensor
+    discrete: Tensor
+    exists: Tensor
+    counts: Tensor
+    categories: Tensor
+    hot: Tensor
+    order: Tensor
+
+    def __init__(self, choices: Sequence[int]) -> None:
+        super().__init__()
+        integers: dict[str, Any] = {"dtype": torch.long, "device": "cpu"}  # also where weights are made on another
+        counts = torch.tensor([num for num in choices if num], **integers)
+        categories = torch.arange(max(choices), **integers)
+        places = {
+            "continuous": torch.tensor([place for place, num in enumerate(choices) if not num], **integers),
+            "discrete": torch.tensor([place for place, num in enumerate(choices) if num], **integers),
+            "counts": counts,
+            "categories": categories,
+            "exists": categories < counts[:, None],
+            "hot": (categories < counts[:, None]).flatten().nonzero()[:, 0],  # a mask would stop a CUDA graph
+        }
+        places["order"] = torch.cat([places["continuous"], places["discrete"]]).argsort()
+        for name, value in places.items():
+            self.register_buffer(name, value, persistent=False)
+        self.size = sum(num or 1 for num in choices)
+
+    def forward(self, actions: Tensor) -> Tensor:
+        """Codes (..., size) of actions (..., action) in [-1, 1]; a number that is NaN gives NaN."""
+        given = actions[..., self.discrete]
+        is_taken = (self.find(actions)[..., None] == self.categories).to(actions.dtype) + 0.0 * given[..., None]
+        return torch.cat([actions[..., self.continuous], is_taken.flatten(-2)[..., self.hot]], -1)
+
+    def find(self, actions: Tensor) -> Tensor:
+        """The category that each discrete number stands for, int64 (..., discrete)."""
+        place = (actions[..., self.discrete].nan_to_num() + 1.0) * 0.5 * self.counts
+        return torch.minimum(place.floor().long().clamp_min(0), self.counts - 1)
+
+    def values(self, categories: Tensor) -> Tensor:
+        """The number in [-1, 1] that stands for each category, float32 (..., discrete)."""
+        return (2.0 * categories + 1.0) / self.counts - 1.0
+
+    def join(self, continuous: Tensor, discrete: Tensor) -> Tensor:
+        """Actions (..., action) from continuous numbers (..., continuous) and discrete numbers (..., discrete)."""
+        return torch.cat([continuous, discrete.to(continuous.dtype)], -1)[..., self.order]
+
+
+class MixedActor(nn.Module):
+    """A categorical distribution over each choice of an action, and a Gaussian over each continuous number.
+
+    Samples come from standard normal noise, one number for each number of the action: a category is the one in whose
+    part of the cumulated probabilities the normal quantile of the noise lies. Noise of exactly 0 gives the mode.
+
+    Args:
+        in_features: Size of the features.
+        hidden_dim: Width of the hidden layers.
+        choices: See `latentplan.config.spaces.Spaces`; at least one number stands for a category.
+    """
+
+    places: Tensor
+
+    def __init__(self, in_features: int, hidden_dim: int, choices: Sequence[int]) -> None:
+        super().__init__()
+        self.code = ActionCode(choices)
+        self.num_continuous = 2 * len(self.code.continuous)
+        exists = self.code.exists
+        self.mlp = Mlp(in_features, hidden_dim, self.num_continuous + int(exists.sum()), output_scale=0.01)
+        places = (exists.flatten().cumsum(0) - 1).clamp_min(0).view(exists.shape)
+        self.register_buffer("places", places, persistent=False)
+
+    def forward(self, features: Tensor) -> tuple[Tensor, Tensor]:
+        """Mode and std of the action, float32 (..., action) each, for features (..., in)."""
+        mean, std, logits = self._distribution(features)
+        probabilities = logits.softmax(-1)
+        values = torch.where(self.code.exists, self.code.values(self.code.categories[:, None]).T, 0.0)
+        average = (probabilities * values).sum(-1)
+        spread = ((probabilities * values.square()).sum(-1) - average.square()).clamp_min(0.0).sqrt()
+        return self.code.join(mean, self.code.values(logits.argmax(-1))), self.code.join(std, spread)
+
+    def sample(self, features: Tensor, noise: Tensor) -> Tensor:
+        """Actions in [-1, 1] for standard normal noise, float32 (..., action) each; categories pass no gradient."""
+        mean, std, logits = self._distribution(features)
+        continuous = sample_action(mean, std, noise[..., self.code.continuous])
+        drawn = noise[..., self.code.discrete]
+        quantile = torch.special.ndtr(drawn)[..., None]
+        category = torch.minimum((logits.softmax(-1).cumsum(-1) < quantile).sum(-1), self.code.counts - 1)
+        category = torch.where(drawn == 0.0, logits.argmax(-1), category)
+        return self.code.join(continuous, self.code.values(category))
+
+    def score(self, features: Tensor, actions: Tensor) -> tuple[Tensor, Tensor]:
+        """Log-probability of actions (..., action), and entropy of the distribution in nats, (...) each.
+
+        The density of a clamped continuous number is that of the number it was clamped to.
+        """
+        mean, std, logits = self._distribution(features)
+        log_probs = logits.log_softmax(-1)
+        taken = log_probs.gather(-1, self.code.find(actions)[..., None])[..., 0].sum(-1)
+        entropy = -(log_probs.exp() * log_probs.masked_fill(~self.code.exists, 0.0)).sum((-2, -1))
+        error = (actions[..., self.code.continuous] - mean) / std
+        density = (-0.5 * error.square() - std.log() + 0.5 - HALF_LOG_2_PI_E).sum(-1)
+        return taken + density, entropy + (std.log() + HALF_LOG_2_PI_E).sum(-1)
+
+    def _distribution(self, features: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Mean and std of the continuous numbers, (..., continuous) each, and logits (..., discrete, category)."""
+        raw = self.mlp(features)
+        mean, std = action_distribution(raw[..., : self.num_continuous])
+        logits = raw[..., self.num_continuous :][..., self.places].masked_fill(~self.code.exists, float("-inf"))
+        mixed = (1.0 - UNIFORM_SHARE) * logits.softmax(-1) + UNIFORM_SHARE / self.code.counts[:, None]
+        return mean, std, mixed.masked_fill(~self.code.exists, 1.0).log().masked_fill(~self.code.exists, float("-inf"))
+
+
 def single_or_double(values: Tensor) -> Tensor:
     """The values in float32, or in float64 if they are float64."""
     return values.to(torch.promote_types(values.dtype, torch.float32))
@@ -108,6 +235,11 @@ def sample_action(mean: Tensor, std: Tensor, noise: Tensor) -> Tensor:
     """Reparametrised action in [-1, 1], (..., action); the clamp passes gradients straight through."""
     raw = mean + std * noise
     return raw - (raw - raw.clamp(-1.0, 1.0)).detach()
+
+
+def symlog(values: Tensor) -> Tensor:
+    """sign(x) log(1 + abs(x)) of each value (Hafner et al. 2023, eq. 9)."""
+    return torch.sign(values) * torch.log1p(values.abs())
 
 
 def symexp(values: Tensor) -> Tensor:

@@ -9,13 +9,15 @@ import torch
 from torch import Tensor, nn
 
 from latentplan.config import ModelConfig
+from latentplan.config.checks import UserError
 from latentplan.config.quantities import TASK_PREFIX
+from latentplan.config.spaces import Spaces
 from latentplan.models.backend import Backend
 from latentplan.models.decoder import Decoder
 from latentplan.models.dynamics import Dynamics, Rssm, State, surprise
-from latentplan.models.encoder import Encoder
+from latentplan.models.encoder import Encoder, Observation
 from latentplan.models.goal_heads import GoalHeads
-from latentplan.models.heads import Actor, Mlp, ScalarHead, sample_action
+from latentplan.models.heads import Actor, MixedActor, Mlp, ScalarHead, sample_action
 
 PROBE_SHARE = 3  # the probe has a third of the width of other heads, because quantities are easy to predict
 
@@ -31,6 +33,7 @@ class WorldModel(nn.Module):
         action_dim: Size of the action, taken from the environment.
         labels: Names and typical sizes of the quantities that `probe` predicts from the latent.
         goal_dim: Width of the heads for goals (`GoalHeads`), which are trained after everything else; 0 for none.
+        spaces: Shape of frames, and which numbers of the action stand for categories; None takes the usual ones.
 
     Attributes:
         backend: Computes steps, rollouts and beliefs; the reference, or a faster one that `accelerate` chose.
@@ -39,22 +42,42 @@ class WorldModel(nn.Module):
     label_scales: Tensor
 
     def __init__(
-        self, config: ModelConfig, action_dim: int, labels: Mapping[str, float] | None = None, goal_dim: int = 0
+        self,
+        config: ModelConfig,
+        action_dim: int,
+        labels: Mapping[str, float] | None = None,
+        goal_dim: int = 0,
+        spaces: Spaces | None = None,
     ) -> None:
         super().__init__()
+        self.spaces = spaces = spaces or Spaces()
+        if spaces.choices and len(spaces.choices) != action_dim:
+            raise ValueError(f"choices {spaces.choices} must have one entry for each of {action_dim} numbers")
+        if any(spaces.choices) and config.turns > 1:
+            raise UserError("model.turns 4 needs continuous actions, whose mean over turns is an action: set it to 1")
+        if spaces.vector_dim and config.turns > 1:
+            raise UserError("model.turns 4 turns pictures, and env.vectors cannot be turned: leave one of them out")
         self.config, self.action_dim, self.labels = config, action_dim, dict(labels or {})
         embedding_dim, features = config.hidden_dim, config.deter_dim + config.latent_dim
-        self.encoder = Encoder(config.encoder_channels, embedding_dim)
-        self.dynamics: Dynamics = Rssm(
-            config.latent_dim, config.deter_dim, config.hidden_dim, action_dim, embedding_dim
+        self.encoder = Encoder(
+            config.encoder_channels, embedding_dim, spaces.frame_shape, spaces.vector_dim, config.hidden_dim
         )
-        self.decoder = Decoder(features, config.decoder_channels)
+        self.dynamics: Dynamics = Rssm(
+            config.latent_dim, config.deter_dim, config.hidden_dim, action_dim, embedding_dim, spaces.choices
+        )
+        self.decoder = Decoder(features, config.decoder_channels, spaces.frame_shape)
         self.reward_head = ScalarHead(features, config.hidden_dim, config.num_bins)
         self.continue_head = Mlp(features, config.hidden_dim, 1)
         self.value_head = ScalarHead(features, config.hidden_dim, config.num_bins)
-        self.actor = Actor(features, config.hidden_dim, action_dim)
+        self.actor: Actor | MixedActor = (
+            MixedActor(features, config.hidden_dim, spaces.choices)
+            if any(spaces.choices)
+            else Actor(features, config.hidden_dim, action_dim)
+        )
         self.backend = Backend()
         self.register_buffer("label_scales", torch.tensor(list(self.labels.values())), persistent=False)
+        if spaces.vector_dim:
+            self.vector_head = Mlp(features, config.hidden_dim, spaces.vector_dim)
         if self.labels:
             self.probe_head = Mlp(features, max(1, config.hidden_dim // PROBE_SHARE), len(self.labels))
         self.goal_dim = 0
@@ -82,6 +105,11 @@ class WorldModel(nn.Module):
         return self.label_scales.device
 
     @property
+    def has_choices(self) -> bool:
+        """Whether some numbers of the action stand for categories."""
+        return isinstance(self.actor, MixedActor)
+
+    @property
     def label_names(self) -> tuple[str, ...]:
         """The quantities that `probe` predicts, in order; empty for an environment without quantities."""
         return tuple(self.labels)
@@ -104,7 +132,12 @@ class WorldModel(nn.Module):
 
         Raises:
             ValueError: The model was trained without labels.
+            UserError: The model has discrete actions, or sees vectors.
         """
+        if self.has_choices:
+            raise UserError("goals are learned for continuous actions only: let the planner pursue them (--objective)")
+        if self.spaces.vector_dim:
+            raise UserError("goals are learned from pictures alone, without env.vectors: let the planner pursue them")
         if not self.goal_names:
             raise ValueError("this model was trained without labels, so it has no quantities that a goal could name")
         features, config = self.config.deter_dim + self.config.latent_dim, self.config
@@ -120,6 +153,10 @@ class WorldModel(nn.Module):
         """Predictions of the quantities `goal_names` for features (..., feature), float32 (..., quantity)."""
         return self.probe(features)[..., : len(self.goal_names)].float()
 
+    def seen_vectors(self, labels: Tensor) -> Tensor:
+        """The numbers beside the frames, (..., vector), which lie behind the labels, (..., label + vector)."""
+        return labels[..., len(self.labels) :]
+
     def probe(self, features: Tensor) -> Tensor:
         """Predictions of the quantities `label_names` for features (..., feature), in their own units, (..., label).
 
@@ -130,18 +167,18 @@ class WorldModel(nn.Module):
             raise ValueError("this model was trained without labels, so it predicts no quantities")
         return self.probe_head(features) * self.label_scales
 
-    def infer(self, state: State, action: Tensor, frames: Tensor) -> State:
+    def infer(self, state: State, action: Tensor, frames: Tensor | Observation) -> State:
         """The belief, with the posterior's mean, after actions and the frames that resulted.
 
         Args:
             state: The belief before the action.
             action: Actions in [-1, 1], (rows, action).
-            frames: Frames after the actions, uint8 (rows, 64, 64, 3).
+            frames: Frames after the actions, uint8 (rows, height, width, channel).
         """
         return self.see(self.dynamics.advance(state, action), frames)
 
-    def see(self, deter: Tensor, frames: Tensor) -> State:
-        """The belief with the posterior's mean for deter (rows, deter) and uint8 frames (rows, 64, 64, 3)."""
+    def see(self, deter: Tensor, frames: Tensor | Observation) -> State:
+        """The belief with the posterior's mean for deter (rows, deter) and frames, as in `infer`."""
         return State(deter, self.dynamics.posterior(deter, self.encoder(frames)).mean)
 
     def step(self, state: State, action: Tensor) -> tuple[State, Tensor]:
@@ -181,6 +218,11 @@ class WorldModel(nn.Module):
     def policy(self, state: State, generator: torch.Generator | None = None) -> Tensor:
         """The actor's action (rows, action): a sample when a generator is given, else its mode."""
         with self.trunk_precision():
+            if isinstance(self.actor, MixedActor) and generator is not None:
+                shape = *state.deter.shape[:-1], self.action_dim
+                return self.actor.sample(
+                    state.features, torch.randn(shape, generator=generator, device=state.deter.device)
+                )
             mean, std = self.actor(state.features)
         if generator is None:
             return mean

@@ -7,6 +7,7 @@ row of an episode has no action. A sequence in a batch has one frame more than a
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -36,7 +37,8 @@ class Rows:
         rewards: Rewards that arrived with the next frame, float32 (n,).
         continues: 1 unless the episode ended in a terminal state with the next frame, float32 (n,).
         is_first: Whether an episode starts at this row, bool (n,).
-        labels: True quantities at each frame, float32 (n, label); (n, 0) if the simulator reports none.
+        labels: True quantities at each frame, and then the numbers that the agent sees beside the frame, float32 (n,
+            label); (n, 0) if the simulator reports none.
     """
 
     frames: np.ndarray
@@ -57,7 +59,7 @@ class Batch(NamedTuple):
         actions: actions[t] in [-1, 1] was taken at frames[t], (batch, time, action).
         rewards: rewards[t] arrived with frames[t + 1], (batch, time).
         continues: continues[t] is 0 if frames[t + 1] shows a terminal state, else 1, (batch, time).
-        labels: True quantities at each frame, (batch, time + 1, label).
+        labels: True quantities at each frame, and then the numbers beside it, (batch, time + 1, label).
         rows: Row of the replay that holds each frame, int64 (batch, time + 1); `Replay.refresh` takes these rows.
     """
 
@@ -92,6 +94,7 @@ class Replay:
         num_lanes: Number of environments, each with a lane of its own.
         device: Device of the rows and of the batches.
         num_labels: Number of quantities that the simulator reports with each frame.
+        frame_shape: Shape of a frame.
 
     Raises:
         UserError: The rows do not fit into nine tenths of the free memory.
@@ -105,13 +108,14 @@ class Replay:
         num_lanes: int,
         device: torch.device,
         num_labels: int = 0,
+        frame_shape: tuple[int, ...] = FRAME_SHAPE,
     ) -> None:
         self.lane_size = -(-capacity // num_lanes)
         self.num_lanes, self.device = num_lanes, device
         total = self.lane_size * num_lanes
-        self.num_bytes = count_replay_bytes(total, action_dim, deter_dim, num_labels)
+        self.num_bytes = count_replay_bytes(total, action_dim, deter_dim, num_labels, math.prod(frame_shape))
         check_memory(self.num_bytes, device)
-        self.frames = torch.zeros(total, *FRAME_SHAPE, dtype=torch.uint8, device=device)
+        self.frames = torch.zeros(total, *frame_shape, dtype=torch.uint8, device=device)
         self.deter = torch.zeros(total, deter_dim, dtype=torch.float16, device=device)
         self.actions = torch.zeros(total, action_dim, device=device)
         self.rewards = torch.zeros(total, device=device)

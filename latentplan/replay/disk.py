@@ -11,8 +11,7 @@ import torch
 
 from latentplan.config import UserError
 from latentplan.config.commit import Extent, Log, Save, Saves
-from latentplan.replay.buffer import COLUMNS, FRAME_SHAPE, Replay, read_saved
-from latentplan.replay.memory import FRAME_BYTES
+from latentplan.replay.buffer import COLUMNS, Replay, read_saved
 
 ROWS_FILE = "rows.pt"
 FORMAT = 1
@@ -32,7 +31,7 @@ class ReplayFiles:
 
     def __init__(self, folder: Path, replay: Replay) -> None:
         self.folder, self.replay = folder, replay
-        self._logs = [Log(folder, f"frames{lane}", FRAME_BYTES) for lane in range(replay.num_lanes)]
+        self._logs = [Log(folder, f"frames{lane}", replay.frames[0].numel()) for lane in range(replay.num_lanes)]
 
     def write(self, part: Path) -> dict[str, Extent]:
         """Appends new frames, and writes the other columns into the folder of a save.
@@ -97,7 +96,7 @@ class ReplayFiles:
             low, high = max(first, start), min(first + count, end)
             if low >= high:
                 continue
-            stored = np.memmap(path, np.uint8, "r", shape=(count, *FRAME_SHAPE))
+            stored = np.memmap(path, np.uint8, "r", shape=(count, *replay.frames.shape[1:]))
             rows = torch.arange(low, high) % replay.lane_size + lane * replay.lane_size
             frames = torch.from_numpy(np.array(stored[low - first : high - first]))
             replay.frames[rows.to(replay.device)] = frames.to(replay.device)

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import os
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from types import TracebackType
 
@@ -131,3 +131,37 @@ def _quiet_stderr() -> Iterator[None]:
     finally:
         os.dup2(saved, 2)
         os.close(saved)
+
+
+def read_frames(path: Path, num: int) -> list[Frame]:
+    """At most `num` RGB frames of a film, evenly spaced, with the first and the last one.
+
+    Raises:
+        OSError: The film cannot be read.
+    """
+    capture = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG)
+    frames: list[Frame] = []
+    try:
+        while (read := capture.read())[0]:
+            frames.append(np.asarray(read[1][..., ::-1], np.uint8))
+    finally:
+        capture.release()
+    if not frames:
+        raise OSError(f"the film {path} cannot be read")
+    places = np.linspace(0, len(frames) - 1, min(num, len(frames))).round().astype(int)
+    return [frames[place] for place in dict.fromkeys(places.tolist())]
+
+
+def encode_gif(frames: Sequence[Frame], frame_ms: int) -> tuple[bytes, tuple[int, int]]:
+    """RGB frames at half their size as an animated GIF, and its height and width.
+
+    Args:
+        frames: Frames, uint8 (height, width, 3).
+        frame_ms: Milliseconds that a frame is shown.
+    """
+    animation = cv2.Animation()
+    animation.frames = [cv2.resize(frame[..., ::-1], None, fx=0.5, fy=0.5) for frame in frames]
+    animation.durations = [frame_ms] * len(frames)
+    _, data = cv2.imencodeanimation(".gif", animation)
+    height, width = animation.frames[0].shape[:2]
+    return data.tobytes(), (height, width)

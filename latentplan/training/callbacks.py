@@ -24,6 +24,7 @@ from latentplan.training.state import RunState
 if TYPE_CHECKING:
     from latentplan.training.console import Progress
     from latentplan.training.learner.module import Learner
+    from latentplan.training.trackers import Trackers
 
 WORKER_RESTARTS = 20  # collection processes that may end between two starts of a run before the run does
 CLOCKS = ("env_frames", "decisions", "updates", "minutes")
@@ -104,6 +105,10 @@ class Collect(lightning.Callback):
     def env_restarts(self) -> int:
         """Environments that were made anew after a fault, over the run until its last round that was stored."""
         return 0 if self.memory is None else int(self.memory["restarts"])
+
+    def film_path(self, env_frames: int) -> Path:
+        """Where the film of the evaluation at these frames lies, if it was filmed."""
+        return self.videos / f"{env_frames:09d}.webm"
 
     def has_requests(self) -> bool:
         """Whether the worker was asked for something and has not answered."""
@@ -246,7 +251,7 @@ class Collect(lightning.Callback):
 
     def _submit_evaluation(self) -> None:
         settings, frames = self.config.evaluation, self.requests["evaluate"]["env_frames"]
-        film = self.videos / f"{frames:09d}.webm" if settings.video else None
+        film = self.film_path(frames) if settings.video else None
         self.worker.submit("evaluate", settings.episodes, film, self.requests["weights"])
 
     def _store_round(self, collected: Collected) -> EnvironmentFault | None:
@@ -334,24 +339,26 @@ class MetricsFile:
 
 
 class Record(lightning.Callback):
-    """Writes metrics.csv and TensorBoard events once per epoch, and moves the progress display.
+    """Writes metrics.csv and the trackers once per epoch, and moves the progress display.
 
-    Every entry of `Learner.metrics` becomes a column and a TensorBoard scalar of the same name.
+    Every entry of `Learner.metrics` becomes a column and a scalar of the same name in each tracker.
 
     Args:
         path: Path of metrics.csv.
         state: Clocks and evaluations of the run.
         collect: Says whether an epoch was complete.
         progress: Display of the run.
+        trackers: The trackers of the run.
     """
 
-    def __init__(self, path: Path, state: RunState, collect: Collect, progress: Progress) -> None:
+    def __init__(self, path: Path, state: RunState, collect: Collect, progress: Progress, trackers: Trackers) -> None:
+        self.trackers = trackers
         self.file, self.state, self.collect, self.progress = MetricsFile(path, COLUMNS), state, collect, progress
         self._num_written_evaluations = len(state.evaluations)
 
     def on_train_epoch_start(self, trainer: lightning.Trainer, learner: Learner) -> None:  # type: ignore[override]
         """Append the row of an evaluation that has just finished."""
-        self.write_evaluations(trainer)
+        self.write_evaluations()
 
     def on_train_batch_end(self, trainer: lightning.Trainer, learner: Learner, *_: Any) -> None:  # type: ignore[override]
         """Update the progress display."""
@@ -376,18 +383,18 @@ class Record(lightning.Callback):
             row["worker_restarts"] = state.worker_restarts
         if self.collect.env_restarts:
             row["env_restarts"] = self.collect.env_restarts
-        self._append(trainer, row)
+        self._append(row)
 
-    def write_evaluations(self, trainer: lightning.Trainer) -> None:
+    def write_evaluations(self) -> None:
         """Append one row per new evaluation, with the clocks of the weights that were evaluated."""
         for entry in self.state.evaluations[self._num_written_evaluations :]:
             returns = {"planner_return": entry["planner"], "actor_return": entry["actor"]}
             difference = {"planner_minus_actor": entry["planner"] - entry["actor"]}
-            self._append(trainer, {name: entry[name] for name in CLOCKS} | returns | difference)
+            self._append({name: entry[name] for name in CLOCKS} | returns | difference)
+            self.trackers.log_film(self.collect.film_path(entry["env_frames"]), step=entry["env_frames"])
             self.progress.show_evaluation(entry)
         self._num_written_evaluations = len(self.state.evaluations)
 
-    def _append(self, trainer: lightning.Trainer, row: dict[str, float]) -> None:
-        if trainer.logger is not None:
-            trainer.logger.log_metrics(row, step=int(row["env_frames"]))
+    def _append(self, row: dict[str, float]) -> None:
+        self.trackers.log(row, step=int(row["env_frames"]))
         self.file.append(row)

@@ -8,6 +8,7 @@ from pathlib import Path
 from latentplan.config import USER_DOMAIN, Config, EnvConfig, PlannerConfig, UserError
 from latentplan.config.checks import shown
 from latentplan.config.env_id import is_by_id
+from latentplan.config.extras import EXTRAS, require_extra
 from latentplan.config.parsing import raise_unknown
 from latentplan.config.quantities import TASK_PREFIX, scales
 from latentplan.config.suites import DEFAULT_SUITE, check_task
@@ -25,6 +26,9 @@ def check_settings(config: Config) -> None:
     check_run(config)
     if config.run.run_dir is not None:
         check_folder(config.run.run_dir)
+    for name in config.run.logger:
+        if name in EXTRAS:
+            require_extra(f"the logger {name}", *EXTRAS[name])
     env, learning = config.env, config.learning
     check_env_settings(env)
     if env.suite == DEFAULT_SUITE and env.domain != USER_DOMAIN:

@@ -8,6 +8,8 @@ from typing import Any
 from rich.console import Console
 
 from latentplan.config import RunConfig
+from latentplan.config.run_results import Evaluation
+from latentplan.reporting.runs import format_evaluation
 from latentplan.training.state import RunState
 
 SECONDS_ON_A_TERMINAL = 0.5
@@ -62,10 +64,7 @@ class Progress:
         """Print one line for an evaluation, an entry of `RunState.evaluations`."""
         planner, actor = entry["planner"], entry["actor"]
         self._evaluation = f"planner {planner:.0f}, actor {actor:.0f}"
-        self.console.print(
-            f"{entry['env_frames']:>9,} frames  {entry['minutes']:6.1f} min  "
-            f"planner {planner:6.1f}  actor {actor:6.1f}  difference {planner - actor:+6.1f}"
-        )
+        self.console.print(format_evaluation(Evaluation(*(entry[name] for name in Evaluation._fields))))
 
     def _format_line(self, state: RunState) -> str:
         left = [self.run.minutes - state.minutes] if self.run.minutes else []

@@ -5,7 +5,7 @@ from __future__ import annotations
 from latentplan.config import Config
 from latentplan.config.estimates import Part, check_parts, estimate_model, estimate_search
 from latentplan.config.files import has_cuda
-from latentplan.replay.memory import FRAME_BYTES, count_replay_bytes, describe_replay, free_memory
+from latentplan.replay.memory import count_replay_bytes, describe_replay, free_memory
 
 UNKNOWN_LENGTH_CAPACITY = 200_000
 LEARNING_COPIES = 6  # weights, gradients, two moments, the average, the acting model
@@ -42,7 +42,10 @@ def check_run(config: Config) -> None:
         UserError: The parts of the run do not fit into the free memory, or a decision would take minutes.
     """
     on_device = config.run.device != "cpu" and has_cuda()
-    learning = [estimate_model(config.model, LEARNING_COPIES), _estimate_update(config)]
+    learning = [
+        estimate_model(config.model, LEARNING_COPIES, frame_size=config.env.frame_size),
+        _estimate_update(config),
+    ]
     collecting = [_estimate_environments(config), _estimate_rounds(config)]
     search = estimate_search(config.planner, config.model, on_device and not config.collection.overlap)
     replay = [_estimate_replay(config)]
@@ -53,15 +56,20 @@ def check_run(config: Config) -> None:
     check_parts([*collecting, *(() if config.replay.on_device else replay), search], free_memory())
 
 
+def count_frame_bytes(config: Config) -> int:
+    """Bytes of a frame, as far as the settings tell: images that an environment of the user adds are not counted."""
+    return 3 * max(1, len(config.env.cameras)) * config.env.frame_size**2
+
+
 def _estimate_update(config: Config) -> Part:
     learning, model = config.learning, config.model
-    sides = [16 // 2**layer for layer in range(len(model.encoder_channels))]
+    sides = [config.env.frame_size // 4 // 2**layer for layer in range(len(model.encoder_channels))]
     pictures = sum(channels * side * side for channels, side in zip(model.encoder_channels, sides, strict=True))
     pictures += 5 * 64 * model.decoder_channels + 3072
     beliefs = 6 * model.deter_dim + 8 * model.hidden_dim
     frames = learning.batch_size * (learning.sequence_length + 1)
     imagined = learning.imagination_starts * (learning.imagination_horizon + 1)
-    num_bytes = frames * (FRAME_BYTES + 4 * (pictures + beliefs)) + 4 * imagined * beliefs
+    num_bytes = frames * (count_frame_bytes(config) + 4 * (pictures + beliefs)) + 4 * imagined * beliefs
     advice = "--learning.batch_size, --learning.sequence_length, --learning.imagination_starts or the horizon there"
     seconds = config.collection.updates_per_decision * UPDATE_S
     if seconds > 1.0:
@@ -81,8 +89,9 @@ def _estimate_rounds(config: Config) -> Part:
     if run.frames is not None:
         decisions = min(decisions, -(-run.frames // config.env.action_repeat))
     advice = "--collection.prefill_decisions or --collection.round_decisions"
-    return Part("a round of collection", decisions * FRAME_BYTES, 0.0, advice)
+    return Part("a round of collection", decisions * count_frame_bytes(config), 0.0, advice)
 
 
 def _estimate_replay(config: Config) -> Part:
-    return describe_replay(count_replay_bytes(count_replay_rows(config), 1, config.model.deter_dim))
+    rows = count_replay_rows(config)
+    return describe_replay(count_replay_bytes(rows, 1, config.model.deter_dim, 0, count_frame_bytes(config)))

@@ -7,6 +7,9 @@ import errno
 import json
 import logging
 import math
+import shlex
+import sys
+import uuid
 import warnings
 from dataclasses import dataclass, replace
 from datetime import datetime
@@ -16,21 +19,26 @@ from typing import TYPE_CHECKING, Any
 import lightning
 import numpy as np
 import torch
-from lightning.pytorch.loggers import TensorBoardLogger
 from lightning.pytorch.utilities.exceptions import SIGTERMException
 
+from latentplan import __version__
 from latentplan.agents.checkpoint import INFO, load_model
 from latentplan.agents.files import is_checkpoint
 from latentplan.config import USER_DOMAIN, Config, Device, EnvironmentFault, UserError, derive_seed
 from latentplan.config.commit import Save
 from latentplan.config.env_id import as_file_name, repeat_flag
 from latentplan.config.files import dump_config, read_config
+from latentplan.config.origin import present_facts
 from latentplan.config.run_folder import RUN_FILE, SAVES_FOLDER, lock_folder, read_run_config, run_saves
+from latentplan.config.run_results import METRICS_FILE, note_state, read_evaluations, read_facts
 from latentplan.envs import default_task
+from latentplan.evaluation.statistics import confidence_interval
 from latentplan.models import WorldModel
 from latentplan.models.fast import accelerate
 from latentplan.replay.buffer import Replay
 from latentplan.replay.disk import ReplayFiles, count_saved
+from latentplan.reporting.page import write_page
+from latentplan.reporting.report import ReportData, Returns, render_report
 from latentplan.training.callbacks import Collect, Record, copy_weights
 from latentplan.training.checks import check_folder, check_settings
 from latentplan.training.collection.collector import Description, EnvFactory
@@ -47,7 +55,6 @@ from latentplan.training.saving import Guard, Restore, Stop
 from latentplan.training.saving import Save as SaveRun
 from latentplan.training.signals import Signals, exit_code
 from latentplan.training.state import (
-    METRICS_FILE,
     RunState,
     SavedRun,
     read_state,
@@ -56,10 +63,12 @@ from latentplan.training.state import (
     restore_metrics,
     warn_of_loss,
 )
+from latentplan.training.trackers import Trackers
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
+REPORT_FILE = "report.html"
 DISK_ERRORS = (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EIO)  # of which some do not name a file
 
 
@@ -159,28 +168,44 @@ def resume(
 def _start(config: Config, folder: Path, make_env: EnvFactory | None, *, resume: bool) -> Result:
     """Runs until the end, an interruption or an error; goes back to the last save after too many skipped steps."""
     check_settings(config)
-    failed_at = -1
     with lock_folder(folder), Signals() as signals:
-        while True:
-            try:
-                return _Run(config, folder, make_env, signals, resume=resume).execute()
-            except NotFiniteError as error:
-                if error.update <= failed_at:
-                    raise  # the same again: another try would end here too
-                failed_at, resume = error.update, True
-                warnings.warn(f"{error}: the run goes back to its last save", RuntimeWarning, stacklevel=2)
-            except Stopped:  # while the run was being set up, from which nothing is lost
-                return Result(folder, exit_code(signals.received), {})
-            except WorkerEnded as error:
-                raise UserError(f"{error}; the run has stopped, and --resume {folder} continues it") from error
-            except OSError as error:
-                is_own = str(error.filename or "").startswith(str(folder))
-                if not is_own and error.errno not in DISK_ERRORS:
-                    raise
-                raise UserError(
-                    f"the run in {folder} has stopped: {error.strerror} ({error.filename or 'while writing'}); "
-                    f"when this is mended, --resume {folder} continues from its last save"
-                ) from error
+        facts = present_facts(config.run.device != "cpu" and torch.cuda.is_available())
+        run_id = read_facts(folder).get("run_id") or uuid.uuid4().hex[:8]
+        note_state(folder, "running", run_id=run_id, command=shlex.join(sys.argv), **facts)
+        try:
+            result = _run_until_end(config, folder, make_env, signals, resume=resume)
+        except BaseException as error:
+            with contextlib.suppress(OSError):  # a full disk may be the reason
+                note_state(folder, "failed", reason=" ".join(str(error).split()) or type(error).__name__)
+            raise
+        note_state(folder, "finished" if result.exit_code == 0 else "stopped")
+        return result
+
+
+def _run_until_end(
+    config: Config, folder: Path, make_env: EnvFactory | None, signals: Signals, *, resume: bool
+) -> Result:
+    failed_at = -1
+    while True:
+        try:
+            return _Run(config, folder, make_env, signals, resume=resume).execute()
+        except NotFiniteError as error:
+            if error.update <= failed_at:
+                raise  # the same again: another try would end here too
+            failed_at, resume = error.update, True
+            warnings.warn(f"{error}: the run goes back to its last save", RuntimeWarning, stacklevel=3)
+        except Stopped:  # while the run was being set up, from which nothing is lost
+            return Result(folder, exit_code(signals.received), {})
+        except WorkerEnded as error:
+            raise UserError(f"{error}; the run has stopped, and --resume {folder} continues it") from error
+        except OSError as error:
+            is_own = str(error.filename or "").startswith(str(folder))
+            if not is_own and error.errno not in DISK_ERRORS:
+                raise
+            raise UserError(
+                f"the run in {folder} has stopped: {error.strerror} ({error.filename or 'while writing'}); "
+                f"when this is mended, --resume {folder} continues from its last save"
+            ) from error
 
 
 class _Run:
@@ -190,6 +215,7 @@ class _Run:
         self, config: Config, folder: Path, make_env: EnvFactory | None, signals: Signals, *, resume: bool
     ) -> None:
         self.config, self.folder, self.signals = config, folder, signals
+        self.trackers: Trackers | None = None
         self.saves = run_saves(folder)
         self.saves.remove_leftovers()
         save = self._find_save() if resume else None
@@ -216,7 +242,8 @@ class _Run:
         saved: SavedRun | None = None if save is None else read_state(save)
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(derive_seed(config.run.seed, "weights"))
-            model = WorldModel(config.model, self.description.action_dim, self.description.labels).to(self.device)
+            facts = self.description
+            model = WorldModel(config.model, facts.action_dim, facts.labels, spaces=facts.spaces).to(self.device)
         accelerate(model)
         replay_device = self.device if config.replay.on_device else torch.device("cpu")
         self.replay = Replay(
@@ -225,7 +252,8 @@ class _Run:
             config.model.deter_dim,
             config.env.num_envs,
             replay_device,
-            len(model.labels),
+            len(model.labels) + model.spaces.vector_dim,
+            model.spaces.frame_shape,
         )
         self.files = ReplayFiles(self.folder / SAVES_FOLDER, self.replay)
         self.saved, self.state = saved, RunState() if saved is None else saved.state
@@ -246,6 +274,8 @@ class _Run:
         try:
             return self._execute()
         finally:
+            if self.trackers is not None:
+                self.trackers.close()
             self.worker.close()
 
     def _execute(self) -> Result:
@@ -259,7 +289,9 @@ class _Run:
         facts = self._agent_facts()
         save = SaveRun(self.folder, config, collect, state, self.saves, self.files, facts, optimizers)
         stop = Stop(config, state, self.signals)
-        record = Record(self.folder / METRICS_FILE, state, collect, self.console)
+        run_id = read_facts(self.folder)["run_id"]
+        self.trackers = Trackers(config.run.logger, self.folder, config, run_id)
+        record = Record(self.folder / METRICS_FILE, state, collect, self.console, self.trackers)
         callbacks = [collect, self.curriculum, record, Guard(self.folder), save, stop]
         trainer = self._trainer([Restore(optimizers), *callbacks])
         copy = self.saves.find(RUN_FILE)
@@ -273,7 +305,7 @@ class _Run:
                 with contextlib.suppress(Stopped):
                     if not state.interrupted:
                         collect.complete()
-                record.write_evaluations(trainer)
+                record.write_evaluations()
                 save.keep_best(self.learner)
                 save.save(trainer, self.learner)
             with contextlib.suppress(Stopped):
@@ -305,7 +337,7 @@ class _Run:
             devices=1,
             max_epochs=-1,
             callbacks=callbacks,
-            logger=TensorBoardLogger(self.folder, name="tensorboard", version=""),
+            logger=False,  # `Record` writes the trackers
             enable_checkpointing=False,
             enable_progress_bar=False,
             enable_model_summary=False,
@@ -316,7 +348,9 @@ class _Run:
         clocks = save.clocks(self.learner)
         episodes = self.config.evaluation.final_episodes
         self.console.console.print(f"final evaluation: {episodes} episodes each of planner and actor")
-        returns = self._evaluate(self.learner.averaged, film if self.config.evaluation.video else None)
+        settings = self.config.evaluation
+        returns = self._evaluate(self.learner.averaged, film if settings.video else None, record=settings.report)
+        page = self._take_recording() if settings.report else None
         summary = {mode: float(np.mean(values)) for mode, values in returns.items()}
         info = clocks | {"final_evaluation": returns}
         (self.folder / "final.json").write_text(json.dumps(info | summary, indent=1))
@@ -333,13 +367,52 @@ class _Run:
         self.state.best_return = max(best, summary["planner"])
         self.state.set_minutes(clocks["minutes"])
         save.save_run(trainer, self.learner)
+        if self.trackers is not None:
+            self.trackers.log_film(film, step=clocks["env_frames"])
+        if page is not None:
+            self._write_report(returns, page, film)
         self.console.console.print(f"run folder: {self.folder}")
         return summary
 
-    def _evaluate(self, model: WorldModel, film: Path | None = None, actor: bool = True) -> dict[str, list[float]]:
+    def _take_recording(self) -> dict[str, Any] | None:
+        """What the worker recorded in the final evaluation; None if its process has ended."""
+        try:
+            self.worker.submit("take_recording")
+            taken: dict[str, Any] = self.worker.result()
+            return taken
+        except WorkerEnded as error:
+            self.collect.replace_worker(error)
+            return None
+
+    def _write_report(self, returns: Mapping[str, list[float]], page: Mapping[str, Any], film: Path) -> None:
+        """Writes the page of the run; an error becomes a warning, because the run itself is complete."""
+        env, deadline = self.config.env, self.config.planner.deadline_ms
+        deadlines = {"deadline of the search": deadline, "period of control": page["period_ms"]}
+        data = ReportData(
+            task=f"{env.domain}-{env.task}",
+            config=self.config,
+            returns=[Returns(mode, values, confidence_interval(values)) for mode, values in returns.items()],
+            film=film if film.exists() else None,
+            recording=page["recording"],
+            decision_ms=page["decision_ms"],
+            deadlines_ms={name: value for name, value in deadlines.items() if value is not None},
+            facts={"run folder": str(self.folder), **read_facts(self.folder), "renderer": self.description.renderer},
+        )
+        try:
+            data = replace(data, evaluations=read_evaluations(self.folder))
+            path = write_page(self.folder / REPORT_FILE, render_report(data))
+        except Exception as error:
+            warnings.warn(f"no report of the run: {error}", RuntimeWarning, stacklevel=1)
+        else:
+            self.console.console.print(f"report: {path}", soft_wrap=True)
+
+    def _evaluate(
+        self, model: WorldModel, film: Path | None = None, actor: bool = True, record: bool = False
+    ) -> dict[str, list[float]]:
+        episodes = self.config.evaluation.final_episodes
         returns: dict[str, list[float]] | None = None
         while returns is None:
-            self.worker.submit("evaluate", self.config.evaluation.final_episodes, film, copy_weights(model), actor)
+            self.worker.submit("evaluate", episodes, film, copy_weights(model), actor, record)
             try:
                 returns = self.worker.result()
             except WorkerEnded as error:
@@ -389,8 +462,6 @@ class _Run:
             self.console.console.print(f"{name:<12}{line}", soft_wrap=True)
 
     def _agent_facts(self) -> dict[str, Any]:
-        from latentplan import __version__
-
         return {
             "format": 1,
             "version": __version__,

@@ -6,6 +6,7 @@ import copy
 import shutil
 import time
 import warnings
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -17,6 +18,7 @@ from latentplan.config import Config
 from latentplan.config.commit import Extent, Saves
 from latentplan.config.files import dump_config
 from latentplan.config.run_folder import RUN_FILE
+from latentplan.config.run_results import METRICS_FILE
 from latentplan.models import WorldModel
 from latentplan.replay.disk import ReplayFiles
 from latentplan.training.callbacks import Collect
@@ -24,7 +26,7 @@ from latentplan.training.collection.episodes import to_tensors
 from latentplan.training.learner.optimization import load_optimizer_state
 from latentplan.training.learner.skips import LONGEST_STREAK, NotFiniteError
 from latentplan.training.signals import Signals
-from latentplan.training.state import METRICS_FILE, RunState, SavedRun, write_state
+from latentplan.training.state import RunState, SavedRun, write_state
 
 if TYPE_CHECKING:
     from latentplan.training.learner.module import Learner
@@ -129,7 +131,10 @@ class Save(lightning.Callback):
     def save_agent(self, name: str, model: WorldModel, info: dict[str, Any]) -> None:
         """Save an agent in `checkpoints/<name>`, with the facts in `info` and the facts of the run."""
         facts = self.facts | info | {"metrics": self.state.evaluations}
-        save_checkpoint(self.folder / "checkpoints" / name, model, self.config, facts)
+        planner = self.config.planner
+        if planner.use_continues is None:
+            planner = replace(planner, use_continues=bool(self.files.replay.is_end.any()))
+        save_checkpoint(self.folder / "checkpoints" / name, model, replace(self.config, planner=planner), facts)
 
     def clocks(self, learner: Learner) -> dict[str, Any]:
         """The frames, updates and minutes of the present agent."""

@@ -15,6 +15,7 @@ from latentplan.agents.checkpoint import INFO
 from latentplan.config import UserError
 from latentplan.config.commit import DamageError, Extent, Save, Saves, write_synced
 from latentplan.config.run_folder import RUN_FILE, SAVES_FOLDER
+from latentplan.config.run_results import METRICS_FILE
 from latentplan.replay.buffer import read_saved
 
 if TYPE_CHECKING:
@@ -23,7 +24,6 @@ if TYPE_CHECKING:
 
 CONTENTS = {RUN_FILE: "a run", INFO: "an agent", f"{SAVES_FOLDER}/save-*[0-9]": "an agent"}
 STATE_FILE = "state.pt"
-METRICS_FILE = "metrics.csv"
 
 
 @dataclass

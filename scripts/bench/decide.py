@@ -12,7 +12,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 from bench.options import ComposeRequest
 from bench.report import format_number, format_table, write_json
@@ -158,7 +158,7 @@ class ExportedActor:
             self._program = torch.export.load(export_actor(agent, Path(folder) / "actor.pt2")).module()
         self._past: tuple[torch.Tensor, ...] | None = None
 
-    def act(self, frame: np.ndarray) -> np.ndarray:
+    def act(self, frame: Any) -> np.ndarray:
         """The action for frames uint8 (64, 64, 3) or (batch, 64, 64, 3)."""
         import torch
 
@@ -213,5 +213,5 @@ def _agents(model: WorldModel, config: Config, discount: float) -> dict[str, Age
     }
     # The program computes on a processor, and can be written for the dynamics of the class Rssm alone.
     if model.device.type == "cpu" and type(model.dynamics) is Rssm:
-        agents["exported actor"] = ExportedActor(actor)
+        agents["exported actor"] = cast("Agent", ExportedActor(actor))
     return agents

@@ -15,13 +15,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-from bench.anchors import FRAMES, published_returns_of
 from bench.learn_plot import Curve, Point, plot_runs
 from bench.report import format_interval, format_number, format_table, write_csv, write_json
-from bench.runs import RunsRequest, TrainingRun, read_evaluations
+from bench.runs import RunsRequest, TrainingRun
 from latentplan.config import UserError, make_folder
 from latentplan.config.env_id import as_file_name
 from latentplan.config.parsing import option
+from latentplan.config.run_results import read_evaluations
+from latentplan.reporting.published import FRAMES, published_returns_of
 
 FRAMES_TOLERANCE = 0.03  # largest distance of an evaluation from a number of frames, as a share of that number
 OWN = "latentplan"

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
-from bench.anchors import METHODS, published_returns_of
+from latentplan.reporting.published import METHODS, published_returns_of
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -7,7 +7,7 @@ from typing import Any
 
 import torch
 
-from latentplan.commands.doctor import processor_name
+from latentplan.config.origin import processor_name
 
 PRODUCT_SIZES = {"cpu": 2048, "cuda": 8192}
 SMALLEST_PRODUCT = 256

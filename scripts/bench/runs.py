@@ -1,4 +1,4 @@
-"""Training runs that a benchmark starts: their flags, their folders, and the evaluations in them.
+"""Training runs that a benchmark starts: their flags and their folders.
 
 Every run is a `train.py` process with a folder of its own. A run that was begun there goes on from its last save, and a
 run that is finished is not repeated.
@@ -6,25 +6,24 @@ run that is finished is not repeated.
 
 from __future__ import annotations
 
-import csv
-import io
 import json
 import sys
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 from bench.report import write_json
 from latentplan.commands import train
 from latentplan.commands.flags import overrides, read_request
-from latentplan.config import Config, Device, RunConfig, UserError, to_dict
+from latentplan.config import Config, Device, UserError
 from latentplan.config.checks import above_zero
 from latentplan.config.env_id import FLAG, import_named, is_by_id
 from latentplan.config.files import Preset, read_config
 from latentplan.config.parsing import option
 from latentplan.config.run_folder import RUN_FILE, read_run_config, run_saves
-from latentplan.config.suites import ID_DOMAIN, check_task
+from latentplan.config.run_results import comparable_settings
+from latentplan.config.suites import ID_DOMAIN
 from latentplan.training.checks import check_settings
 
 OWN_FLAGS = {  # settings that flags of these benchmarks set for each run
@@ -36,7 +35,7 @@ OWN_FLAGS = {  # settings that flags of these benchmarks set for each run
     "run.run_dir": "--out",
 }
 SCRIPT = Path(__file__).resolve().parent.parent / "train.py"
-METRICS, FINAL, FINISHED = "metrics.csv", "final.json", "finished.json"
+FINISHED = "finished.json"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -167,16 +166,6 @@ class TrainingRun:
         return [*chosen, "--seed", str(self.seed), "--run-dir", str(self.folder), *self.budget, *self.extra]
 
 
-class Evaluation(NamedTuple):
-    """One evaluation of a run: its clocks, and the mean returns of planner and actor."""
-
-    env_frames: int
-    minutes: float
-    planner: float
-    actor: float
-    updates: int
-
-
 def check_same(config: Config, folder: Path) -> None:
     """Checks that the run in a folder, if there is one, has these settings, except for the budget.
 
@@ -188,39 +177,10 @@ def check_same(config: Config, folder: Path) -> None:
     begun = _read_begun(folder)
     if begun is None:
         return
-    asked, known = (_comparable_settings(each) for each in (config, begun))
+    asked, known = (comparable_settings(each) for each in (config, begun))
     for name, value in asked.items():
         if known[name] != value:
             raise UserError(f"{folder} was begun with --{name} {known[name]}, not {value}: choose another --out")
-
-
-def read_evaluations(folder: Path) -> list[Evaluation]:
-    """The evaluations of a run, in the order of their frames; empty before the first.
-
-    The final evaluation takes the place of an earlier one at the same frames.
-
-    Raises:
-        UserError: The files of the run are damaged.
-    """
-    try:
-        found = {each.env_frames: each for each in _read_metrics(folder / METRICS)}
-        if (folder / FINAL).exists():
-            final = json.loads((folder / FINAL).read_text())
-            found[final["env_frames"]] = Evaluation(*(final[name] for name in Evaluation._fields))
-    except KeyError as error:
-        raise UserError(f"the results in {folder} cannot be read: they lack {error}") from None
-    except (OSError, ValueError, TypeError) as error:
-        raise UserError(f"the results in {folder} cannot be read: {error}") from None
-    return [found[frames] for frames in sorted(found)]
-
-
-def read_progress(folder: Path) -> tuple[float, float]:
-    """Frames and minutes of the latest row of metrics of a run; zeros before the first row."""
-    try:
-        *_, last = _read_rows(folder / METRICS)
-        return float(last["env_frames"]), float(last["minutes"])
-    except (OSError, ValueError, TypeError, KeyError):  # no row yet, or a damaged file, which the run itself reports
-        return 0.0, 0.0
 
 
 def _read_begun(folder: Path) -> Config | None:
@@ -230,30 +190,6 @@ def _read_begun(folder: Path) -> Config | None:
         return read_config(folder / RUN_FILE) if (folder / RUN_FILE).exists() else None
     except UserError:
         return None
-
-
-def _comparable_settings(config: Config) -> dict[str, Any]:
-    """The settings by name, with the default task filled in and without the budget and folder of the run."""
-    task = config.env.task or check_task(config.env.suite, config.env.domain)[0]
-    settings = replace(config, env=replace(config.env, task=task), run=RunConfig(seed=config.run.seed))
-    return {
-        f"{section}.{name}": value for section, fields in to_dict(settings).items() for name, value in fields.items()
-    }
-
-
-def _read_metrics(path: Path) -> Iterator[Evaluation]:
-    """The evaluations of a file of metrics, whose columns `actor` and `value` are losses."""
-    for row in _read_rows(path):
-        if row["planner_return"]:
-            returns = float(row["planner_return"]), float(row["actor_return"])
-            yield Evaluation(int(row["env_frames"]), float(row["minutes"]), *returns, int(row["updates"]))
-
-
-def _read_rows(path: Path) -> Iterator[dict[str, str]]:
-    """The rows of a file of metrics, without a last line that is still being written."""
-    if path.exists():
-        text = path.read_text(encoding="utf-8")
-        yield from csv.DictReader(io.StringIO(text[: text.rfind("\n") + 1], newline=""))
 
 
 def _read_limits(budget: Sequence[str]) -> dict[str, float]:

@@ -8,11 +8,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from bench.anchors import METHODS_AT_REPEAT_2
 from bench.learn_plot import mark_published
 from bench.suite_rows import Row
 from bench.suite_scores import LARGEST_RETURN, TOLERANCE, Curves, Scores, profile
 from latentplan.reporting.curves import CURVES, save_figure
+from latentplan.reporting.published import METHODS_AT_REPEAT_2
 
 if TYPE_CHECKING:
     from matplotlib.artist import Artist

@@ -10,10 +10,11 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
-from bench.runs import FINAL, METRICS, TrainingRun, read_progress
+from bench.runs import TrainingRun
 from bench.suite_queue import LOG
 from bench.suite_rows import Origin, Row, merge_rows, note_origin, read_origin, read_rows, rows_of, write_rows
 from latentplan.config import UserError
+from latentplan.config.run_results import FINAL_FILE, METRICS_FILE, read_progress
 
 LOOK_S = 5.0
 LEAST_SHARE = 0.02  # of a run, from which its speed is known
@@ -110,7 +111,7 @@ class Board:
 
     def _read(self, run: TrainingRun) -> bool:
         """Read the rows of a run if its files have changed; returns whether its rows have changed."""
-        files = (run.folder / METRICS, run.folder / FINAL)
+        files = (run.folder / METRICS_FILE, run.folder / FINAL_FILE)
         changes = tuple(path.stat().st_mtime_ns if path.exists() else 0 for path in files)
         if changes == self._changes.get(run, (0, 0)):
             return False

@@ -8,7 +8,6 @@ from pathlib import Path
 
 import numpy as np
 
-from bench.anchors import METHODS_AT_REPEAT_2, published_returns_of
 from bench.estimates import Estimate, mean_estimate
 from bench.report import format_number, write_text
 from bench.suite_plot import plot_curves, plot_profile
@@ -26,6 +25,7 @@ from bench.suite_scores import (
     score_matrix,
 )
 from latentplan.config import UserError
+from latentplan.reporting.published import METHODS_AT_REPEAT_2, published_returns_of
 
 MODES = ("planner", "actor")
 SHOWN_FRAMES = (100_000, 200_000)  # of published returns in the table of tasks
@@ -138,8 +138,8 @@ def _describe_table(frames: int) -> str:
     return (
         f"Planner and actor are returns of the last evaluation within {frames:,} frames, as the mean over seeds, with "
         "Student's 95 % interval where there are several seeds. Published returns are means over seeds at "
-        f"{shown} frames, with action repeat 2; `scripts/bench/published.csv` has their sources. **Bold**: at least as "
-        f"high as each of these methods at {published_frames(frames):,} frames."
+        f"{shown} frames, with action repeat 2; `latentplan/reporting/published.csv` has their sources. **Bold**: at "
+        f"least as high as each of these methods at {published_frames(frames):,} frames."
     )
 
 

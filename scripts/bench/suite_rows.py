@@ -6,22 +6,19 @@ import csv
 import io
 import json
 import math
-import subprocess
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
 from bench.report import write_csv, write_json
-from bench.runs import TrainingRun, read_evaluations
+from bench.runs import TrainingRun
 from latentplan import __version__
 from latentplan.config import UserError, make_folder
-from latentplan.config.estimates import count_cores
+from latentplan.config.origin import UNKNOWN, describe_commit, describe_hardware
 from latentplan.config.reading import LARGEST_DATA, read_text
+from latentplan.config.run_results import read_evaluations
 
-ROOT = Path(__file__).resolve().parents[2]
-GPU_FACTS = Path("/proc/driver/nvidia/gpus")
 ORIGIN = "origin.json"
-UNKNOWN = "unknown"
 JOINED = " + "  # between two machines or two commits of one run
 DIGITS = 2
 
@@ -69,11 +66,8 @@ def present_origin(jobs: int, on_gpu: bool) -> Origin:
         jobs: Runs side by side.
         on_gpu: Whether the runs learn on a graphics processor.
     """
-    from latentplan.commands.doctor import processor_name
-
-    parts = [f"{count_cores()} cores of {processor_name()}", *(_gpu_names() if on_gpu else ())]
-    hardware = ", ".join(parts) + (f", {jobs} runs side by side" if jobs > 1 else "")
-    return Origin(hardware, _describe_commit(), __version__)
+    hardware = describe_hardware(on_gpu) + (f", {jobs} runs side by side" if jobs > 1 else "")
+    return Origin(hardware, describe_commit(), __version__)
 
 
 def note_origin(folder: Path, origin: Origin) -> None:
@@ -185,21 +179,3 @@ def _parse_row(values: dict[str, str]) -> Row:
     if None in row or "-" not in row.task or not all(map(math.isfinite, (row.minutes, row.planner, row.actor))):
         raise ValueError
     return row
-
-
-def _describe_commit() -> str:
-    """The short name of the commit of this checkout, with `-dirty` after it where files differ from the commit."""
-    command = ["git", "-C", str(ROOT), "describe", "--always", "--dirty", "--abbrev=8", "--exclude", "*"]
-    try:
-        found = subprocess.run(command, capture_output=True, text=True)
-    except OSError:  # no git
-        return UNKNOWN
-    return found.stdout.strip() or UNKNOWN
-
-
-def _gpu_names() -> list[str]:
-    names = []
-    for facts in sorted(GPU_FACTS.glob("*/information")):
-        lines = facts.read_text().splitlines()
-        names += [line.partition(":")[2].strip() for line in lines if line.startswith("Model")]
-    return names[:1]

@@ -13,10 +13,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bench.anchors import FRAMES, published_returns_of
 from bench.estimates import NUM_RESAMPLES, Estimate, interquartile_mean
 from bench.suite_rows import Row
 from latentplan.config.extras import import_extra
+from latentplan.reporting.published import FRAMES, published_returns_of
 
 Scores = NDArray[np.float64]
 Curves = dict[str, dict[int, list[Row]]]

@@ -103,7 +103,7 @@ def toy_config(folder: Path, frames: int, *, overlap: bool, every_frames: int = 
         collection=CollectionConfig(
             prefill_decisions=45, round_decisions=ROUND_FRAMES, updates_per_decision=0.4, overlap=overlap
         ),
-        evaluation=EvaluationConfig(every_frames=every_frames, episodes=1, final_episodes=2, video=False),
+        evaluation=EvaluationConfig(every_frames=every_frames, episodes=1, final_episodes=2, video=False, report=False),
         run=RunConfig(frames=frames, device="cpu", threads=1, run_dir=str(folder)),
     )
 

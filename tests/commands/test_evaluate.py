@@ -222,3 +222,11 @@ def test_interrupt_reports_the_finished_episodes(root, tmp_path, checkpoint):
     assert "mean return" in stdout
     assert "Traceback" not in stderr
     assert 2 <= json.loads(out.read_text())["episodes"] < 100000
+
+
+def test_eval_writes_a_report_and_the_same_results_as_without(tmp_path, checkpoint, returns):
+    page = tmp_path / "report.html"
+    assert result_of(tmp_path, checkpoint, "--episodes", 2, "--report", page)["returns"] == returns
+    text = page.read_text()
+    assert all(f"<h2>{name}</h2>" in text for name in ("Film", "Returns", "Decision time", "Searches", "Provenance"))
+    assert [path.name for path in tmp_path.glob("*.webm")] == []

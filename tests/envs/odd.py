@@ -124,14 +124,22 @@ class Short(Slider):
 
 # name: (environment, settings, words of the one line that refuses it, the remedy among them)
 REFUSED = {
-    "FloatSpace": (with_spaces(Box(0.0, 1.0, (16, 16, 3), np.float32)), {}, ["observations", "np.uint8"]),
-    "Grey": (with_spaces(Box(0, 255, (16, 16), np.uint8)), {}, ["observations", "(16, 16)"]),
-    "ChannelsFirst": (with_spaces(Box(0, 255, (3, 16, 16), np.uint8)), {}, ["observations", "(3, 16, 16)"]),
-    "StateOnly": (with_spaces(STATE), {}, ["observations", "(4,)"]),
-    "StateWithRender": (State, {}, ["observations", "--env.pixels render"]),
-    "DictWithoutPictures": (with_spaces(Dict({"joint": STATE})), {}, ["observations", "Dict"]),
-    "TextSpace": (with_spaces(Text(8)), {}, ["observations", "Text"]),
-    "Unbounded": (with_spaces(actions=Box(-np.inf, np.inf, (1,), np.float32)), {}, ["bounds", "finite"]),
+    "FloatSpace": (
+        with_spaces(Box(0.0, 1.0, (16, 16, 3), np.float32)),
+        {},
+        ["floats in [0, 1]", "divide brightness by 255"],
+    ),
+    "Grey": (with_spaces(Box(0, 255, (16, 16), np.uint8)), {}, ["(16, 16)", "declare in observation_space"]),
+    "ChannelsFirst": (
+        with_spaces(Box(0, 255, (3, 16, 16), np.uint8)),
+        {},
+        ["(3, 16, 16)", "declare in observation_space"],
+    ),
+    "StateOnly": (with_spaces(STATE), {}, ["observation_space", "AddRenderObservation"]),
+    "StateWithRender": (State, {}, ["observation_space", "--env.pixels render"]),
+    "DictWithoutPictures": (with_spaces(Dict({"joint": STATE})), {}, ["observation_space", "add one to the Dict"]),
+    "TextSpace": (with_spaces(Text(8)), {}, ["observation_space", "Text"]),
+    "Unbounded": (with_spaces(actions=Box(-np.inf, np.inf, (1,), np.float32)), {}, ["bounded", "TransformAction"]),
     "HugeActions": (with_spaces(actions=Box(-1e30, 1e30, (1,), np.float32)), {}, ["1e+30", "declare"]),
     "TextActions": (with_spaces(actions=Text(8)), {}, ["action", "Text"]),
     "NoSeed": (NoSeed, {}, ["reset must take both: def reset(self, *, seed=None, options=None)"]),

@@ -82,7 +82,7 @@ def test_check_environment_finds_nothing_to_note_in_a_good_environment():
 def test_refusal_names_both_spaces():
     report = check_environment(config_of("odd/TextActions"), decisions=1, isolate=False)
     both = odd.with_spaces(odd.STATE, odd.REFUSED["TextActions"][0].action_space)
-    with pytest.raises(UserError, match=r"observations .*; action.*Text"):
+    with pytest.raises(UserError, match=r"observation_space .*; action.*Text"):
         wrap_user_env(both())
     assert len(report.problems) == 1
 

@@ -213,3 +213,20 @@ def test_default_task_exists_in_every_domain():
         assert default_task(domain) in tasks
     with pytest.raises(UserError, match="Did you mean 'walker'"):
         default_task("walkr")
+
+
+def test_cameras_are_stacked_and_each_looks_as_alone():
+    both = make_env(EnvConfig(domain="cartpole", cameras=("1", "0"), frame_size=84), seed=0)
+    frame, _ = both.reset(seed=3)
+    assert frame.shape == both.observation_space.shape == (84, 84, 6) and both.spaces.cameras == 2
+    for place, camera in enumerate((1, 0)):
+        alone = make_env(EnvConfig(domain="cartpole", camera=camera, frame_size=84), seed=0)
+        assert np.array_equal(alone.reset(seed=3)[0], frame[..., 3 * place : 3 * place + 3])
+    assert np.array_equal(both.render(), frame[..., :3])
+    assert both.step(np.zeros(1))[0].shape == (84, 84, 6)
+
+
+@pytest.mark.parametrize(("camera", "message"), [("9", "camera 9 does not exist"), ("left", "takes camera ids")])
+def test_cameras_that_do_not_exist_are_refused(camera, message):
+    with pytest.raises(UserError, match=message):
+        make_env(EnvConfig(domain="cartpole", cameras=("0", camera)))

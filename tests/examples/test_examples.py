@@ -15,8 +15,15 @@ PUBLIC = {
     "latentplan.training",
 }
 NAMES = (
-    *("corridor_constraint", "follow_reference", "own_environment", "plan_in_jax", "plan_in_mujoco"),
-    *("plan_learned_mlp", "plan_your_dynamics", "ros2_timer", "trained_agent_new_goal"),
+    *(
+        "corridor_constraint",
+        "discrete_actions",
+        "follow_reference",
+        "own_environment",
+        "plan_in_jax",
+        "plan_in_mujoco",
+    ),
+    *("plan_learned_mlp", "plan_your_dynamics", "ros2_timer", "trained_agent_new_goal", "two_cameras"),
 )
 
 
@@ -24,8 +31,8 @@ NAMES = (
 def run_example(root, run_python, tmp_path):
     """Runs an example in an empty folder; returns the numbers of each line "label: ..." that it prints."""
 
-    def run(name):
-        result = run_python(root / "examples" / f"{name}.py", cwd=tmp_path, timeout=300)
+    def run(name, timeout=300):
+        result = run_python(root / "examples" / f"{name}.py", cwd=tmp_path, timeout=timeout)
         assert result.returncode == 0, result.stderr
         labelled = re.findall(r"^([\w ]+): (.*)$", result.stdout, flags=re.MULTILINE)
         return {label: [float(text) for text in re.findall(r"-?\d+\.?\d*", line)] for label, line in labelled}
@@ -80,6 +87,18 @@ def test_own_environment_is_learned_within_seconds(run_example, tmp_path):
     assert numbers["planner"][0] > 14.0 > 12.0 > numbers["random"][0]
     assert (tmp_path / "dot" / "checkpoints" / "best").is_dir()
     assert (tmp_path / "dot" / "metrics.csv").is_file()
+
+
+@pytest.mark.slow
+def test_two_cameras_and_a_vector_are_learned_from_within_a_minute(run_example):
+    numbers = run_example("two_cameras")
+    assert numbers["planner"][0] > numbers["random"][0] + 1.0
+
+
+@pytest.mark.slow
+def test_discrete_actions_are_learned_far_above_random(run_example):
+    numbers = run_example("discrete_actions", timeout=1200)
+    assert numbers["planner"][0] > 2.0 * numbers["random"][0]
 
 
 def test_planning_in_mujoco_lifts_the_hand_to_its_target(run_example, tmp_path):

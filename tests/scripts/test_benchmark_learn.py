@@ -7,7 +7,7 @@ from dataclasses import replace
 import benchmark
 import numpy as np
 import pytest
-from bench.anchors import METHODS, METHODS_AT_REPEAT_2, TASK_GROUPS, published_returns_of
+from bench.anchors import TASK_GROUPS
 from bench.estimates import interquartile_estimate, mean_estimate
 from bench.learn import compare, first_reaching, read_run, run_facts
 from bench.learn_plot import MARKERS, Curve, Point
@@ -15,6 +15,7 @@ from bench.runs import check_same
 
 from latentplan.config import Config, EnvConfig, PlannerConfig, RunConfig, UserError
 from latentplan.config.files import dump_config
+from latentplan.reporting.published import METHODS, METHODS_AT_REPEAT_2, published_returns_of
 
 HEADER = "env_frames,updates,minutes,planner_return,actor_return\n"
 

@@ -16,7 +16,7 @@ import pytest
 from bench import runs, suite, suite_progress, suite_queue
 from bench.anchors import TASK_GROUPS
 from bench.estimates import interquartile_mean
-from bench.runs import TrainingRun, read_evaluations
+from bench.runs import TrainingRun
 from bench.suite_progress import Progress, estimate_minutes_left, format_left
 from bench.suite_rows import Origin, Row, merge_rows, note_origin, read_origin, read_rows, write_rows
 from bench.suite_scores import aggregate, completed, improvement, newest_curves, profile, rows_at
@@ -25,6 +25,7 @@ from hypothesis import strategies as st
 
 from latentplan.commands.flags import read_request
 from latentplan.config.run_folder import lock_folder
+from latentplan.config.run_results import read_evaluations
 
 STUB = Path(__file__).with_name("stub_trainer.py")
 TASKS = ("walker-walk", "cartpole-swingup", "ball_in_cup-catch")

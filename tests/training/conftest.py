@@ -34,7 +34,7 @@ TINY = Config(
     ),
     learning=LearningConfig(batch_size=4, sequence_length=5, imagination_horizon=3, imagination_starts=8),
     collection=CollectionConfig(prefill_decisions=45, round_decisions=15, updates_per_decision=0.4, overlap=False),
-    evaluation=EvaluationConfig(every_frames=40, episodes=1, final_episodes=2, video=False),
+    evaluation=EvaluationConfig(every_frames=40, episodes=1, final_episodes=2, video=False, report=False),
     run=RunConfig(frames=90, device="cpu", threads=1),
 )
 

@@ -5,11 +5,12 @@ from types import SimpleNamespace
 
 import pytest
 import torch
-from lightning.pytorch.loggers import TensorBoardLogger
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
+from latentplan.config import Config
 from latentplan.training.callbacks import COLUMNS, MetricsFile, Record
 from latentplan.training.state import RunState
+from latentplan.training.trackers import Trackers
 
 
 def read_table(path):
@@ -45,13 +46,13 @@ def test_record_writes_each_metric_of_the_learner_to_csv_and_tensorboard(tmp_pat
     """The header orders losses as the learner does, and gradient norms after them."""
     state = RunState(env_frames=30, decisions=15, earlier_minutes=2.0, episode_returns=[4.0, 6.0])
     collect = SimpleNamespace(is_epoch_over=True, env_restarts=2)
-    record = Record(tmp_path / "metrics.csv", state, collect, SimpleNamespace(episode_return=None))
+    trackers = Trackers(("tensorboard",), tmp_path, Config(), "id")
+    record = Record(tmp_path / "metrics.csv", state, collect, SimpleNamespace(episode_return=None), trackers)
     names = ("reconstruction", "model_grad_norm", "surprise", "behaviour_grad_norm")
     metrics = {name: torch.tensor(float(place)) for place, name in enumerate(names)}
     learner = SimpleNamespace(updates=7, metrics=metrics, skips=())
-    logger = TensorBoardLogger(tmp_path, name="tensorboard", version="")
-    record.on_train_epoch_end(SimpleNamespace(logger=logger), learner)
-    logger.finalize("success")
+    record.on_train_epoch_end(SimpleNamespace(), learner)
+    trackers.close()
     ((row,), header) = read_table(tmp_path / "metrics.csv")
     losses = ("reconstruction", "surprise", "model_grad_norm", "behaviour_grad_norm")
     assert header == (*COLUMNS, *losses, "env_restarts") and row["env_restarts"] == "2"

@@ -10,6 +10,7 @@ import torch
 from latentplan.agents.checkpoint import load_agent, read_info
 from latentplan.config import UserError
 from latentplan.config.run_folder import lock_folder
+from latentplan.config.run_results import find_state, read_facts
 from latentplan.training import resume, train
 from latentplan.training.callbacks import COLUMNS
 from tests.training.run_folder import list_saves, read_epochs, read_rows, read_state, seal
@@ -39,6 +40,14 @@ def test_train_ends_with_its_budget_and_returns_a_summary(finished):
     assert all(0.0 <= finished.summary[mode] <= 20.0 for mode in ("planner", "actor"))
     state = read_state(finished.run_dir)
     assert state["run"]["env_frames"] == state["run"]["decisions"] == 90
+
+
+def test_train_writes_a_report_and_notes_that_it_has_finished(tiny, dot, tmp_path):
+    result = train(tiny(tmp_path / "run", evaluation={"report": True}), dot)
+    page = (result.run_dir / "report.html").read_text()
+    assert "<h2>Training curves</h2>" in page and "<h2>Imagined against real</h2>" in page
+    assert read_facts(result.run_dir)["state"] == "finished"
+    assert find_state(result.run_dir) == ("finished", None)
 
 
 def test_train_makes_every_update_of_its_rounds(finished):

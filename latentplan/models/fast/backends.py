@@ -19,7 +19,7 @@ from latentplan.models.fast import rollout as rollouts
 from latentplan.models.fast.library import find_fast_dtype
 from latentplan.models.fast.native_frame import NativeFrameFunctions
 from latentplan.models.fast.one_frame import TorchFrameFunctions
-from latentplan.models.heads import Mlp, ScalarHead
+from latentplan.models.heads import Actor, Mlp, ScalarHead
 from latentplan.models.world_model import WorldModel
 
 ROLLOUT_PARTS = ("dynamics", "reward_head", "value_head", "actor")
@@ -87,10 +87,12 @@ class _ConvertingBackend(Backend):
 
     def rollout(self, model: WorldModel, state: State, actions: Tensor) -> tuple[Tensor, State]:
         """See `Backend.rollout`; gradients do not reach the weights."""
-        return rollouts.imagine(self._weights(model), state, actions)
+        return rollouts.imagine(self._weights(model), state, _rssm(model).read(actions))
 
     def propose(self, model: WorldModel, state: State, noise: Tensor) -> Tensor:
         """See `Backend.propose`; gradients do not reach the weights."""
+        if model.has_choices:
+            return super().propose(model, state, noise)
         return rollouts.propose(self._weights(model), state, noise)
 
     def frame_functions(self, model: WorldModel) -> FrameFunctions:
@@ -142,13 +144,13 @@ class CpuBackend(_ConvertingBackend):
         """See `Backend.observe`."""
         if not native.fits(model.dynamics):
             return super().observe(model, embeddings, actions, deter, noise)
-        return native_unroll.observe(_rssm(model), embeddings, actions, deter, noise)
+        return native_unroll.observe(_rssm(model), embeddings, _rssm(model).read(actions), deter, noise)
 
     def predict(self, model: WorldModel, start: State, actions: Tensor) -> tuple[Tensor, Gaussian]:
         """See `Backend.predict`; gradients do not reach the start."""
         if not native.fits(model.dynamics):
             return super().predict(model, start, actions)
-        return native_unroll.predict(_rssm(model), start, actions)
+        return native_unroll.predict(_rssm(model), start, _rssm(model).read(actions))
 
     def imagine(
         self, model: WorldModel, start: State, action_noise: Tensor, noise: Tensor, decay: float
@@ -156,17 +158,17 @@ class CpuBackend(_ConvertingBackend):
         """See `Backend.imagine`; the weights of the dynamics get no gradient."""
         if not (native.fits(model.dynamics) and native.fits(model.actor)):
             return super().imagine(model, start, action_noise, noise, decay)
-        return native_unroll.imagine(_rssm(model), model.actor, start, action_noise, noise, decay)
+        return native_unroll.imagine(_rssm(model), _gaussian_actor(model), start, action_noise, noise, decay)
 
     def encode(self, model: WorldModel, frames: Tensor) -> Tensor:
         """See `Backend.encode`."""
-        if not native_pictures.can_encode(model.encoder):
+        if not (model.spaces.has_usual_frames and native_pictures.can_encode(model.encoder)):
             return super().encode(model, frames)
         return native_pictures.encode(model.encoder, frames)
 
     def reconstruction_errors(self, model: WorldModel, features: Tensor, frames: Tensor) -> Tensor:
         """See `Backend.reconstruction_errors`."""
-        if not native_pictures.can_encode(model.decoder):
+        if not (model.spaces.has_usual_frames and native_pictures.can_encode(model.decoder)):
             return super().reconstruction_errors(model, features, frames)
         return native_pictures.reconstruction_errors(model.decoder, features, frames)
 
@@ -213,17 +215,17 @@ class GpuBackend(_ConvertingBackend):
         self, model: WorldModel, embeddings: Tensor, actions: Tensor, deter: Tensor, noise: Tensor
     ) -> tuple[State, Gaussian]:
         """See `Backend.observe`."""
-        return unroll.observe(_rssm(model), embeddings, actions, deter, noise)
+        return unroll.observe(_rssm(model), embeddings, _rssm(model).read(actions), deter, noise)
 
     def predict(self, model: WorldModel, start: State, actions: Tensor) -> tuple[Tensor, Gaussian]:
         """See `Backend.predict`."""
-        return unroll.predict(_rssm(model), start, actions)
+        return unroll.predict(_rssm(model), start, _rssm(model).read(actions))
 
     def imagine(
         self, model: WorldModel, start: State, action_noise: Tensor, noise: Tensor, decay: float
     ) -> tuple[Tensor, Tensor]:
         """See `Backend.imagine`; the weights of the dynamics get no gradient."""
-        return unroll.imagine(_rssm(model), model.actor, start, action_noise, noise, decay)
+        return unroll.imagine(_rssm(model), _gaussian_actor(model), start, action_noise, noise, decay)
 
     def lambda_return(self, rewards: Tensor, discounts: Tensor, values: Tensor, lambda_: float) -> Tensor:
         """See `Backend.lambda_return`."""
@@ -254,9 +256,15 @@ def _rssm(model: WorldModel) -> Rssm:
     return cast(Rssm, model.dynamics)  # by `can_compute`
 
 
+def _gaussian_actor(model: WorldModel) -> Actor:
+    return cast(Actor, model.actor)  # a learner calls `Backend.sample` for any other
+
+
 def _convert_for_rollouts(model: WorldModel, dtype: torch.dtype) -> rollouts.Weights:
     return rollouts.convert_weights(_rssm(model), model.reward_head, model.value_head, model.actor, dtype)
 
 
 def _convert_for_frames(model: WorldModel, dtype: torch.dtype) -> FrameFunctions:
+    if model.has_choices or model.spaces.vector_dim or not model.spaces.has_usual_frames:
+        return FrameFunctions(model)
     return NativeFrameFunctions(model) if NativeFrameFunctions.can_pack(model) else TorchFrameFunctions(model)

@@ -7,7 +7,7 @@ This module packs the weights in the layout that `frame.c` reads. Results equal 
 from __future__ import annotations
 
 import ctypes
-from typing import NamedTuple, cast
+from typing import Any, NamedTuple, cast
 
 import torch
 from torch import Tensor, nn
@@ -81,14 +81,14 @@ class NativeFrameFunctions(FrameFunctions):
         known = all(each.device.type == "cpu" and each.dtype == torch.float32 for each in weights)
         return type(model.dynamics) is Rssm and known and not weights[0].is_inference() and load() is not None
 
-    def infer(self, state: State, action: Tensor | None, frames: Tensor, is_first: Tensor | None = None) -> State:
+    def infer(self, state: State, action: Tensor | None, frames: Any, is_first: Tensor | None = None) -> State:
         """See `FrameFunctions.infer`."""
         belief = self._new_belief(frames)
         self._call(state, action, is_first, frames, *belief)
         return belief
 
     def infer_and_act(
-        self, state: State, action: Tensor | None, frames: Tensor, is_first: Tensor | None = None
+        self, state: State, action: Tensor | None, frames: Any, is_first: Tensor | None = None
     ) -> tuple[State, Tensor, Tensor]:
         """See `FrameFunctions.infer_and_act`."""
         belief, mean, std = self._new_belief(frames), *self._new_actions(frames)
@@ -96,7 +96,7 @@ class NativeFrameFunctions(FrameFunctions):
         return belief, mean, std
 
     def infer_and_compare(
-        self, state: State, action: Tensor | None, frames: Tensor, is_first: Tensor | None = None
+        self, state: State, action: Tensor | None, frames: Any, is_first: Tensor | None = None
     ) -> tuple[State, Tensor]:
         """See `FrameFunctions.infer_and_compare`."""
         belief, mismatch = self._new_belief(frames), torch.empty(len(frames))

@@ -8,7 +8,7 @@ tensors, so that `latentplan.agents.export` can trace them into a program.
 
 from __future__ import annotations
 
-from typing import NamedTuple, cast
+from typing import Any, NamedTuple, cast
 
 import torch
 from torch import Tensor, nn
@@ -16,7 +16,7 @@ from torch.nn import functional
 
 from latentplan.models.backend import FrameFunctions
 from latentplan.models.dynamics import Rssm, State
-from latentplan.models.encoder import FRAME_SIZE, PATCH
+from latentplan.models.encoder import PATCH
 from latentplan.models.fast import pointwise
 from latentplan.models.heads import NormedLinear, action_distribution
 from latentplan.models.world_model import WorldModel
@@ -63,7 +63,7 @@ class TorchFrameFunctions(FrameFunctions):
         super().__init__(model)
         self._weights = convert_weights(model)
 
-    def infer(self, state: State, action: Tensor | None, frames: Tensor, is_first: Tensor | None = None) -> State:
+    def infer(self, state: State, action: Tensor | None, frames: Any, is_first: Tensor | None = None) -> State:
         """See `FrameFunctions.infer`."""
         return see(self._weights, self._find_deter(state, action, is_first), frames)
 
@@ -126,8 +126,8 @@ def act(weights: FrameWeights, state: State) -> tuple[Tensor, Tensor]:
 def _embed(weights: FrameWeights, frames: Tensor) -> Tensor:
     """Embeddings (rows, embedding) of uint8 frames (rows, 64, 64, 3)."""
     # The size comes from `shape`, because `len` would build the number of rows into an exported program.
-    rows, side = frames.shape[0], FRAME_SIZE // PATCH
-    patches = frames.reshape(rows, side, PATCH, side, 3 * PATCH).transpose(2, 3).reshape(rows, side * side, -1)
+    rows, side, channels = frames.shape[0], frames.shape[1] // PATCH, frames.shape[3]
+    patches = frames.reshape(rows, side, PATCH, side, channels * PATCH).transpose(2, 3).reshape(rows, side * side, -1)
     pixels = patches.to(weights.patches[0].dtype).mul_(1.0 / 255.0).sub_(0.5)
     tokens = functional.silu(functional.linear(pixels, *weights.patches))
     for weight, shift in weights.convolutions:

@@ -17,7 +17,7 @@ from torch.nn import functional
 from latentplan.models.dynamics import Rssm, State
 from latentplan.models.fast import compiled
 from latentplan.models.fast.library import Norm, expectation, gates, norm_silu
-from latentplan.models.heads import Actor, Mlp, NormedLinear, ScalarHead, action_distribution
+from latentplan.models.heads import Actor, MixedActor, Mlp, NormedLinear, ScalarHead, action_distribution
 
 ROWS_PER_THREAD = 1024  # results of one step for more rows do not fit a core's cache
 BIN_MULTIPLE = 16  # float32 products with other numbers of columns take 1.5 times as long
@@ -68,7 +68,9 @@ class Weights(NamedTuple):
 
 
 @torch.no_grad()
-def convert_weights(dynamics: Rssm, head: ScalarHead, critic: ScalarHead, actor: Actor, dtype: torch.dtype) -> Weights:
+def convert_weights(
+    dynamics: Rssm, head: ScalarHead, critic: ScalarHead, actor: Actor | MixedActor, dtype: torch.dtype
+) -> Weights:
     """Converted weights for products in `dtype`; the norm of the gates and the outputs of heads are float32.
 
     Args:

@@ -21,13 +21,13 @@ from latentplan.agents.modes import make_agent
 from latentplan.agents.planning import PlanningAgent
 from latentplan.agents.random import RandomAgent
 from latentplan.config import Config, EnvironmentFault, derive_seed
+from latentplan.config.spaces import Spaces
 from latentplan.config.suites import DEFAULT_SUITE
 from latentplan.envs import make_vector_env
 from latentplan.envs.faults import FrameCheck
 from latentplan.envs.registry import USERS_RENDERER, describe_renderer
-from latentplan.envs.suite import FRAME_SIZE
 from latentplan.envs.vector import Restarts, make_guarded_env
-from latentplan.evaluation.episodes import OnStep, episode_seed, run_episodes
+from latentplan.evaluation.episodes import OnStep, Step, episode_seed, run_episodes
 from latentplan.evaluation.statistics import Episode
 from latentplan.models import WorldModel
 from latentplan.models.fast import accelerate
@@ -35,6 +35,7 @@ from latentplan.models.heads import LARGEST_SCALAR
 from latentplan.models.symmetry import first_turn
 from latentplan.replay.buffer import Rows
 from latentplan.reporting.film import filming_if_possible
+from latentplan.reporting.recorder import EpisodeRecorder, GuardedRecorder
 from latentplan.training.collection.episodes import Episodes, Stopped, to_arrays, to_tensors
 
 TIMED_FRAMES = 5
@@ -76,6 +77,7 @@ class Description:
         render_ms: Milliseconds per rendered frame.
         renderer: Name and settings of the renderer.
         labels: Quantities that the environment reports with each frame, and the typical size of each.
+        spaces: What the networks have to know of actions and observations.
     """
 
     action_dim: int
@@ -83,6 +85,7 @@ class Description:
     render_ms: float
     renderer: dict[str, str]
     labels: dict[str, float]
+    spaces: Spaces
 
 
 class Collector:
@@ -125,7 +128,8 @@ class Collector:
         self._decisions: int | None = facts["decisions_per_episode"]
         self.discount = discount = config.learning.discount or _choose_discount(self._decisions)
         self.labels: dict[str, float] = facts["labels"] or {}
-        self.model = accelerate(WorldModel(config.model, action_dim, self.labels).to(device))
+        self.spaces: Spaces = facts["spaces"] or Spaces()
+        self.model = accelerate(WorldModel(config.model, action_dim, self.labels, spaces=self.spaces).to(device))
         noise, correlation = config.collection.noise_std, config.collection.noise_correlation
         planner, goal_planner = (
             PlanningAgent(self.model, config, discount, noise_std=noise, noise_correlation=correlation)
@@ -141,26 +145,30 @@ class Collector:
         self._random = RandomAgent(action_dim)
         self._episodes = Episodes(self.envs, config.run.seed)
         self._frames: np.ndarray | None = None
-        self._labels = np.zeros((config.env.num_envs, len(self.labels)), np.float32)
+        self._labels = np.zeros((config.env.num_envs, len(self.labels) + self.spaces.vector_dim), np.float32)
         self._has_ended = np.ones(config.env.num_envs, dtype=bool)
         self._returns = np.zeros(config.env.num_envs)
         self._check_rewards = RewardCheck(config.env.num_envs, discount)
         self._check_frames = FrameCheck(config.env.num_envs)
+        self._has_seen_end = False  # an episode ended in a terminal state
         self._current_agent: ModelAgent | RandomAgent | None = None
+        self._recorder: GuardedRecorder | None = None
+        self._decision_ms = np.zeros(0)
         self.should_stop: Callable[[], bool] = lambda: False
 
     def describe(self) -> Description:
         """Facts of the environment that the learner needs; renders a few frames to time them."""
         env = self._eval_env
         self._try_environment()
-        draw = partial(env.render_large, FRAME_SIZE) if self.config.env.pixels == "render" else env.render
+        config = self.config.env
+        draw = partial(env.render_large, config.frame_size) if config.pixels == "render" else env.render
         started = time.perf_counter()
         for _ in range(TIMED_FRAMES):
             draw()
         render_ms = 1000.0 * (time.perf_counter() - started) / TIMED_FRAMES
         facts = describe_renderer(self.config.env) if self._make_user_env is None else USERS_RENDERER
         renderer = {name: str(value) for name, value in facts.items()}
-        return Description(self.model.action_dim, self.discount, render_ms, renderer, self.labels)
+        return Description(self.model.action_dim, self.discount, render_ms, renderer, self.labels, self.spaces)
 
     def _try_environment(self) -> None:
         """Resets and steps once, so that a mistake of the environment ends the run before it starts.
@@ -239,9 +247,11 @@ class Collector:
         """
         memory = to_tensors(memory)
         self.restarts.count = memory["restarts"]
+        if memory.get("has_seen_end"):
+            self._notice_end()
         frames, labels, is_same = self._episodes.replay(memory["episodes"])
         self._frames, self._returns = frames, memory["returns"].numpy().copy()
-        if self.labels:
+        if self._labels.shape[1]:
             self._labels = np.array(labels, np.float32)
         self._has_ended = memory["has_ended"].numpy() | ~is_same
         name = memory["agent"]
@@ -263,6 +273,7 @@ class Collector:
             "returns": self._returns.copy(),
             "has_ended": self._has_ended.copy(),
             "restarts": self.restarts.count,
+            "has_seen_end": self._has_seen_end,
         }
         return to_arrays(memory)  # type: ignore[no-any-return]
 
@@ -272,6 +283,7 @@ class Collector:
         film: Path | None = None,
         weights: dict[str, np.ndarray] | None = None,
         actor: bool = True,
+        record: bool = False,
     ) -> dict[str, list[float]]:
         """Returns of planner and actor, without exploration, in episodes with the same starts.
 
@@ -280,6 +292,7 @@ class Collector:
             film: Path of a film of the planner's first episode, or None. A film that cannot be written gives a warning.
             weights: State of the world model; None keeps the weights of the last round.
             actor: Whether the actor is evaluated too.
+            record: Whether the planner's first episode is recorded, for `take_recording`.
 
         Returns:
             One return per episode, under "planner" and, with `actor`, under "actor".
@@ -290,14 +303,35 @@ class Collector:
         seeds = [episode_seed(stream, index) for index in range(episodes)]
         planner = self._evaluation_agents["planner"]
         with contextlib.ExitStack() as stack:
-            on_step = None
+            watchers: list[OnStep] = []
             if film is not None:
                 every = -(-(self._decisions or 0) // FILMED_FRAMES) or 1
-                on_step = stack.enter_context(filming_if_possible(film, self._eval_env, planner, every=every))
-            played = {"planner": self._play(planner, seeds, on_step)}
+                watchers.append(stack.enter_context(filming_if_possible(film, self._eval_env, planner, every=every)))
+            if record:
+                self._recorder = GuardedRecorder(EpisodeRecorder(planner, self._decisions))
+                watchers.append(self._recorder)
+
+            def watch(step: Step) -> None:
+                for watcher in watchers:
+                    watcher(step)
+
+            played = {"planner": self._play(planner, seeds, watch if watchers else None)}
+            self._decision_ms = np.concatenate([episode.decision_ms for episode in played["planner"]])
         if actor:
             played["actor"] = self._play(self._evaluation_agents["actor"], seeds)
         return {mode: [episode.total_return for episode in rollouts] for mode, rollouts in played.items()}
+
+    def take_recording(self) -> dict[str, Any]:
+        """What a report shows of the latest evaluation that was recorded.
+
+        Returns:
+            `recording` (None where nothing was recorded), `decision_ms` (decision,) of the planner, and `period_ms`,
+            the time between two decisions in the simulated world (None where it is not known).
+        """
+        recording = None if self._recorder is None else self._recorder.recording
+        rate = self._eval_env.metadata.get("render_fps")
+        self._recorder = None
+        return {"recording": recording, "decision_ms": self._decision_ms, "period_ms": 1000.0 / rate if rate else None}
 
     def close(self) -> None:
         """Ends simulators and their processes."""
@@ -330,22 +364,34 @@ class Collector:
         self._frames, info = self._episodes.restart(self._has_ended)
         if not is_new:
             agent.reset(self._has_ended)
-        if self.labels:
+        if self._labels.shape[1]:
             self._labels[self._has_ended] = np.asarray(info["labels"])[self._has_ended]
         self._returns[self._has_ended] = 0.0
+
+    def _notice_end(self) -> None:
+        """Lets all plans weigh rewards by the probability that the episode goes on, unless the settings decide."""
+        if self._has_seen_end or self.config.planner.use_continues is not None:
+            return
+        self._has_seen_end = True
+        for agent in (*self._agents.values(), *self._evaluation_agents.values()):
+            if isinstance(agent, PlanningAgent):
+                agent.weigh_ends()
 
     def _step(self, agent: ModelAgent | RandomAgent, log: _Log) -> None:
         assert self._frames is not None
         frames, labels, first = self._frames.copy(), self._labels.copy(), self._has_ended.copy()
-        actions = agent.act(frames)
+        seen = self._labels[:, len(self.labels) :].copy()
+        actions = agent.act((frames, seen) if self.spaces.vector_dim else frames)
         state = agent.state if isinstance(agent, ModelAgent) else None
         deter = None if state is None else first_turn(state).deter.float().cpu().numpy()
         self._frames, rewards, terminated, truncated, info = self._episodes.step(actions)
         self._check_rewards(rewards, first)
         self._check_frames(frames)
+        if terminated.any():
+            self._notice_end()
         self._has_ended = terminated | truncated
         self._returns += rewards
-        if self.labels:
+        if self._labels.shape[1]:
             self._labels = np.array(info["labels"], np.float32)
         failed = info["failed"]
         log.append(frames, deter, actions, rewards, ~terminated, first, labels, np.asarray(info["env_frames"]), failed)

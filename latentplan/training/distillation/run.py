@@ -18,7 +18,7 @@ import time
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import torch
@@ -36,6 +36,7 @@ from latentplan.envs import make_env, make_from
 from latentplan.evaluation.episodes import OnStep, Step, episode_seed, iterate_episodes
 from latentplan.evaluation.statistics import confidence_interval
 from latentplan.models import Gaussian, State
+from latentplan.models.heads import Actor
 from latentplan.training.collection.collector import EnvFactory
 from latentplan.training.console import StatusLine
 from latentplan.training.distillation.labels import Demonstrations, plan_actions, read_first_actions
@@ -222,6 +223,13 @@ class _Distillation:
             raise UserError(
                 f"{source} has learned goals with its present actor: run scripts/distill.py before scripts/goals.py"
             )
+        if self.model.has_choices:
+            raise UserError(
+                f"{source} has discrete actions, and only continuous actions are distilled: the actor that its run "
+                "learned acts with --mode actor"
+            )
+        if self.model.spaces.vector_dim:
+            raise UserError(f"{source} was trained with env.vectors, and only agents of pictures alone are distilled")
         self.model.requires_grad_(False)
         self.planner_config = replace(planner or self.config.planner, deadline_ms=None)
         self.planning = PlanningAgent(self.model, self.config, self.info["discount"], planner=self.planner_config)
@@ -229,7 +237,7 @@ class _Distillation:
         build = make_env if make_user_env is None else make_from(make_user_env)
         self.env = build(choose_env(self.config.env, env or {}, must_match=True), 0)
         self.state, self.demonstrations = DistillationState(), Demonstrations()
-        self.student = Student(self.model.actor, settings)
+        self.student = Student(cast(Actor, self.model.actor), settings)
         self.initial = self.best = copy.deepcopy(self.model.actor.state_dict())
         self.line = StatusLine()
         self.saves = _saves(folder)

@@ -95,7 +95,7 @@ def load_replay(save: Save, model: WorldModel) -> Replay:
     """
     num_lanes, num_rows = count_saved(save)
     sizes = (model.action_dim, model.config.deter_dim, num_lanes, torch.device("cpu"), len(model.labels))
-    replay = Replay(num_lanes * num_rows, *sizes)
+    replay = Replay(num_lanes * num_rows, *sizes, frame_shape=model.spaces.frame_shape)
     ReplayFiles(save.folder.parent, replay).read(save)
     return replay
 
@@ -219,7 +219,8 @@ def play(config: Config, model: WorldModel, decisions: int, seed: int, report: C
     """
     single = replace(config, env=replace(config.env, num_envs=1), run=replace(config.run, seed=seed))
     size = 2 * (decisions + ROUND_DECISIONS)  # an episode has one row more than decisions
-    replay = Replay(size, model.action_dim, model.config.deter_dim, 1, torch.device("cpu"), len(model.labels))
+    sizes = (model.action_dim, model.config.deter_dim, 1, torch.device("cpu"), len(model.labels))
+    replay = Replay(size, *sizes, frame_shape=model.spaces.frame_shape)
     collector = Collector(single, None, "cpu")
     heads = [name for name in model.state_dict() if name.startswith("goal_heads.")]
     weights = {name: value.cpu().numpy() for name, value in model.state_dict().items() if name not in heads}

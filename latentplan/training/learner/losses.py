@@ -14,12 +14,10 @@ from torch import Tensor
 
 from latentplan.config import LearningConfig
 from latentplan.models import Gaussian, State, WorldModel, kl_divergence
-from latentplan.models.heads import MAX_ACTION_STD, MIN_ACTION_STD, Actor
+from latentplan.models.heads import HALF_LOG_2_PI_E, MAX_ACTION_STD, MIN_ACTION_STD, Actor, MixedActor, symlog
 from latentplan.replay.buffer import Batch
 from latentplan.training.learner.augmentation import random_shift
 from latentplan.training.learner.registry import BEHAVIOUR_LOSSES, WORLD_MODEL_LOSSES, register, weighted_sum
-
-HALF_LOG_2_PI_E = 1.4189385  # entropy of a Gaussian is log std + this, in nats
 
 
 class Imagination(NamedTuple):
@@ -31,6 +29,8 @@ class Imagination(NamedTuple):
         rewards: rewards[t] arrives with features[t + 1], (horizon, rows).
         continues: Probability that the episode continues after features[t + 1], (horizon, rows).
         entropies: Entropy in nats of the action taken at features[t], (horizon, rows).
+        log_probs: Log-probability of the action taken at features[t], (horizon, rows), for actors whose gradient is
+            that of REINFORCE; None for actors whose gradient passes through the dynamics.
     """
 
     features: Tensor
@@ -38,6 +38,7 @@ class Imagination(NamedTuple):
     rewards: Tensor
     continues: Tensor
     entropies: Tensor
+    log_probs: Tensor | None = None
 
 
 class Prediction(NamedTuple):
@@ -98,6 +99,8 @@ class Behaviour(NamedTuple):
         returns: Lambda-returns of the imagined states but the last, (horizon, rows).
         reach: Probability that a rollout has not ended before each state but the last, (horizon, rows).
         return_scale: Spread of the returns, by which the actor's loss divides them, a scalar.
+        baselines: Values of the imagined states but the last, (horizon, rows), without gradient; None for actors whose
+            gradient passes through the dynamics.
         replayed: Replayed states with their returns.
     """
 
@@ -108,6 +111,7 @@ class Behaviour(NamedTuple):
     reach: Tensor
     return_scale: Tensor
     replayed: Replayed
+    baselines: Tensor | None = None
 
 
 class Learned(NamedTuple):
@@ -136,6 +140,8 @@ def world_model_loss(model: WorldModel, batch: Batch, config: LearningConfig, ge
     moved = random_shift(model.backend, batch.frames, config.random_shift, generator)
     with model.trunk_precision(cache=False):
         embeddings = model.backend.encode(model, moved.flatten(0, 1)).unflatten(0, (size, frames_per_sequence))
+        if model.spaces.vector_dim:
+            embeddings = embeddings + model.encoder.read_vectors(model.seen_vectors(batch.labels))
     noise = torch.randn(
         size, frames_per_sequence, model.config.latent_dim, generator=generator, device=batch.frames.device
     )
@@ -223,15 +229,35 @@ def _probe(predicted: Prediction) -> Tensor:
     model, batch, reached = predicted.model, predicted.batch, predicted.open_loop.shape[1]
     if not model.labels:
         return batch.rewards.new_zeros(())
-    errors = mean_within(_probe_errors(model, predicted.features, batch.labels), predicted.is_seen)
-    open_loop_errors = _probe_errors(model, predicted.open_loop, batch.labels[:, 1 : reached + 1])
+    labels = batch.labels[..., : len(model.labels)]
+    errors = mean_within(_probe_errors(model, predicted.features, labels), predicted.is_seen)
+    open_loop_errors = _probe_errors(model, predicted.open_loop, labels[:, 1 : reached + 1])
     return errors + mean_within(open_loop_errors, batch.within[:, :reached])
+
+
+@register(WORLD_MODEL_LOSSES, "vectors", "vector_scale", is_recorded=False)
+def _vectors(predicted: Prediction) -> Tensor:
+    """Squared error of the numbers beside the frames, in symlog units, summed over the numbers."""
+    model, batch = predicted.model, predicted.batch
+    if not model.spaces.vector_dim:
+        return batch.rewards.new_zeros(())
+    with model.trunk_precision(cache=False):
+        painted = model.backend.apply(model.vector_head, predicted.features)
+    errors = (painted - symlog(model.seen_vectors(batch.labels))).square().sum(-1)
+    return mean_within(errors, predicted.is_seen)
 
 
 @register(BEHAVIOUR_LOSSES, "actor")
 def _actor(behaviour: Behaviour) -> Tensor:
-    """Negative sum of normalised return and weighted entropy; the gradient flows through the dynamics."""
+    """Negative sum of normalised return and weighted entropy.
+
+    The gradient flows through the dynamics. With discrete actions, which pass none, it is that of REINFORCE with the
+    value as the baseline (Williams 1992; for world models Hafner et al. 2021, section 2.3).
+    """
     entropies = behaviour.config.entropy_scale * behaviour.imagined.entropies
+    if behaviour.imagined.log_probs is not None and behaviour.baselines is not None:
+        advantages = (behaviour.returns - behaviour.baselines).detach() / behaviour.return_scale
+        return -(behaviour.reach * (behaviour.imagined.log_probs * advantages + entropies)).mean()
     return -(behaviour.reach * (behaviour.returns / behaviour.return_scale + entropies)).mean()
 
 
@@ -262,11 +288,17 @@ def imagine(
         generator: Random stream of the actions and latents.
         decay: Share of a state's gradient that a step passes back to the state before.
     """
-    features, std = model.backend.imagine(model, start, *draw_noise(model, horizon, len(start.deter), generator), decay)
+    draws, log_probs = draw_noise(model, horizon, len(start.deter), generator), None
+    if isinstance(model.actor, MixedActor):
+        features, actions = model.backend.sample(model, start, *draws)
+        log_probs, entropies = model.actor.score(features[:-1], actions)
+    else:
+        features, std = model.backend.imagine(model, start, *draws, decay)
+        entropies = entropy(std)
     backend, following = model.backend, features[1:]  # one slice, so that its gradients are summed before they pass
     rewards = backend.mean(model.reward_head, backend.apply(model.reward_head.mlp, following))
     continues = torch.sigmoid(backend.apply(model.continue_head, following)).squeeze(-1)
-    return Imagination(features, following, rewards, continues, entropy(std))
+    return Imagination(features, following, rewards, continues, entropies, log_probs)
 
 
 def draw_noise(model: WorldModel, horizon: int, rows: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:

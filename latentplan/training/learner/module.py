@@ -188,13 +188,16 @@ class Learner(lightning.LightningModule):
                 config.gradient_decay,
             )
             values = self._target_values(imagined.following)
+            baselines = None
+            if imagined.log_probs is not None:
+                baselines = torch.cat([self._target_values(imagined.features[:1]), values[:-1]]).detach()
         discounts = self.discount * imagined.continues
         returns = self.model.backend.lambda_return(imagined.rewards, discounts, values, config.lambda_)
         reach = torch.cat([torch.ones_like(discounts[:1]), discounts[:-1]]).cumprod(0).detach()
         scale = return_scale(self.return_range, returns.detach())
         with self.model.trunk_precision(cache=False):
             replayed = self._replayed(learned, batch)
-        behaviour = Behaviour(self.model, config, imagined, returns, reach, scale, replayed)
+        behaviour = Behaviour(self.model, config, imagined, returns, reach, scale, replayed, baselines)
         loss, parts = weighted_sum(BEHAVIOUR_LOSSES, behaviour, config)
         parts["imagined_return"] = returns[0].detach().mean()
         parts["entropy"] = imagined.entropies.detach().mean()

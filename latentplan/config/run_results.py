@@ -1,0 +1,179 @@
+"""What the folder of a run tells about the run: its evaluations, its clocks, its settings and its state."""
+
+from __future__ import annotations
+
+import csv
+import fcntl
+import io
+import json
+import os
+from collections.abc import Iterator, Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, Literal, NamedTuple
+
+from latentplan.config.checks import UserError, cut
+from latentplan.config.files import read_config
+from latentplan.config.run_folder import LOCK_FILE, RUN_FILE, run_saves
+from latentplan.config.settings import Config, RunConfig, to_dict
+from latentplan.config.suites import check_task
+
+METRICS_FILE, FINAL_FILE, STATUS_FILE = "metrics.csv", "final.json", "status.json"
+StateName = Literal["running", "finished", "stopped", "failed"]
+
+
+class Evaluation(NamedTuple):
+    """One evaluation of a run: its clocks, and the mean returns of planner and actor."""
+
+    env_frames: int
+    minutes: float
+    planner: float
+    actor: float
+    updates: int
+
+
+def read_evaluations(folder: Path) -> list[Evaluation]:
+    """The evaluations of a run, in the order of their frames; empty before the first.
+
+    The final evaluation takes the place of an earlier one at the same frames.
+
+    Raises:
+        UserError: The files of the run are damaged.
+    """
+    try:
+        found = {each.env_frames: each for each in _read_metrics(folder / METRICS_FILE)}
+        if (folder / FINAL_FILE).exists():
+            final = json.loads((folder / FINAL_FILE).read_text())
+            found[final["env_frames"]] = Evaluation(*(final[name] for name in Evaluation._fields))
+    except KeyError as error:
+        raise UserError(f"the results in {folder} cannot be read: they lack {error}") from None
+    except (OSError, ValueError, TypeError) as error:
+        raise UserError(f"the results in {folder} cannot be read: {error}") from None
+    return [found[frames] for frames in sorted(found)]
+
+
+def read_log(info: Mapping[str, Any]) -> list[Evaluation]:
+    """The evaluations in the `info.json` of an agent, without entries that are not whole."""
+    log = info.get("metrics")
+    entries = [entry for entry in log if isinstance(entry, dict)] if isinstance(log, list) else []
+    return [Evaluation(*(entry[name] for name in Evaluation._fields)) for entry in entries if _is_whole(entry)]
+
+
+def read_progress(folder: Path) -> tuple[float, float]:
+    """Frames and minutes of the latest row of metrics of a run; zeros before the first row."""
+    try:
+        *_, last = read_rows(folder / METRICS_FILE)
+        return float(last["env_frames"]), float(last["minutes"])
+    except (OSError, ValueError, TypeError, KeyError):  # no row yet, or a damaged file, which the run itself reports
+        return 0.0, 0.0
+
+
+def read_rows(path: Path) -> Iterator[dict[str, str]]:
+    """The rows of a file of metrics, without a last line that is still being written."""
+    if path.exists():
+        text = path.read_text(encoding="utf-8")
+        yield from csv.DictReader(io.StringIO(text[: text.rfind("\n") + 1], newline=""))
+
+
+def read_settings(folder: Path) -> Config:
+    """The settings of a run; those of its last save where `config.yaml` cannot be read.
+
+    Raises:
+        UserError: The folder holds no run, or its settings cannot be read.
+    """
+    path = folder / RUN_FILE
+    if not folder.is_dir():
+        raise UserError(f"there is no folder {folder}")
+    if not path.exists() and (folder / STATUS_FILE).exists():
+        raise UserError(f"{folder} has no settings yet: its run is being set up, or could not begin")
+    if not path.exists() and not run_saves(folder).exist():
+        raise UserError(f"{folder} holds no training run: it has no {RUN_FILE}")
+    try:
+        return read_config(path)
+    except UserError:
+        copy = run_saves(folder).find(RUN_FILE)
+        if copy is None:
+            raise
+        return read_config(copy)
+
+
+def comparable_settings(config: Config) -> dict[str, Any]:
+    """The settings by name, with the default task filled in and without the budget and folder of the run."""
+    task = config.env.task or check_task(config.env.suite, config.env.domain)[0]
+    settings = replace(config, env=replace(config.env, task=task), run=RunConfig(seed=config.run.seed))
+    return {
+        f"{section}.{name}": value for section, fields in to_dict(settings).items() for name, value in fields.items()
+    }
+
+
+def note_state(folder: Path, state: StateName, **facts: Any) -> None:
+    """Writes the state of a run, and adds facts to those that were written before."""
+    path = folder / STATUS_FILE
+    part = path.with_name(f".{path.name}.{os.getpid()}")
+    part.write_text(json.dumps(read_facts(folder) | {"state": state, "reason": None} | facts, indent=1) + "\n")
+    part.replace(path)
+
+
+def read_facts(folder: Path) -> dict[str, Any]:
+    """What a run has noted about itself: `state`, `reason`, `command`, `commit` and others; empty without a note."""
+    try:
+        facts = json.loads((folder / STATUS_FILE).read_text())
+    except (OSError, ValueError):
+        return {}
+    return facts if isinstance(facts, dict) else {}
+
+
+def find_state(folder: Path) -> tuple[StateName, str | None]:
+    """The state of a run, and the reason if it has failed.
+
+    A run is running while a process holds its lock. A run that notes that it is running while no process holds its
+    lock was killed, and has failed. Runs of versions that note no state are finished after their final evaluation.
+    """
+    if _is_locked(folder):
+        return "running", None
+    facts = read_facts(folder)
+    state = facts.get("state")
+    if state == "running":
+        return "failed", "the process was killed"
+    if state == "failed":
+        return "failed", cut(str(facts.get("reason") or "unknown"))
+    if state in ("finished", "stopped"):
+        return state, None
+    return ("finished" if _has_final_evaluation(folder) else "stopped"), None
+
+
+def _is_whole(entry: Mapping[str, Any]) -> bool:
+    return all(isinstance(entry.get(name), int | float) for name in Evaluation._fields)
+
+
+def _has_final_evaluation(folder: Path) -> bool:
+    """Whether the run was evaluated finally after the last frames that it has collected."""
+    try:
+        return bool(json.loads((folder / FINAL_FILE).read_text())["env_frames"] >= read_progress(folder)[0])
+    except (OSError, ValueError, TypeError, KeyError):
+        return False
+
+
+def _is_locked(folder: Path) -> bool:
+    """Whether a process holds the lock of a folder; false on a file system without locks."""
+    try:
+        lock = os.open(folder / LOCK_FILE, os.O_RDONLY)
+    except OSError:
+        return False
+    try:
+        fcntl.flock(lock, fcntl.LOCK_SH | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return True
+    except OSError:
+        return False
+    finally:
+        os.close(lock)
+    return False
+
+
+def _read_metrics(path: Path) -> Iterator[Evaluation]:
+    """The evaluations of a file of metrics, whose columns `actor` and `value` are losses."""
+    for row in read_rows(path):
+        if row["planner_return"]:
+            returns = float(row["planner_return"]), float(row["actor_return"])
+            yield Evaluation(int(row["env_frames"]), float(row["minutes"]), *returns, int(row["updates"]))

@@ -1,0 +1,128 @@
+"""Self-contained web pages: sections with figures, tables, pictures and films, and no address of another file."""
+
+from __future__ import annotations
+
+import base64
+import os
+import re
+import string
+from collections.abc import Iterable, Sequence
+from html import escape
+from pathlib import Path
+from typing import NamedTuple
+
+import cv2
+
+from latentplan.reporting.frame import Frame
+
+LARGEST_PAGE = 10_000_000  # bytes
+LARGEST_FILM = 6_000_000
+WIDEST_CARD = 48  # characters of a row in a card of one column
+MEDIA = {".webm": "video/webm", ".mp4": "video/mp4"}
+_TEMPLATE = Path(__file__).with_name("page.html")
+_NUMBER = re.compile(r"[-+]?[\d,.]+( ms| %)?|-")
+
+
+class Section(NamedTuple):
+    """A section of a page.
+
+    Attributes:
+        name: Heading.
+        intro: Text below the heading.
+        parts: Elements in a grid, as HTML.
+    """
+
+    name: str
+    intro: str
+    parts: Sequence[str]
+
+
+def render_page(title: str, sections: Iterable[Section]) -> str:
+    """The page as HTML; sections without elements are left out.
+
+    Args:
+        title: Title and heading.
+        sections: The sections, in order.
+    """
+    links, bodies = [], []
+    for section in sections:
+        if section.parts:
+            anchor = re.sub(r"\W+", "-", section.name.lower()).strip("-")
+            links.append(f'<a href="#{anchor}">{escape(section.name)}</a>')
+            grid = "\n".join(section.parts)
+            bodies.append(
+                f'<section id="{anchor}"><h2>{escape(section.name)}</h2><p>{escape(section.intro)}</p>'
+                f'<div class="grid">{grid}</div></section>'
+            )
+    template = string.Template(_TEMPLATE.read_text(encoding="utf-8"))
+    return template.substitute(title=escape(title), links="\n".join(links), body="\n".join(bodies))
+
+
+def write_page(path: Path, page: str) -> Path:
+    """Writes a page under a temporary name and renames it, so that the file is never half written; returns the path."""
+    partial = path.with_name(f".{path.name}.{os.getpid()}")
+    partial.write_text(page, encoding="utf-8")
+    partial.replace(path)
+    return path
+
+
+def figure(content: str, caption: str) -> str:
+    """A drawing, picture or film with its caption."""
+    return f"<figure>{content}<figcaption>{escape(caption)}</figcaption></figure>"
+
+
+def table(rows: Sequence[Sequence[str]], caption: str = "") -> str:
+    """A table; the first row is its header, and columns of numbers are aligned to the right."""
+    head, *body = rows
+    is_number = [bool(body) and all(_NUMBER.fullmatch(row[column]) for row in body) for column in range(len(head))]
+
+    def cells(row: Sequence[str], tag: str) -> str:
+        kinds = [' class="number"' if number else "" for number in is_number]
+        return "".join(f"<{tag}{kind}>{escape(cell)}</{tag}>" for cell, kind in zip(row, kinds, strict=True))
+
+    lines = "".join(f"<tr>{cells(row, 'td')}</tr>" for row in body)
+    longest = [max(len(row[column]) for row in rows) for column in range(len(head))]
+    wide = " wide" if sum(longest) > WIDEST_CARD else ""
+    title = f"<caption>{escape(caption)}</caption>" if caption else ""
+    return (
+        f'<div class="card scroll{wide}" tabindex="0"><table>{title}<thead><tr>{cells(head, "th")}</tr></thead>'
+        f"<tbody>{lines}</tbody></table></div>"
+    )
+
+
+def picture(frame: Frame, alt: str) -> str:
+    """A picture, RGB uint8 (height, width, 3), as PNG whose pixels stay sharp when it is enlarged."""
+    _, png = cv2.imencode(".png", cv2.cvtColor(frame, cv2.COLOR_RGB2BGR))
+    data = base64.b64encode(png.tobytes()).decode()
+    return f'<img class="pixels" alt="{escape(alt)}" src="data:image/png;base64,{data}">'
+
+
+def film(path: Path, name: str, largest: int = LARGEST_FILM) -> str:
+    """A film as an element with controls; a sentence where there is no film, or where it is too large for the page.
+
+    Args:
+        path: The film, `.mp4` or `.webm`.
+        name: What the film shows.
+        largest: Size of the largest film that the page may hold, in bytes.
+    """
+    if not path.exists():
+        return f"<p>There is no film at {escape(path.name)}.</p>"
+    if path.stat().st_size > largest:
+        size = path.stat().st_size / 1e6
+        return f"<p>The film {escape(path.name)} has {size:.1f} MB and is too large for this page.</p>"
+    data = base64.b64encode(path.read_bytes()).decode()
+    return (
+        f'<video controls loop muted playsinline preload="metadata" aria-label="{escape(name)}" '
+        f'src="data:{MEDIA[path.suffix]};base64,{data}"></video>'
+    )
+
+
+def scrubber(name: str, frames: Sequence[tuple[str, str]]) -> str:
+    """Elements of which a slider shows one at a time, the last one first; without scripts all are shown.
+
+    Args:
+        name: What the slider chooses, such as `iteration`.
+        frames: Name and HTML of each element.
+    """
+    inner = "".join(f'<div class="frame" data-name="{escape(label)}">{content}</div>' for label, content in frames)
+    return f'<div class="scrub" data-name="{escape(name)}">{inner}</div>'

@@ -1,0 +1,142 @@
+"""Training runs are listed, watched and compared from what their folders hold."""
+
+import csv
+import json
+import re
+from dataclasses import replace
+
+import pytest
+
+from latentplan.commands.main import main
+from latentplan.config import Config, EnvConfig, PlannerConfig, RunConfig
+from latentplan.config.files import dump_config
+from latentplan.config.run_folder import lock_folder
+from latentplan.config.run_results import find_state, note_state
+from latentplan.evaluation.statistics import confidence_interval
+from latentplan.reporting.compare import group_runs, mean_curve
+from latentplan.reporting.runs import find_runs, read_run
+
+COLUMNS = ("env_frames", "updates", "minutes", "planner_return", "actor_return")
+
+
+@pytest.fixture
+def make_run(tmp_path):
+    """Makes a folder with the settings and evaluations of a run."""
+
+    def make(name, returns=(100.0, 300.0, 200.0), seed=0, **planner):
+        folder = tmp_path / name
+        folder.mkdir(parents=True)
+        run = RunConfig(frames=4000, seed=seed)
+        env = EnvConfig(domain="cartpole", task="swingup")
+        dump_config(
+            replace(Config(), env=env, run=run, planner=PlannerConfig(**{"horizon": 12, **planner})),
+            folder / "config.yaml",
+        )
+        with (folder / "metrics.csv").open("w", newline="") as file:
+            writer = csv.writer(file)
+            writer.writerow(COLUMNS)
+            for index, value in enumerate(returns, start=1):
+                writer.writerow([1000 * index, 10 * index, 0.5 * index, value, value - 50.0])
+        return folder
+
+    return make
+
+
+def test_runs_lists_best_and_last_return_of_every_run_below_a_folder(make_run, tmp_path, capsys):
+    make_run("one")
+    note_state(make_run("sweep/two", returns=()), "finished")
+    assert main(["runs", str(tmp_path)]) == 0
+    header, one, two = capsys.readouterr().out.splitlines()
+    assert header.split() == ["run", "task", "seed", "frames", "minutes", "best", "last", "state"]
+    assert one.split() == ["one", "cartpole-swingup", "0", "3,000", "1.5", "300.0", "200.0", "stopped"]
+    assert two.split() == ["sweep/two", "cartpole-swingup", "0", "0", "0.0", "-", "-", "finished"]
+
+
+def test_runs_gives_one_line_for_each_folder_that_is_no_run(make_run, tmp_path, capsys):
+    make_run("good")
+    (tmp_path / "empty").mkdir()
+    (tmp_path / "foreign" / "deep").mkdir(parents=True)
+    (tmp_path / "settings").mkdir()
+    (tmp_path / "settings" / "config.yaml").write_text("{{{")
+    damaged = make_run("damaged")
+    (damaged / "metrics.csv").write_text("a,b\n1,2\n")
+    assert main(["runs", str(tmp_path)]) == 0
+    output = capsys.readouterr()
+    assert len(output.out.splitlines()) == 2
+    lines = output.err.splitlines()
+    assert len(lines) == 4
+    for name, line in zip(("damaged", "empty", "foreign", "settings"), lines, strict=True):
+        assert line.startswith("no run: ") and str(tmp_path / name) in line
+
+
+@pytest.mark.parametrize("command", ["runs", "watch", "compare"])
+def test_a_missing_folder_is_refused_in_one_line(command, tmp_path, capsys):
+    other = [str(tmp_path)] if command == "compare" else []
+    assert main([command, str(tmp_path / "missing"), *other]) == 2
+    assert re.fullmatch(r"error: there is no folder .*missing.*\n", capsys.readouterr().err)
+
+
+def test_a_run_is_running_while_its_lock_is_held_and_has_failed_if_it_was_killed(make_run):
+    folder = make_run("run")
+    assert find_state(folder) == ("stopped", None)  # a run of a version that noted no state
+    with lock_folder(folder):
+        note_state(folder, "running", command="train")
+        assert find_state(folder) == ("running", None)
+    assert find_state(folder) == ("failed", "the process was killed")
+    note_state(folder, "failed", reason="no space left")
+    assert find_state(folder) == ("failed", "no space left")
+    note_state(folder, "stopped")
+    assert find_state(folder) == ("stopped", None)
+    assert json.loads((folder / "status.json").read_text())["command"] == "train"
+
+
+def test_asking_for_the_state_does_not_hinder_a_run_that_begins(make_run):
+    folder = make_run("run")
+    for _ in range(50):
+        find_state(folder)
+        with lock_folder(folder):
+            assert find_state(folder)[0] == "running"
+
+
+def test_watch_prints_every_evaluation_and_returns_whether_the_run_failed(make_run, capsys):
+    folder = make_run("run")
+    assert main(["watch", str(folder)]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert [line.split()[0] for line in lines[1:-1]] == ["1,000", "2,000", "3,000"]
+    assert lines[-1].startswith("stopped | 3,000 frames | 1.5 min | best 300.0")
+    note_state(folder, "failed", reason="no space left")
+    assert main(["watch", str(folder)]) == 1
+    assert capsys.readouterr().out.splitlines()[-1].endswith(": no space left")
+
+
+def test_compare_groups_seeds_and_names_the_settings_that_differ(make_run, tmp_path, capsys):
+    folders = [make_run("a0", seed=0), make_run("a1", (200.0, 400.0, 300.0), seed=1), make_run("b", horizon=5)]
+    page = tmp_path / "page.html"
+    assert main(["compare", *map(str, folders), "--report", str(page)]) == 0
+    text = capsys.readouterr().out
+    assert re.search(r"^horizon 12 +cartpole-swingup +0, 1 .* 250\.0 \(-?[\d.]+ to [\d.]+\)", text, re.MULTILINE)
+    assert re.search(r"^planner\.horizon +12 +5$", text, re.MULTILINE)
+    html = page.read_text()
+    assert "planner.horizon" in html and "<svg" in html
+    assert not re.search(r"""(?:src|href)=["'](?!data:|#)""", html)
+
+
+def test_mean_curve_of_one_seed_is_its_evaluations_and_of_several_their_mean(make_run):
+    runs = [read_run(make_run("a", seed=0)), read_run(make_run("b", (200.0, 400.0, 300.0), seed=1))]
+    alone = mean_curve(group_runs(runs[:1])[0][0], "planner", "env_frames", confidence_interval)
+    assert list(alone.x) == [1000, 2000, 3000] and list(alone.y) == [100, 300, 200] and alone.low is None
+    both = mean_curve(group_runs(runs)[0][0], "planner", "env_frames", confidence_interval)
+    assert (both.x[0], both.x[-1], both.y[0], both.y[-1]) == (1000, 3000, 150, 250)
+    low, high = confidence_interval([200.0, 300.0])
+    assert (both.low[-1], both.high[-1]) == pytest.approx((low, high))
+
+
+def test_a_run_that_is_compared_alone_is_refused(make_run, capsys):
+    folder = str(make_run("run"))
+    assert main(["compare", folder, folder]) == 2
+    assert capsys.readouterr().err == "error: a comparison needs two runs or more: give their folders\n"
+
+
+def test_find_runs_takes_a_run_itself(make_run):
+    runs, problems = find_runs(make_run("run"))
+    assert len(runs) == 1 and not problems

@@ -1,0 +1,194 @@
+"""Recording an episode changes nothing of it, and a report is one page that needs no other file."""
+
+import re
+from html.parser import HTMLParser
+from types import SimpleNamespace
+
+import gymnasium
+import numpy as np
+import pytest
+import torch
+
+from latentplan.agents.gated import GatedAgent
+from latentplan.agents.planning import PlanningAgent
+from latentplan.config import Config
+from latentplan.config.run_results import Evaluation
+from latentplan.evaluation.episodes import run_episodes
+from latentplan.reporting.page import Section, film, render_page, scrubber, table
+from latentplan.reporting.recorder import COMPARED_STEPS, EpisodeRecorder, GuardedRecorder
+from latentplan.reporting.report import ReportData, Returns, render_report, tile
+from latentplan.reporting.svg import Labels, Line, plot_lines
+from tests.agents.small_agents import CONFIG, make_model
+
+DECISIONS = 40
+VOID = {"meta", "link", "img", "input", "br"}
+
+
+class NoisyEnv(gymnasium.Env):
+    """Shows noise that depends on the seed and the actions."""
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.steps = 0
+        return self.draw(), {}
+
+    def step(self, action):
+        self.steps += 1
+        return self.draw(), float(action[0]), False, self.steps == DECISIONS, {}
+
+    def draw(self):
+        return self.np_random.integers(0, 255, (64, 64, 3), np.uint8)
+
+
+class Elements(HTMLParser):
+    """Checks that every element of a page is closed, and collects the addresses that it names."""
+
+    def __init__(self):
+        super().__init__()
+        self.open, self.addresses, self.names = [], [], []
+
+    def handle_starttag(self, tag, attributes):
+        values = dict(attributes)
+        self.addresses += [values[name] for name in ("src", "href", "xlink:href") if name in values]
+        self.names += [values["id"]] if "id" in values else []
+        if tag not in VOID:
+            self.open.append(tag)
+
+    def handle_endtag(self, tag):
+        assert self.open.pop() == tag
+
+
+def play(make_agent, record):
+    """The actions of one episode, and the recording if there is one."""
+    agent, actions = make_agent(), []
+    recorder = EpisodeRecorder(agent, DECISIONS) if record else None
+
+    def watch(step):
+        actions.append(step.action)
+        if recorder is not None:
+            recorder(step)
+
+    run_episodes(NoisyEnv(), agent, [3], on_step=watch)
+    return np.stack(actions[:-1]), recorder and recorder.recording
+
+
+@pytest.mark.parametrize("kind", [PlanningAgent, GatedAgent])
+def test_recorder_changes_no_action(kind):
+    plain, _ = play(lambda: kind(make_model(), CONFIG, 0.95), record=False)
+    recorded, recording = play(lambda: kind(make_model(), CONFIG, 0.95), record=True)
+    assert np.array_equal(plain, recorded) and np.array_equal(recorded, np.stack(recording.actions))
+    assert len(recording.surprise) == len(recording.actor_actions) == DECISIONS
+    assert len(recording.totals) == DECISIONS + 1
+    assert recording.inspections and recording.inspections[0].decision == 0
+
+
+@pytest.fixture(scope="module")
+def recording():
+    return play(lambda: PlanningAgent(make_model(), CONFIG, 0.95), record=True)[1]
+
+
+def test_recorder_sorts_candidates_from_elites(recording):
+    assert [each.decision for each in recording.inspections] == [0, 10, 20, 30]
+    first, *_, last = recording.inspections[0].search
+    assert len(first.elites) == CONFIG.planner.num_elites
+    assert first.elites.shape[1:] == first.mean.shape == (CONFIG.planner.horizon, 2)
+    assert last.elite_return >= first.elite_return - 1e-4  # elites of an earlier iteration are no longer candidates
+    assert first.elite_pictures.dtype == np.uint8
+
+
+def test_recorder_compares_imagination_with_the_frames_that_followed(recording):
+    assert recording.picture_error.shape[1] == recording.reward_error.shape[1] == COMPARED_STEPS
+    assert np.isfinite(recording.picture_error).all() and (recording.picture_error > 0.0).all()
+    strip = recording.strips[0]
+    assert strip.real.shape == strip.imagined.shape == (len(strip.steps), 32, 32, 3)
+
+
+def test_imagination_along_the_plan_ends_as_the_film_shows_it():
+    agent = PlanningAgent(make_model(), CONFIG, 0.95)
+    agent.act(np.random.default_rng(0).integers(0, 255, (64, 64, 3), np.uint8))
+    actions = agent.controller.plan.actions.float().numpy()
+    pictures = agent.imagine_along([agent.belief()], actions, actions.shape[1]).pictures
+    assert np.abs(pictures[0, -1].astype(int) - agent.imagine().astype(int)).max() <= 1  # rounding of two paths
+
+
+def test_a_recorder_that_fails_warns_once_and_the_episode_goes_on():
+    agent = PlanningAgent(make_model(), CONFIG, 0.95)
+    agent.belief = None
+    recorder = GuardedRecorder(EpisodeRecorder(agent, DECISIONS))
+    with pytest.warns(RuntimeWarning, match="nothing of this episode") as caught:
+        episode = run_episodes(NoisyEnv(), agent, [3], on_step=recorder)[0]
+    assert len(caught) == 1 and episode.num_decisions == DECISIONS and recorder.recording is None
+    assert agent.controller.keep is None
+
+
+@pytest.fixture(scope="module")
+def page(recording, tmp_path_factory):
+    path = tmp_path_factory.mktemp("film") / "film.webm"
+    path.write_bytes(b"film")
+    recording.clauses = {"cart < 0.5": [True] * DECISIONS}
+    recording.objective_scores = [0.5] * DECISIONS
+    data = ReportData(
+        "cartpole-swingup",
+        Config(),
+        [Returns("planner", [1.0, 2.0], (0.0, 3.0)), Returns("actor", [1.0], (np.nan, np.nan))],
+        path,
+        [Evaluation(1000, 1.0, 10.0, 5.0, 10), Evaluation(2000, 2.0, 20.0, 15.0, 20)],
+        recording,
+        np.linspace(1.0, 9.0, 50),
+        {"period of control": 5.0},
+        {"command": "eval.py <&>", "libraries": {"torch": "1"}},
+    )
+    return render_report(data)
+
+
+def test_report_is_well_formed_and_names_no_other_file(page):
+    elements = Elements()
+    elements.feed(page)
+    assert elements.open == []
+    assert len(elements.names) == len(set(elements.names))
+    for address in elements.addresses:
+        assert address.startswith("data:") or address[1:] in elements.names, address
+    assert not re.search(r"url\((?!#)", page) and "@import" not in page
+    assert len(page) < 10_000_000
+
+
+def test_report_shows_every_part_that_has_figures(page):
+    for name in ("Film", "Returns", "Training curves", "Decision time", "Imagined against real", "Searches"):
+        assert f"<h2>{name}</h2>" in page
+    for name in ("Planner and actor", "Surprise and gate", "Goals", "Provenance"):
+        assert f"<h2>{name}</h2>" in page
+    assert "eval.py &lt;&amp;&gt;" in page and "DreamerV3" in page and "torch 1" in page
+
+
+def test_report_leaves_out_parts_without_figures():
+    page = render_report(ReportData("corridor", Config()))
+    assert re.findall("<h2>(.*?)</h2>", page) == ["Provenance"]
+
+
+def test_figures_take_their_colours_from_the_theme():
+    svg = plot_lines([Line("a", [0, 1], [0, 1], [0, 0], [1, 2])], Labels("a & b", "x", "y", [("level", 0.5)]))
+    assert "var(--series-1)" in svg and "var(--ink)" in svg and 'aria-label="a &amp; b"' in svg
+    assert not re.search(r"#[0-9a-f]{6}\b", svg)
+
+
+def test_page_escapes_text_and_a_film_that_is_too_large_is_named(tmp_path):
+    path = tmp_path / "film.webm"
+    path.write_bytes(b"0" * 100)
+    parts = [table([["<b>"], ["1"]]), film(path, "f", largest=10), film(tmp_path / "none.webm", "f")]
+    page = render_page("<title>", [Section("<s>", "<i>", parts), Section("empty", "", [])])
+    assert "<b>" not in page and "<i>" not in page and "empty" not in page
+    assert "too large" in page and "There is no film" in page
+    assert scrubber("iteration", [("1 of 1", "x")]).count("data-name") == 2
+
+
+def test_tile_keeps_pictures_apart():
+    black = np.zeros((2, 4, 4, 3), np.uint8)
+    assert tile([black, black]).shape == (9, 9, 3) and (tile([black, black])[4] == 128).all()
+
+
+def test_recorder_of_an_agent_without_a_model_keeps_actions_and_returns():
+    agent = SimpleNamespace(act=lambda frame: np.zeros(2, np.float32), reset=lambda: None, seed=lambda seed: None)
+    recorder = EpisodeRecorder(agent, None)
+    run_episodes(NoisyEnv(), agent, [0], on_step=recorder)
+    assert len(recorder.recording.actions) == DECISIONS and not recorder.recording.surprise
+    assert torch.is_grad_enabled()
