@@ -44,7 +44,13 @@ def frozen(make_planner, **options):
 
 
 def test_planner_config_and_planner_share_options_defaults_and_checks():
-    evaluated = {"num_elites": 16, "final": "mean", "noise_beta": 0.0, "keep_elite_fraction": 0.0}
+    evaluated = {
+        "num_elites": 16,
+        "final": "mean",
+        "noise_beta": 0.0,
+        "keep_elite_fraction": 0.0,
+        "use_continues": None,
+    }
     problem = {"action_dim", "action_low", "action_high", "action_choices", "init_mean", "discount", "clock"}
     for kind, own, other in ((PlannerConfig, {"method", "surprise_limit"}, evaluated), (CEMPlanner, problem, {})):
         fields = {field.name: field.default for field in dataclasses.fields(kind)}
