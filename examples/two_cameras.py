@@ -42,12 +42,12 @@ class Dot(gymnasium.Env):
 
 
 def main(out: str = ".") -> None:
-    """Trains for about a minute, and evaluates in episodes of 20 steps."""
+    """Trains for about two minutes, and evaluates in episodes of 20 steps."""
     env = EnvConfig(action_repeat=2, cameras=("side", "above"), vectors=("speed",))
     model = ModelConfig(deter_dim=32, hidden_dim=32, encoder_channels=(8, 8, 8))
     learning = LearningConfig(batch_size=8, sequence_length=8, model_learning_rate=3e-3, behaviour_learning_rate=1e-3)
     collection = CollectionConfig(prefill_decisions=200, round_decisions=100, updates_per_decision=1.0, overlap=False)
-    run = RunConfig(frames=600, threads=1, run_dir=f"{out}/dot")
+    run = RunConfig(frames=2000, threads=1, run_dir=f"{out}/dot")
     config = Config(env=env, model=model, learning=learning, collection=collection, run=run)
     train(config, make_env=lambda: gymnasium.wrappers.TimeLimit(Dot(), 20))
     for mode in ("planner", "random"):

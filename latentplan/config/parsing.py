@@ -157,7 +157,7 @@ def _parse_values(given: Sequence[Setting], values: Mapping[str, Any], names: Ma
     parser = ArgumentParser(exit_on_error=False)
     for index, setting in enumerate(given):
         parser.add_argument(f"--value{index}", type=_parsed_type(setting.hint))
-    texts = {f"value{index}": values[setting.key] for index, setting in enumerate(given)}
+    texts = {f"value{index}": _spell_numbers(setting, values[setting.key]) for index, setting in enumerate(given)}
     try:
         parsed = parser.parse_object(texts, defaults=False)
     except argparse.ArgumentError as error:
@@ -247,6 +247,13 @@ def _parsed_type(hint: Any) -> Any:
     return functools.reduce(lambda left, right: left | right, kinds)
 
 
+def _spell_numbers(setting: Setting, value: Any) -> Any:
+    """The value, with whole numbers as texts where the items are texts: `cameras: [0, 1]` names cameras 0 and 1."""
+    if tuple[str, ...] not in alternatives(setting.hint) or not isinstance(value, list):
+        return value
+    return [str(item) if type(item) is int else item for item in value]
+
+
 def _wrong_type(setting: Setting, values: Mapping[str, Any], names: Mapping[str, str]) -> UserError:
     name, value = names.get(setting.key, setting.key), values[setting.key]
     words = setting.choices
@@ -256,8 +263,9 @@ def _wrong_type(setting: Setting, values: Mapping[str, Any], names: Mapping[str,
         return UserError(f"{name} must be one of {', '.join(words)}, got {shown(value)}{hint}")
     separator = setting.options.get("separator")
     if separator:
+        text = separator.join(map(str, value)) if isinstance(value, list | tuple) else value
         item = _TYPE_WORDS[typing.get_args(setting.hint)[0]].partition(" ")[2]
-        return UserError(f"{name} must be {item}s, separated by {separator!r}, got {shown(separator.join(value))}")
+        return UserError(f"{name} must be {item}s, separated by {separator!r}, got {shown(text)}")
     example = '["speed -> 1.0"]' if str in typing.get_args(setting.hint) else "[16, 32]"
     wanted = " or ".join(_TYPE_WORDS.get(kind, f"a list such as {example}") for kind in alternatives(setting.hint))
     return UserError(f"{name} must be {wanted}, got {shown(value)}")

@@ -276,8 +276,8 @@ def _mean_picture(pictures: Frame) -> Frame:
 
 
 def _shrink(frame: Frame) -> Frame:
-    """A frame (64, 64, 3) at the size of decoded pictures, (32, 32, 3)."""
-    pairs = frame.astype(np.float32).reshape(frame.shape[0] // 2, 2, frame.shape[1] // 2, 2, 3)
+    """The first camera of a frame (64, 64, 3 camera) at the size of decoded pictures, (32, 32, 3)."""
+    pairs = frame[..., :3].astype(np.float32).reshape(frame.shape[0] // 2, 2, frame.shape[1] // 2, 2, 3)
     return pairs.mean(axis=(1, 3)).round().astype(np.uint8)
 
 

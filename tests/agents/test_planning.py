@@ -76,8 +76,8 @@ def test_surprise_is_half_the_squared_distance_in_standard_deviations(model):
 def test_planning_agent_acts_by_the_actor_when_a_frame_exceeds_the_surprise_limit(model, frames, monkeypatch, limit):
     surprise = torch.tensor([3.0, 0.7])
     monkeypatch.setattr(type(model.backend.frame_functions(model)), "surprise", lambda self, state: surprise)
-    planner, actor = make_planner(model), ActorAgent(model, CONFIG)
-    limited = make_planner(model, surprise_limit=limit)
+    planner, actor = make_planner(model, num_policy_samples=0), ActorAgent(model, CONFIG)
+    limited = make_planner(model, num_policy_samples=0, surprise_limit=limit)
     planned, acted, action = (agent.act(frames) for agent in (planner, actor, limited))
     assert not np.allclose(planned, acted, atol=0.05)
     for row in range(2):

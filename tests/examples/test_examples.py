@@ -90,9 +90,9 @@ def test_own_environment_is_learned_within_seconds(run_example, tmp_path):
 
 
 @pytest.mark.slow
-def test_two_cameras_and_a_vector_are_learned_from_within_a_minute(run_example):
+def test_two_cameras_and_a_vector_are_learned_from(run_example):
     numbers = run_example("two_cameras")
-    assert numbers["planner"][0] > numbers["random"][0] + 1.0
+    assert numbers["planner"][0] > numbers["random"][0] + 2.0
 
 
 @pytest.mark.slow

@@ -26,7 +26,7 @@ def observed(tiny, dot, tmp_path_factory):
     def copy_state(model):
         return {name: value.clone() for name, value in model.state_dict().items()}
 
-    def evaluate(collector, episodes, film=None, weights=None, actor=True):
+    def evaluate(collector, episodes, film=None, weights=None, actor=True, record=False):
         if weights is not None:
             collector._load_weights(weights)
         evaluated.append(copy_state(collector.model))
@@ -75,7 +75,7 @@ def test_collection_acts_with_the_averaged_weights(observed):
 def make_evaluate(returns, calls):
     """A stand-in for `Collector.evaluate` with given returns of the planner; records whether the actor plays."""
 
-    def evaluate(collector, episodes, film=None, weights=None, actor=True):
+    def evaluate(collector, episodes, film=None, weights=None, actor=True, record=False):
         calls.append(actor)
         return {"planner": [next(returns)] * episodes, "actor": [0.0] * episodes}
 
