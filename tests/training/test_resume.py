@@ -134,7 +134,7 @@ def test_resume_keeps_the_new_budget_of_an_interrupted_extension(short, dot, tmp
 def test_resume_repeats_a_run_that_crashed_before_its_first_save(finished, tiny, dot, tmp_path):
     """The metrics of the crashed run do not stay beside those of the repetition."""
     steps = itertools.count()
-    step = {"step": lambda self, action: dot.step(self, action) if next(steps) < 100 else crash()}
+    step = {"step": lambda self, action: dot.step(self, action) if next(steps) < 105 else crash()}
     with pytest.raises(Crash):
         train(tiny(tmp_path / "run", evaluation={"every_frames": 10**6}), type("Crashing", (dot,), step))
     assert len(read_rows(tmp_path / "run")) > 0 and read_state(tmp_path / "run")["learner"]["updates"] == 0
@@ -183,7 +183,7 @@ def test_resume_drops_metrics_written_after_the_last_save(short, dot, tmp_path):
 def test_resume_continues_from_the_last_timed_save_after_a_crash(tiny, dot, tmp_path, monkeypatch):
     steps = itertools.count(-45 - 2 * 20 - 3 * 15)  # of the prefill, its evaluation and three rounds
     monkeypatch.setattr(saving, "SAVE_MINUTES", 0.0)
-    step = {"step": lambda self, action: dot.step(self, action) if next(steps) < 5 else crash()}
+    step = {"step": lambda self, action: dot.step(self, action) if next(steps) < 105 else crash()}
     config = tiny(tmp_path / "run", evaluation={"every_frames": 10**6}, run={"frames": 105})
     with pytest.raises(Crash):
         train(config, type("Crashing", (dot,), step))
