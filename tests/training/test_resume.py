@@ -183,7 +183,7 @@ def test_resume_drops_metrics_written_after_the_last_save(short, dot, tmp_path):
 def test_resume_continues_from_the_last_timed_save_after_a_crash(tiny, dot, tmp_path, monkeypatch):
     steps = itertools.count(-45 - 2 * 20 - 3 * 15)  # of the prefill, its evaluation and three rounds
     monkeypatch.setattr(saving, "SAVE_MINUTES", 0.0)
-    step = {"step": lambda self, action: dot.step(self, action) if next(steps) < 105 else crash()}
+    step = {"step": lambda self, action: dot.step(self, action) if next(steps) < 5 else crash()}
     config = tiny(tmp_path / "run", evaluation={"every_frames": 10**6}, run={"frames": 105})
     with pytest.raises(Crash):
         train(config, type("Crashing", (dot,), step))
