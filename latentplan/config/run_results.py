@@ -129,7 +129,7 @@ def find_state(folder: Path) -> tuple[StateName, str | None]:
     A run is running while a process holds its lock. A run that notes that it is running while no process holds its
     lock was killed, and has failed. Runs of versions that note no state are finished after their final evaluation.
     """
-    if _is_locked(folder):
+    if is_locked(folder):
         return "running", None
     facts = read_facts(folder)
     state = facts.get("state")
@@ -154,7 +154,7 @@ def _has_final_evaluation(folder: Path) -> bool:
         return False
 
 
-def _is_locked(folder: Path) -> bool:
+def is_locked(folder: Path) -> bool:
     """Whether a process holds the lock of a folder; false on a file system without locks."""
     try:
         lock = os.open(folder / LOCK_FILE, os.O_RDONLY)

@@ -20,7 +20,7 @@ from typing import Protocol
 from bench.runs import TrainingRun
 from latentplan.config import UserError
 from latentplan.config.checks import cut
-from latentplan.config.run_folder import lock_folder
+from latentplan.config.run_results import is_locked
 from latentplan.training.signals import Signals
 
 LOG = "train.log"
@@ -99,7 +99,7 @@ class Queue:
         for run in list(self.waiting):
             if len(self.active) >= self.jobs:
                 return
-            if _is_locked(run.folder):
+            if is_locked(run.folder):  # such as a run of a sweep that was killed and that still saves itself
                 if run not in self._busy:
                     self._busy.add(run)
                     self.observer.wait(run)
@@ -156,17 +156,6 @@ def _end_with_parent() -> None:
     """Makes the system send SIGTERM to this process when its parent ends, however it ends."""
     if _LIBRARY is not None:
         _LIBRARY.prctl(_SET_DEATH_SIGNAL, signal.SIGTERM, 0, 0, 0)
-
-
-def _is_locked(folder: Path) -> bool:
-    """Whether a process learns in a folder, such as a run of a sweep that was killed and that still saves itself."""
-    if not folder.is_dir():
-        return False
-    try:
-        with lock_folder(folder):
-            return False
-    except UserError:
-        return True
 
 
 def _describe_end(code: int, log: Path) -> str:

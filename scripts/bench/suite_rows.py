@@ -117,14 +117,10 @@ def merge_rows(known: Iterable[Row], new: Iterable[Row]) -> list[Row]:
     Returns:
         The rows in the order of task, seed, version and frames.
     """
-    groups: dict[tuple[str, int, str], list[Row]] = {}
-    for row in known:
-        groups.setdefault(_key(row), []).append(row)
-    replaced: dict[tuple[str, int, str], list[Row]] = {}
-    for row in new:
-        replaced.setdefault(_key(row), []).append(row)
-    groups |= replaced
-    return sorted((row for rows in groups.values() for row in rows), key=lambda row: (*_key(row), row.env_frames))
+    new = list(new)
+    replaced = set(map(_key, new))
+    rows = [*(row for row in known if _key(row) not in replaced), *new]
+    return sorted(rows, key=lambda row: (*_key(row), row.env_frames))
 
 
 def read_rows(path: Path) -> list[Row]:

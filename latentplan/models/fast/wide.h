@@ -6,7 +6,7 @@
 
 #include "products.h"
 
-#if PAIR == 2
+#ifdef __AVX512F__
 #define LANES 16
 #else
 #define LANES 8

@@ -380,8 +380,8 @@ class Collector:
     def _step(self, agent: ModelAgent | RandomAgent, log: _Log) -> None:
         assert self._frames is not None
         frames, labels, first = self._frames.copy(), self._labels.copy(), self._has_ended.copy()
-        seen = self._labels[:, len(self.labels) :].copy()
-        actions = agent.act((frames, seen) if self.spaces.vector_dim else frames)
+        vectors = labels[:, len(self.labels) :]
+        actions = agent.act((frames, vectors) if self.spaces.vector_dim else frames)
         state = agent.state if isinstance(agent, ModelAgent) else None
         deter = None if state is None else first_turn(state).deter.float().cpu().numpy()
         self._frames, rewards, terminated, truncated, info = self._episodes.step(actions)
