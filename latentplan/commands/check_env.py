@@ -15,6 +15,7 @@ from latentplan.config.checks import above_zero, at_least
 from latentplan.config.env_id import FLAG, import_named, lay_env
 from latentplan.config.files import compose
 from latentplan.config.parsing import option
+from latentplan.config.suites import check_task
 
 if TYPE_CHECKING:
     import numpy as np
@@ -69,7 +70,7 @@ def run(request: Request) -> int:
     check_env_settings(config)
     from latentplan.envs.conformance import check_environment
 
-    print(f"{config.domain}-{config.task or 'default task'}", flush=True)
+    print(f"{config.domain}-{config.task or check_task(config.suite, config.domain)[0]}", flush=True)
     report = check_environment(config, request.decisions, request.step_timeout_s)
     for name, fact in report.facts.items():
         print(f"{name:<14}{fact}")

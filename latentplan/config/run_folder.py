@@ -17,7 +17,7 @@ from latentplan.config.settings import Config
 RUN_FILE = "config.yaml"
 LOCK_FILE = ".lock"
 SAVES_FOLDER = "resume"
-RUN_FORMAT = 2  # 1 was `resume/state.pt`, from which a run could not continue exactly
+RUN_FORMAT = 3  # 1 was `resume/state.pt`, from which a run could not continue exactly; 2 kept other counts
 
 
 def run_saves(folder: Path) -> Saves:

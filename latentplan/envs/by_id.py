@@ -13,6 +13,7 @@ from latentplan.config.checks import nearest
 from latentplan.config.env_id import FLAG, require_imported, split_id
 from latentplan.config.extras import extra_of
 from latentplan.config.reading import read_kwargs
+from latentplan.config.suites import check_task
 from latentplan.envs.faults import describe_failure
 from latentplan.envs.rendered import MODE
 from latentplan.envs.user import PixelEnv, make_from
@@ -55,7 +56,8 @@ def make_inner(config: EnvConfig) -> gymnasium.Env[Any, Any]:
             reason = str(error).partition(" was raised from")[0]
             raise UserError(f"cannot make {name} with --env-kwargs {config.kwargs}: {reason}; correct them") from None
         raise describe_failure(error) from error
-    _draw_small(env, kwargs, config.frame_size)
+    if config.pixels == "render":
+        _draw_small(env, kwargs, config.frame_size)
     return env
 
 
@@ -66,7 +68,7 @@ def find_id(config: EnvConfig) -> str:
         UserError: The registry does not have it, or the module that registers it was not imported.
     """
     require_imported(config)
-    _, name = split_id(str(config.task))
+    _, name = split_id(config.task or check_task(config.suite, config.domain)[0])
     try:
         gymnasium.spec(name)
     except gymnasium.error.Error:

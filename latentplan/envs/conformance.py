@@ -18,7 +18,7 @@ from latentplan.config.env_id import is_by_id
 from latentplan.envs.by_id import make_inner
 from latentplan.envs.faults import FrameCheck
 from latentplan.envs.user import MAX_DECISIONS, describe_refusals, wrap_user_env
-from latentplan.envs.vector import GuardedEnv, make_guarded_env
+from latentplan.envs.vector import make_guarded_env
 
 ENOUGH_SECONDS = 20.0  # of play, also where fewer decisions than asked for were played
 FEWEST_DECISIONS = 10
@@ -83,7 +83,7 @@ def describe_spaces(env: Any, config: EnvConfig) -> dict[str, str]:
         env: The environment, from `make_env` or `make_guarded_env`.
         config: Its settings.
     """
-    decisions = env.facts["decisions_per_episode"] if isinstance(env, GuardedEnv) else env.decisions_per_episode
+    decisions = env.decisions_per_episode
     steps = f"at most {decisions or MAX_DECISIONS} decisions of {config.action_repeat} steps"
     return {
         "actions": f"{(env.action_space.shape or (0,))[0]} numbers in [-1, 1]",
@@ -155,7 +155,7 @@ def _play(env: Any, config: EnvConfig, decisions: int, report: Report) -> None:
                 break
     report.notes += [str(warning.message) for warning in caught if warning.category is RuntimeWarning]
     places = np.linspace(0, len(frames) - 1, min(STRIP_PICTURES, len(frames))).astype(int)
-    report.pictures = [frames[place] for place in places]
+    report.pictures = [frames[place][..., :3] for place in places]
     played = len(rewards)
     report.facts |= {
         "played": f"{played} decisions, {len(lengths) - (lengths[-1] == 0)} episodes",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import traceback
 import warnings
 from collections.abc import Mapping, Sequence
@@ -16,7 +17,7 @@ from latentplan.config.checks import EnvironmentFault, cut, shown
 
 UNCHANGED_FRAMES = 100  # equal frames in a row after which a picture counts as constant
 PLAIN_FRAMES = 10  # frames of one colour in a row after which a picture counts as blank
-_OWN_FOLDERS = (str(Path(__file__).parents[1]), str(Path(gymnasium.__file__).parent))
+_OWN_FOLDERS = tuple(f"{folder}{os.sep}" for folder in (Path(__file__).parents[1], Path(gymnasium.__file__).parent))
 
 
 def check_picture(picture: Any, shape: tuple[int, ...]) -> np.ndarray:
@@ -30,7 +31,7 @@ def check_picture(picture: Any, shape: tuple[int, ...]) -> np.ndarray:
     wanted = f"the environment must return frames uint8 {shape}"
     try:
         given = np.asarray(picture)
-    except EnvironmentFault:
+    except UserError:  # of the environment's own render
         raise
     except (TypeError, ValueError):
         raise EnvironmentFault(f"{wanted}, got {type(picture).__name__}") from None

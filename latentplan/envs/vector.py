@@ -276,6 +276,11 @@ class GuardedEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         return self.facts["action_space"]
 
     @property
+    def decisions_per_episode(self) -> int | None:
+        """Decisions until the environment's time limit; None without one."""
+        return self.facts["decisions_per_episode"]  # type: ignore[no-any-return]
+
+    @property
     def metadata(self) -> dict[str, Any]:  # type: ignore[override]
         """The environment's own."""
         return self.facts["metadata"]  # type: ignore[no-any-return]

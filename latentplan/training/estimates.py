@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import math
+
 from latentplan.config import Config
 from latentplan.config.estimates import Part, check_parts, estimate_model, estimate_search
 from latentplan.config.files import has_cuda
+from latentplan.config.spaces import Spaces
 from latentplan.replay.memory import count_replay_bytes, describe_replay, free_memory
 
 UNKNOWN_LENGTH_CAPACITY = 200_000
@@ -58,14 +61,14 @@ def check_run(config: Config) -> None:
 
 def count_frame_bytes(config: Config) -> int:
     """Bytes of a frame, as far as the settings tell: images that an environment of the user adds are not counted."""
-    return 3 * max(1, len(config.env.cameras)) * config.env.frame_size**2
+    return math.prod(Spaces(frame_size=config.env.frame_size, cameras=max(1, len(config.env.cameras))).frame_shape)
 
 
 def _estimate_update(config: Config) -> Part:
     learning, model = config.learning, config.model
     sides = [config.env.frame_size // 4 // 2**layer for layer in range(len(model.encoder_channels))]
     pictures = sum(channels * side * side for channels, side in zip(model.encoder_channels, sides, strict=True))
-    pictures += 5 * 64 * model.decoder_channels + 3072
+    pictures += 5 * 64 * model.decoder_channels + count_frame_bytes(config) // 4  # the decoded picture
     beliefs = 6 * model.deter_dim + 8 * model.hidden_dim
     frames = learning.batch_size * (learning.sequence_length + 1)
     imagined = learning.imagination_starts * (learning.imagination_horizon + 1)

@@ -271,11 +271,14 @@ class _Run:
 
     def execute(self) -> Result:
         """Learn until the budget is spent or a signal arrives, then evaluate."""
+        is_complete = False
         try:
-            return self._execute()
+            result = self._execute()
+            is_complete = result.exit_code == 0
+            return result
         finally:
             if self.trackers is not None:
-                self.trackers.close()
+                self.trackers.close(is_complete)
             self.worker.close()
 
     def _execute(self) -> Result:
@@ -349,6 +352,7 @@ class _Run:
         episodes = self.config.evaluation.final_episodes
         self.console.console.print(f"final evaluation: {episodes} episodes each of planner and actor")
         settings = self.config.evaluation
+        film.unlink(missing_ok=True)  # of a run that was finished before and goes on
         returns = self._evaluate(self.learner.averaged, film if settings.video else None, record=settings.report)
         page = self._take_recording() if settings.report else None
         summary = {mode: float(np.mean(values)) for mode, values in returns.items()}

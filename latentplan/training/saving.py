@@ -133,7 +133,8 @@ class Save(lightning.Callback):
         facts = self.facts | info | {"metrics": self.state.evaluations}
         planner = self.config.planner
         if planner.use_continues is None:
-            planner = replace(planner, use_continues=bool(self.files.replay.is_end.any()))
+            memory = self.collect.memory  # the collector remembers an end that the replay has overwritten
+            planner = replace(planner, use_continues=bool(memory and memory["has_seen_end"]))
         save_checkpoint(self.folder / "checkpoints" / name, model, replace(self.config, planner=planner), facts)
 
     def clocks(self, learner: Learner) -> dict[str, Any]:

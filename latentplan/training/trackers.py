@@ -84,12 +84,18 @@ class Trackers:
         shows = [logger for logger in self.loggers if not isinstance(logger, CSVLogger)]
         if not path.exists() or not shows:
             return
-        strip = tile(np.array_split(np.stack(read_frames(path, STRIP_FRAMES)), 2))
-        self._each(lambda logger: _log_film(logger, path, strip, step))
+        try:
+            frames = read_frames(path, GIF_FRAMES)
+        except OSError as error:
+            warnings.warn(f"no film in the trackers: {error}", RuntimeWarning, stacklevel=2)
+            return
+        places = np.linspace(0, len(frames) - 1, min(STRIP_FRAMES, len(frames))).astype(int)
+        strip = tile(np.array_split(np.stack([frames[place] for place in places]), 2))
+        self._each(lambda logger: _log_film(logger, path, frames, strip, step))
 
-    def close(self) -> None:
-        """End the runs of trackers that have to be told."""
-        self._each(_finish)
+    def close(self, is_complete: bool) -> None:
+        """End the runs of trackers, which show whether a run is complete, stopped or failed."""
+        self._each(lambda logger: _finish(logger, is_complete))
 
     def _each(self, call: Callable[[Logger], Any]) -> None:
         for logger in list(self.loggers):
@@ -114,7 +120,7 @@ class Trackers:
             for field, value in fields.items()
         }
         if name == "csv":
-            return CSVLogger(folder, name="csv", version="")
+            return CSVLogger(folder, name="csv", flush_logs_every_n_steps=1)  # a new version at every start
         if name == "wandb":
             import_extra("wandb", "the logger wandb")
             return WandbLogger(name=run, save_dir=folder, project=PROJECT, id=self._id, config=settings)
@@ -139,12 +145,12 @@ def _make_mlflow(run: str, folder: Path, settings: Mapping[str, Any]) -> MLFlowL
     return logger
 
 
-def _log_film(logger: Logger, path: Path, strip: Frame, step: int) -> None:
+def _log_film(logger: Logger, path: Path, frames: list[Frame], strip: Frame, step: int) -> None:
     if isinstance(logger, TensorBoardLogger):
         from tensorboard.compat.proto.summary_pb2 import Summary
 
         logger.experiment.add_image(STRIP, strip, step, dataformats="HWC")
-        gif, (height, width) = encode_gif(read_frames(path, GIF_FRAMES), GIF_MS)
+        gif, (height, width) = encode_gif(frames, GIF_MS)
         image = Summary.Image(height=height, width=width, colorspace=3, encoded_image_string=gif)
         writer = logger.experiment._get_file_writer()
         writer.add_summary(Summary(value=[Summary.Value(tag=FILM, image=image)]), step)
@@ -159,8 +165,10 @@ def _log_film(logger: Logger, path: Path, strip: Frame, step: int) -> None:
         logger.experiment.log_image(logger.run_id, strip, f"strips/{step:09d}.png")
 
 
-def _finish(logger: Logger) -> None:
-    if isinstance(logger, WandbLogger | TrackioLogger):
+def _finish(logger: Logger, is_complete: bool) -> None:
+    if isinstance(logger, WandbLogger):
+        logger.experiment.finish(exit_code=0 if is_complete else 1)
+    elif isinstance(logger, TrackioLogger):
         logger.experiment.finish()
     else:
-        logger.finalize("success")
+        logger.finalize("success" if is_complete else "failed")

@@ -18,6 +18,7 @@ from latentplan.config.env_id import (
     split_id,
 )
 from latentplan.envs import make_env, wrap_user_env
+from latentplan.envs.by_id import find_id
 from latentplan.envs.conformance import check_environment
 from latentplan.envs.vector import make_vector_env
 from latentplan.training import train
@@ -195,3 +196,13 @@ def test_folder_names_hold_no_separators():
 def test_unknown_ids_are_answered_by_the_nearest():
     with pytest.raises(UserError, match="unknown environment 'Slidr-v0'; did you mean 'Slider-v0'"):
         make_env(replace(config_of("Slider"), task="Slidr-v0"))
+
+
+def test_strip_of_several_cameras_shows_the_first(tmp_path):
+    config = EnvConfig(domain="cartpole", task="swingup", cameras=("0", "1"))
+    report = check_environment(config, decisions=3, isolate=False)
+    assert report.problems == [] and {picture.shape for picture in report.pictures} == {(64, 64, 3)}
+
+
+def test_usual_environment_of_the_suite_is_made_without_an_id():
+    assert find_id(EnvConfig(suite="gymnasium", domain="gymnasium")) == "InvertedPendulum-v5"

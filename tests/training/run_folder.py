@@ -7,6 +7,7 @@ from pathlib import Path
 import torch
 
 from latentplan.config.commit import MANIFEST, read_manifest, write_manifest
+from latentplan.config.run_folder import RUN_FORMAT
 
 
 def read_rows(folder):
@@ -37,9 +38,9 @@ def write_state(folder, state, kind="run"):
 
 def seal(save, kind="run"):
     """Makes the manifest of a save fit its changed files."""
-    old = read_manifest(save, kind, 2)
+    old = read_manifest(save, kind, RUN_FORMAT)
     (save / MANIFEST).unlink()
-    write_manifest(save, kind, 2, old.note, old.logs)
+    write_manifest(save, kind, RUN_FORMAT, old.note, old.logs)
 
 
 def fingerprint(folder):

@@ -27,12 +27,12 @@ def test_several_trackers_get_the_same_scalars(tmp_path, film):
     trackers = Trackers(("tensorboard", "csv"), tmp_path, Config(), "id")
     trackers.log({"reward": 2.0}, step=10)
     trackers.log_film(film, step=10)
-    trackers.close()
+    trackers.close(is_complete=True)
     events = EventAccumulator(str(tmp_path / "tensorboard")).Reload()
     assert [(each.step, each.value) for each in events.Scalars("reward")] == [(10, 2.0)]
     assert {FILM, STRIP} <= set(events.Tags()["images"])
     assert events.Images(FILM)[0].encoded_image_string.startswith(b"GIF8")
-    with (tmp_path / "csv" / "metrics.csv").open(newline="") as file:
+    with (tmp_path / "csv" / "version_0" / "metrics.csv").open(newline="") as file:
         assert [(row["step"], row["reward"]) for row in csv.DictReader(file)] == [("10", "2.0")]
 
 
@@ -44,8 +44,23 @@ def test_a_tracker_that_fails_is_dropped_with_one_warning(tmp_path):
         trackers.log({"reward": 2.0}, step=10)
         trackers.log({"reward": 3.0}, step=20)
     assert len(caught) == 1 and broken not in trackers.loggers
-    trackers.close()
-    assert len((tmp_path / "csv" / "metrics.csv").read_text().splitlines()) == 3
+    trackers.close(is_complete=True)
+    assert len((tmp_path / "csv" / "version_0" / "metrics.csv").read_text().splitlines()) == 3
+
+
+def test_rows_of_csv_are_on_the_disk_at_once_and_stay_when_the_run_is_resumed(tmp_path):
+    for start in range(2):
+        Trackers(("csv",), tmp_path, Config(), "id").log({"reward": float(start)}, step=10)  # not closed
+    rows = [row for file in sorted(tmp_path.rglob("metrics.csv")) for row in csv.DictReader(file.open(newline=""))]
+    assert [row["reward"] for row in rows] == ["0.0", "1.0"]
+
+
+def test_a_film_that_cannot_be_read_is_left_out_with_a_warning(tmp_path):
+    (tmp_path / "film.webm").write_bytes(b"no film")
+    trackers = Trackers(("tensorboard",), tmp_path, Config(), "id")
+    with pytest.warns(RuntimeWarning, match="no film in the trackers"):
+        trackers.log_film(tmp_path / "film.webm", step=10)
+    assert len(trackers.loggers) == 1
 
 
 def test_read_frames_takes_the_first_and_the_last_frame_of_a_film(film):

@@ -247,7 +247,7 @@ class Collector:
         """
         memory = to_tensors(memory)
         self.restarts.count = memory["restarts"]
-        if memory.get("has_seen_end"):
+        if memory["has_seen_end"]:
             self._notice_end()
         frames, labels, is_same = self._episodes.replay(memory["episodes"])
         self._frames, self._returns = frames, memory["returns"].numpy().copy()

@@ -16,7 +16,7 @@ from latentplan.config import GoalsConfig, UserError
 from latentplan.config.commit import Saves
 from latentplan.config.files import dump_config
 from latentplan.config.quantities import QUANTITIES
-from latentplan.config.run_folder import lock_folder
+from latentplan.config.run_folder import lock_folder, run_saves
 from latentplan.models import State, WorldModel
 from latentplan.objectives.box import box_degree, box_of
 from latentplan.objectives.parser import parse_objective
@@ -59,13 +59,13 @@ def make_run(folder, config, labels):
             labels=rng.normal(size=(ROWS, len(labels))).astype(np.float32),
         ),
     )
-    Saves(folder / "resume", "run", 2).commit(ReplayFiles(folder / "resume", replay).write, {"env_frames": ROWS})
+    run_saves(folder).commit(ReplayFiles(folder / "resume", replay).write, {"env_frames": ROWS})
     dump_config(config, folder / "config.yaml")
     return folder
 
 
 def read_replay(run, model):
-    return load_replay(Saves(run / "resume", "run", 2).newest()[0], model)
+    return load_replay(run_saves(run).newest()[0], model)
 
 
 @pytest.fixture(scope="module")
@@ -147,9 +147,7 @@ def test_goal_learner_raises_the_imagined_worth(run):
         model.probe_head.output.weight.normal_(std=2.0)
         model.dynamics.input.linear.weight[:, -1] *= 4.0
     settings = GoalsConfig(starts=64, horizon=4, learning_rate=1e-2, entropy_scale=0.0)
-    learner = GoalLearner(
-        model, settings, config.learning, 0.9, 2, load_replay(Saves(run / "resume", "run", 2).newest()[0], model)
-    )
+    learner = GoalLearner(model, settings, config.learning, 0.9, 2, load_replay(run_saves(run).newest()[0], model))
     ends = torch.full((64, 2), -math.inf)
     low, high = torch.where(torch.tensor([False, True]), 2.0, ends), -ends  # a high speed at any height
     learner.source.draw = lambda num, generator: Boxes(low, high, torch.arange(num) % ROWS)
@@ -172,9 +170,7 @@ def test_goal_learner_raises_when_the_gradient_is_not_finite(run):
     model.add_goal_heads(8)
     with torch.no_grad():
         model.goal_heads.actor.mlp.output.bias[0] = math.nan
-    learner = GoalLearner(
-        model, SETTINGS, config.learning, 0.9, 2, load_replay(Saves(run / "resume", "run", 2).newest()[0], model)
-    )
+    learner = GoalLearner(model, SETTINGS, config.learning, 0.9, 2, load_replay(run_saves(run).newest()[0], model))
     with pytest.raises(FloatingPointError, match="not finite at update 0"):
         learner.update()
 
