@@ -54,7 +54,7 @@ class Imagined(NamedTuple):
     """Imagined rollouts.
 
     Attributes:
-        pictures: The decoded state after each step, uint8 (rollout, step, 32, 32, 3).
+        pictures: The decoded state after each step, uint8 (rollout, step, height / 2, width / 2, 3).
         rewards: The predicted reward of each step, float32 (rollout, step).
         actions: The action of each step, float32 (rollout, step, action).
     """

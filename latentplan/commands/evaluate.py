@@ -292,7 +292,7 @@ def _write_page(
 ) -> None:
     import numpy as np
 
-    from latentplan.agents.checkpoint import read_info
+    from latentplan.agents.info import read_info
     from latentplan.config.run_results import read_log
     from latentplan.evaluation.statistics import confidence_interval
     from latentplan.reporting.page import write_page

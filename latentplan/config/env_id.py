@@ -16,7 +16,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from latentplan.config.checks import EnvironmentFault, UserError, cut, shown
-from latentplan.config.extras import extra_of
+from latentplan.config.extras import describe_missing, extra_of
 from latentplan.config.parsing import option
 from latentplan.config.settings import EnvConfig, Pixels
 from latentplan.config.suites import ID_DOMAIN, ID_SUITE
@@ -110,10 +110,7 @@ def import_named(env_id: str) -> None:
                 f"{FLAG} {env_id}: there is no module {module} to import; {extra}, or run the command in the folder of "
                 f"{top}.py"
             ) from None
-        what = f"'latentplan[{extra_of(error.name)}]'" if extra_of(error.name) else error.name
-        raise UserError(
-            f"{FLAG} {env_id}: the module {module} needs {error.name}, which is not installed; run: pip install {what}"
-        ) from None
+        raise UserError(describe_missing(str(error.name), f"{FLAG} {env_id}: the module {module}")) from None
     except Exception as error:  # the code of the module may raise anything
         import traceback
 
@@ -126,7 +123,7 @@ def import_named(env_id: str) -> None:
 
 def imported_modules(env: EnvConfig) -> tuple[str, ...]:
     """The module that the settings name, if this process has imported it: what its child processes may import too."""
-    module = split_id(env.task)[0] if is_by_id(env) and env.task else None
+    module = _module_of(env)
     return (module,) if module in sys.modules else ()
 
 
@@ -136,7 +133,7 @@ def require_imported(env: EnvConfig) -> None:
     Raises:
         UserError: The module has to be named again.
     """
-    module = split_id(env.task)[0] if is_by_id(env) and env.task else None
+    module = _module_of(env)
     if module is not None and module not in sys.modules:
         raise UserError(
             f"{env.task} names the module {module}, and a module is never imported because a checkpoint or a file "
@@ -146,7 +143,7 @@ def require_imported(env: EnvConfig) -> None:
 
 def repeat_flag(env: EnvConfig) -> str:
     """The flag that a command needs again to go on in this environment, with a space before it; empty without one."""
-    module = split_id(env.task)[0] if is_by_id(env) and env.task else None
+    module = _module_of(env)
     return "" if module is None else f" {FLAG} {env.task}"
 
 
@@ -184,3 +181,8 @@ def choose_env(saved: EnvConfig, given: Mapping[str, Any], *, must_match: bool =
 def as_file_name(text: str) -> str:
     """A text without the characters of ids that are not for names of folders."""
     return re.sub(r"[^\w.+-]+", "-", text)
+
+
+def _module_of(env: EnvConfig) -> str | None:
+    """The module that the settings name; None without one."""
+    return split_id(env.task)[0] if is_by_id(env) and env.task else None

@@ -72,4 +72,6 @@ def import_extra(module: str, user: str) -> ModuleType:
 
 def describe_missing(module: str, user: str) -> str:
     """One line that says which module a part lacks, and how to install it."""
-    return f"{user} needs {module}, which is not installed; run: pip install 'latentplan[{extra_of(module)}]'"
+    extra = extra_of(module)
+    what = f"'latentplan[{extra}]'" if extra else module
+    return f"{user} needs {module}, which is not installed; run: pip install {what}"

@@ -11,7 +11,7 @@ from gymnasium.error import DependencyNotInstalled, UnregisteredEnv
 from latentplan.config import EnvConfig, UserError
 from latentplan.config.checks import nearest
 from latentplan.config.env_id import FLAG, require_imported, split_id
-from latentplan.config.extras import extra_of
+from latentplan.config.extras import describe_missing
 from latentplan.config.reading import read_kwargs
 from latentplan.config.suites import check_task
 from latentplan.envs.faults import describe_failure
@@ -46,11 +46,7 @@ def make_inner(config: EnvConfig) -> gymnasium.Env[Any, Any]:
     except (DependencyNotInstalled, UnregisteredEnv) as error:
         raise UserError(f"cannot make {name}: {' '.join(str(error).split())}") from None
     except ModuleNotFoundError as error:
-        extra = extra_of(error.name)
-        what = f"'latentplan[{extra}]'" if extra else error.name
-        raise UserError(
-            f"cannot make {name}: it needs {error.name}, which is not installed; run: pip install {what}"
-        ) from None
+        raise UserError(describe_missing(str(error.name), f"cannot make {name}: it")) from None
     except Exception as error:
         if isinstance(error, TypeError) and "argument" in str(error):
             reason = str(error).partition(" was raised from")[0]

@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import time
 import warnings
-from collections.abc import Callable
 from dataclasses import dataclass, field
-from functools import partial
 from typing import Any
 
 import gymnasium
@@ -17,12 +15,12 @@ from latentplan.config.checks import EnvironmentFault
 from latentplan.config.env_id import is_by_id
 from latentplan.envs.by_id import make_inner
 from latentplan.envs.faults import FrameCheck
+from latentplan.envs.rendered import time_pictures
 from latentplan.envs.user import MAX_DECISIONS, describe_refusals, wrap_user_env
 from latentplan.envs.vector import make_guarded_env
 
 ENOUGH_SECONDS = 20.0  # of play, also where fewer decisions than asked for were played
 FEWEST_DECISIONS = 10
-TIMED_PICTURES = 10
 STRIP_PICTURES = 8
 
 
@@ -34,7 +32,7 @@ class Report:
         problems: One line for each reason why training refuses the environment, with its remedy.
         notes: One line for each thing that training accepts, and that is probably not meant.
         facts: Properties of the environment, by name.
-        pictures: Frames over time, uint8 (64, 64, 3) each; empty where none could be had.
+        pictures: First camera over time, uint8 (frame_size, frame_size, 3) each; empty where none could be had.
         origin: Traceback of the environment's own code at the last problem; empty without one.
     """
 
@@ -163,19 +161,11 @@ def _play(env: Any, config: EnvConfig, decisions: int, report: Report) -> None:
         "speed": f"{env_frames / seconds:.0f} steps/s, {1e3 * seconds / played:.1f} ms per decision",
     }
     if config.pixels == "render" or not is_by_id(config):
-        draw = partial(env.render_large, config.frame_size) if config.pixels == "render" else env.render
-        report.facts["pictures"] = f"{_time_pictures(draw):.1f} ms per frame"
+        report.facts["pictures"] = f"{time_pictures(env, config):.1f} ms per frame"
     if max(rewards) == min(rewards):
         report.notes.append(f"every reward is {rewards[0]:g}: there may be nothing to learn from so few decisions")
     if terminations:
         report.notes.append(
-            "episodes end by themselves: --planner.use_continues true lets the planner avoid an end that costs reward"
+            "episodes end by themselves: from the first such end on plans weigh the rewards that an end costs, unless "
+            "--planner.use_continues is false"
         )
-
-
-def _time_pictures(draw: Callable[[], Any]) -> float:
-    """Milliseconds that a picture of the present state takes."""
-    started = time.perf_counter()
-    for _ in range(TIMED_PICTURES):
-        draw()
-    return 1e3 * (time.perf_counter() - started) / TIMED_PICTURES

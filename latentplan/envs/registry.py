@@ -3,7 +3,7 @@
 A suite's factory is called as `factory(config, seed)`, with an `EnvConfig` and the seed of the first reset (None draws
 one), and returns a `gymnasium.Env` with these spaces and values:
 
-    observation_space       Box, uint8 (64, 64, 3); every observation is a new array
+    observation_space       Box, uint8 (size, size, 3 * camera); every observation is a new array
     action_space            Box in [-1, 1], float32 (action,)
     reset                   depends on `seed` alone where one is given, else continues the random stream
     step                    holds the action for `config.action_repeat` control steps and sums the rewards

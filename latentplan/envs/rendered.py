@@ -2,17 +2,29 @@
 
 from __future__ import annotations
 
+import time
+from functools import partial
 from typing import Any
 
 import gymnasium
 import numpy as np
 
-from latentplan.config import UserError
+from latentplan.config import EnvConfig, UserError
 from latentplan.config.checks import EnvironmentFault
 from latentplan.envs.faults import describe_failure
 from latentplan.envs.spaces import resize
 
 MODE = "rgb_array"
+TIMED_PICTURES = 5
+
+
+def time_pictures(env: Any, config: EnvConfig) -> float:
+    """Milliseconds in which an environment draws a picture of its present state; after a reset."""
+    draw = partial(env.render_large, config.frame_size) if config.pixels == "render" else env.render
+    started = time.perf_counter()
+    for _ in range(TIMED_PICTURES):
+        draw()
+    return 1e3 * (time.perf_counter() - started) / TIMED_PICTURES
 
 
 class RenderedEnv(gymnasium.Wrapper[Any, Any, Any, Any]):

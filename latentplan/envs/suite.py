@@ -33,8 +33,9 @@ _UNLIMITED_EPISODE_STEPS = 1000
 class SuiteEnv(gymnasium.Env[np.ndarray, np.ndarray]):
     """A task of `dm_control.suite` with frames as observations, bounded actions and action repeat.
 
-    An observation is a uint8 frame (64, 64, 3), always a new array. An action is float32 (action,) in [-1, 1], scaled
-    to the actuators' range. `reset(seed=s)` depends on s alone; `reset()` continues the random stream. The time limit
+    An observation is a uint8 frame (size, size, 3 * camera), always a new array. An action is float32 (action,) in
+    [-1, 1], scaled to the actuators' range. `reset(seed=s)` depends on s alone; `reset()` continues the random
+    stream. The time limit
     truncates an episode; only the task terminates an episode. `info["env_frames"]` is the number of control steps that
     a step took, which is smaller than the action repeat where an episode ends early. `info["labels"]` holds the true
     quantities at the frame, float32 (label,).
@@ -117,7 +118,7 @@ class SuiteEnv(gymnasium.Env[np.ndarray, np.ndarray]):
             options: Not used.
 
         Returns:
-            The first frame (64, 64, 3), and an info with `env_frames` 0 and the first labels.
+            The first frame (size, size, 3 * camera), and an info with `env_frames` 0 and the first labels.
         """
         super().reset(seed=seed)
         if seed is not None:
@@ -136,7 +137,7 @@ class SuiteEnv(gymnasium.Env[np.ndarray, np.ndarray]):
             action: The action, (action,), clipped to [-1, 1].
 
         Returns:
-            Frame (64, 64, 3), summed reward, terminated, truncated, info.
+            Frame (size, size, 3 * camera), summed reward, terminated, truncated, info.
 
         Raises:
             ResetNeeded: The episode is over.
@@ -180,7 +181,7 @@ class SuiteEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         return self._observe(), reward, terminated, self._needs_reset and not terminated, self._info(env_frames)
 
     def render(self) -> np.ndarray:  # type: ignore[override]
-        """The first camera's picture of the present state, a new uint8 array (64, 64, 3)."""
+        """The first camera's picture of the present state, a new uint8 array (size, size, 3)."""
         return self.render_large(self._frame_size)
 
     def render_large(self, size: int) -> np.ndarray:
@@ -193,7 +194,7 @@ class SuiteEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         return self._renderers[size, camera].render()
 
     def _observe(self) -> np.ndarray:
-        """The agent's frame of the present state, a new uint8 array (64, 64, 3 * camera)."""
+        """The agent's frame of the present state, a new uint8 array (size, size, 3 * camera)."""
         pictures = [self._draw(self._frame_size, camera) for camera in self._cameras]
         return pictures[0] if len(pictures) == 1 else np.concatenate(pictures, axis=2)
 

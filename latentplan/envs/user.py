@@ -138,7 +138,7 @@ class PixelEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         """Holds an action (action,) in [-1, 1] for `action_repeat` steps of the inner environment.
 
         Returns:
-            Frame (64, 64, 3), summed reward, terminated, truncated, info.
+            Frame (size, size, 3 * camera), summed reward, terminated, truncated, info.
 
         Raises:
             ResetNeeded: The episode is over.
@@ -170,7 +170,7 @@ class PixelEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         return self._actions.value(action)
 
     def render(self) -> np.ndarray:  # type: ignore[override]
-        """The first camera's last picture, a new uint8 array (64, 64, 3)."""
+        """The first camera's last picture, a new uint8 array (size, size, 3)."""
         return resize(self._picture, self.spaces.frame_size)
 
     def render_large(self, size: int) -> np.ndarray:

@@ -55,8 +55,9 @@ def make_vector_env(
         step_timeout_s: Seconds that a reset or a step of an environment in a process of its own may take.
 
     Returns:
-        A gymnasium vector environment: observations uint8 (env, 64, 64, 3); rewards, terminated and truncated (env,).
-        The entry `labels` of its info holds the labels of each environment and then its vectors, (env, number).
+        A gymnasium vector environment: observations uint8 (env, size, size, 3 * camera); rewards, terminated
+        and truncated (env,). The entry `labels` of its info holds the labels of each environment and then its
+        vectors, (env, number).
 
     Raises:
         UserError: The environment cannot be built.

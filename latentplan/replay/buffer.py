@@ -31,7 +31,7 @@ class Rows:
     """Consecutive rows of one lane, as collected: arrays (n, ...).
 
     Attributes:
-        frames: uint8 (n, 64, 64, 3).
+        frames: uint8 (n, height, width, 3 * camera).
         deter: Deterministic state of the belief at each frame, float (n, deter).
         actions: Executed actions in [-1, 1], float32 (n, action); zeros on an episode's last row.
         rewards: Rewards that arrived with the next frame, float32 (n,).
@@ -54,7 +54,7 @@ class Batch(NamedTuple):
     """Sequences of `time` decisions and `time + 1` frames; frames after a terminal state belong to another episode.
 
     Attributes:
-        frames: uint8 (batch, time + 1, 64, 64, 3).
+        frames: uint8 (batch, time + 1, height, width, 3 * camera).
         deter: Deterministic state of the belief at the first frame, float32 (batch, deter).
         actions: actions[t] in [-1, 1] was taken at frames[t], (batch, time, action).
         rewards: rewards[t] arrived with frames[t + 1], (batch, time).

@@ -15,7 +15,6 @@ import cv2
 
 from latentplan.reporting.frame import Frame
 
-LARGEST_PAGE = 10_000_000  # bytes
 LARGEST_FILM = 6_000_000
 WIDEST_CARD = 48  # characters of a row in a card of one column
 MEDIA = {".webm": "video/webm", ".mp4": "video/mp4"}

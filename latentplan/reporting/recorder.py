@@ -36,8 +36,8 @@ class SearchStep(NamedTuple):
         elites: The candidates with the highest predicted returns, (elite, horizon, action).
         mean: Mean of the search distribution after the iteration, (horizon, action).
         elite_return: Mean predicted return of all elites.
-        candidate_pictures: Mean picture over candidates and elites at the shown steps, uint8 (step, 32, 32, 3).
-        elite_pictures: Mean picture over the elites, uint8 (step, 32, 32, 3).
+        candidate_pictures: Mean picture over candidates and elites at the shown steps, uint8 (step, side, side, 3).
+        elite_pictures: Mean picture over the elites, uint8 (step, side, side, 3).
     """
 
     candidates: Floats
@@ -56,8 +56,8 @@ class Inspection(NamedTuple):
         frame: The frame of the decision, uint8 (height, width, 3).
         shown_steps: Model steps of the pictures, from 1.
         search: Iterations of the search, in order.
-        plan_pictures: Imagined along the plan, uint8 (step, 32, 32, 3).
-        actor_pictures: Imagined along the actor, uint8 (step, 32, 32, 3).
+        plan_pictures: Imagined along the plan, uint8 (step, side, side, 3).
+        actor_pictures: Imagined along the actor, uint8 (step, side, side, 3).
         plan_reward: Predicted sum of rewards along the plan.
         actor_reward: The same along the actor.
     """
@@ -78,8 +78,8 @@ class Strip(NamedTuple):
     Attributes:
         decision: Number of the first decision.
         steps: Model steps of the pictures, from 1.
-        real: Frames, uint8 (step, 32, 32, 3).
-        imagined: Decoded states, uint8 (step, 32, 32, 3).
+        real: Frames, uint8 (step, side, side, 3).
+        imagined: Decoded states, uint8 (step, side, side, 3).
     """
 
     decision: int
@@ -276,7 +276,7 @@ def _mean_picture(pictures: Frame) -> Frame:
 
 
 def _shrink(frame: Frame) -> Frame:
-    """The first camera of a frame (64, 64, 3 camera) at the size of decoded pictures, (32, 32, 3)."""
+    """The first camera of a frame (height, width, 3 * camera) at half the size, as decoded pictures have."""
     pairs = frame[..., :3].astype(np.float32).reshape(frame.shape[0] // 2, 2, frame.shape[1] // 2, 2, 3)
     return pairs.mean(axis=(1, 3)).round().astype(np.uint8)
 

@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import contextlib
-import time
 import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +24,7 @@ from latentplan.config.suites import DEFAULT_SUITE
 from latentplan.envs import make_vector_env
 from latentplan.envs.faults import FrameCheck
 from latentplan.envs.registry import USERS_RENDERER, describe_renderer
+from latentplan.envs.rendered import time_pictures
 from latentplan.envs.vector import Restarts, make_guarded_env
 from latentplan.evaluation.episodes import OnStep, Step, episode_seed, run_episodes
 from latentplan.evaluation.statistics import Episode
@@ -38,7 +37,6 @@ from latentplan.reporting.film import filming_if_possible
 from latentplan.reporting.recorder import EpisodeRecorder, GuardedRecorder
 from latentplan.training.collection.episodes import Episodes, Stopped, to_arrays, to_tensors
 
-TIMED_FRAMES = 5
 TRIES = 2  # of the environment before a run starts
 FILMED_FRAMES = 250
 CLOSING_SECONDS = 5.0
@@ -160,12 +158,7 @@ class Collector:
         """Facts of the environment that the learner needs; renders a few frames to time them."""
         env = self._eval_env
         self._try_environment()
-        config = self.config.env
-        draw = partial(env.render_large, config.frame_size) if config.pixels == "render" else env.render
-        started = time.perf_counter()
-        for _ in range(TIMED_FRAMES):
-            draw()
-        render_ms = 1000.0 * (time.perf_counter() - started) / TIMED_FRAMES
+        render_ms = time_pictures(env, self.config.env)
         facts = describe_renderer(self.config.env) if self._make_user_env is None else USERS_RENDERER
         renderer = {name: str(value) for name, value in facts.items()}
         return Description(self.model.action_dim, self.discount, render_ms, renderer, self.labels, self.spaces)

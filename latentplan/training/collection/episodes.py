@@ -43,7 +43,7 @@ class Episodes:
             where: The environments, bool (env,); all of them at the first call.
 
         Returns:
-            Frames of all environments, uint8 (env, 64, 64, 3), and the infos of those that began.
+            Frames of all environments, uint8 (env, height, width, 3 * camera), and the infos of those that began.
         """
         for lane in np.flatnonzero(where):
             self._begun[lane] += 1
@@ -60,7 +60,7 @@ class Episodes:
         """The record of each environment's running episode, for `replay`.
 
         Args:
-            frames: The present frames, uint8 (env, 64, 64, 3).
+            frames: The present frames, uint8 (env, height, width, 3 * camera).
             has_ended: Environments whose episode is over, bool (env,).
         """
         size = self.envs.single_action_space.shape or ()
@@ -80,8 +80,8 @@ class Episodes:
             records: What `memory` returned; records without actions stand for episodes that are over.
 
         Returns:
-            The present frames, uint8 (env, 64, 64, 3), the present labels, and whether each environment has repeated
-            its episode, bool (env,).
+            The present frames, uint8 (env, height, width, 3 * camera), the present labels, and whether each
+            environment has repeated its episode, bool (env,).
         """
         self._begun = [record["begun"] for record in records]
         actions = [record["actions"].numpy() for record in records]
