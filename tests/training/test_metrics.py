@@ -52,7 +52,7 @@ def test_record_writes_each_metric_of_the_learner_to_csv_and_tensorboard(tmp_pat
     metrics = {name: torch.tensor(float(place)) for place, name in enumerate(names)}
     learner = SimpleNamespace(updates=7, metrics=metrics, skips=())
     record.on_train_epoch_end(SimpleNamespace(), learner)
-    trackers.close()
+    trackers.close(is_complete=True)
     ((row,), header) = read_table(tmp_path / "metrics.csv")
     losses = ("reconstruction", "surprise", "model_grad_norm", "behaviour_grad_norm")
     assert header == (*COLUMNS, *losses, "env_restarts") and row["env_restarts"] == "2"
