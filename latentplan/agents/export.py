@@ -28,6 +28,7 @@ from torch.utils._pytree import tree_flatten, tree_unflatten
 from latentplan.agents.base import ModelAgent
 from latentplan.agents.checkpoint import load_model
 from latentplan.config import UserError, output_file
+from latentplan.config.writing import replaced_whole
 from latentplan.models import Rssm, State, WorldModel
 from latentplan.models.fast import one_frame
 from latentplan.models.heads import MixedActor
@@ -107,14 +108,11 @@ def export_actor(agent_or_checkpoint: ModelAgent | str | Path, path: str | Path,
         raise UserError(
             f"only agents with dynamics of the class Rssm can be exported, got {type(model.dynamics).__name__}"
         )
-    part = target.with_name(f".{target.name}.part")
     try:
-        _write_program(_trace_actor(model), model, part, format)
-        part.replace(target)
+        with replaced_whole(target) as part:
+            _write_program(_trace_actor(model), model, part, format)
     except OSError as error:
         raise UserError(f"cannot write {target}: {error.strerror}") from None
-    finally:
-        part.unlink(missing_ok=True)
     return target
 
 

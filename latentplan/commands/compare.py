@@ -7,6 +7,7 @@ from pathlib import Path
 
 from latentplan.config import UserError
 from latentplan.config.parsing import option
+from latentplan.config.writing import write_whole
 
 
 @dataclass(frozen=True)
@@ -36,7 +37,6 @@ def run(request: Request) -> int:
     """
     from latentplan.evaluation.statistics import confidence_interval
     from latentplan.reporting.compare import group_runs, render_comparison, setting_rows, summary_rows
-    from latentplan.reporting.page import write_page
     from latentplan.reporting.runs import format_table, read_run
 
     runs = [read_run(folder) for folder in dict.fromkeys(request.folders)]
@@ -46,6 +46,6 @@ def run(request: Request) -> int:
     print()
     print(format_table(settings, right=()) if len(settings) > 1 else "all settings are the same, except seeds")
     if request.report is not None:
-        write_page(request.report, render_comparison(runs, confidence_interval))
+        write_whole(request.report, render_comparison(runs, confidence_interval))
         print(f"\nreport: {request.report}")
     return 0

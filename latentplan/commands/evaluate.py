@@ -8,7 +8,6 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import json
-import os
 import shlex
 import sys
 from dataclasses import dataclass
@@ -22,6 +21,7 @@ from latentplan.config.checks import MAX_EPISODES, above_zero, at_least, one_of,
 from latentplan.config.env_id import ENV_FLAGS, EnvChoice, choose_env, is_by_id
 from latentplan.config.origin import present_facts
 from latentplan.config.parsing import option
+from latentplan.config.writing import write_whole
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -295,7 +295,6 @@ def _write_page(
     from latentplan.agents.info import read_info
     from latentplan.config.run_results import read_log
     from latentplan.evaluation.statistics import confidence_interval
-    from latentplan.reporting.page import write_page
     from latentplan.reporting.report import ReportData, Returns, render_report
 
     assert request.report is not None
@@ -319,7 +318,7 @@ def _write_page(
         facts={"checkpoint": str(request.checkpoint), **facts, **own, "trained": trained}
         | ({"search": result["planner"]} if "planner" in result else {}),
     )
-    write_page(request.report, render_report(data))
+    write_whole(request.report, render_report(data))
     print(f"report: {request.report}", flush=True)
 
 
@@ -373,6 +372,4 @@ def _report(request: Request, result: dict[str, Any]) -> None:
         sources = "   ".join(f"{name} {count}" for name, count in result["action_source"].items())
         print(f"at {result['control_hz']:g} Hz  deadline misses {result['deadline_misses']}   {sources}", flush=True)
     if request.json is not None:
-        partial = request.json.with_name(f".{request.json.name}.{os.getpid()}")
-        partial.write_text(json.dumps(result, indent=2) + "\n")
-        partial.replace(request.json)
+        write_whole(request.json, json.dumps(result, indent=2) + "\n")

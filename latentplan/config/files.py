@@ -20,6 +20,7 @@ from latentplan.config.reading import read_yaml
 from latentplan.config.removed import drop_removed
 from latentplan.config.settings import Config
 from latentplan.config.suites import DEFAULT_SUITE, SUITES, find_suite
+from latentplan.config.writing import write_whole
 
 Layer = dict[str, dict[str, Any]]
 
@@ -84,9 +85,7 @@ def read_config(path: Path) -> Config:
 
 def dump_config(config: Config, path: Path) -> None:
     """Write every setting as YAML, in the order of `latentplan/config`; the file is replaced whole."""
-    part = path.with_name(f"{path.name}.part")
-    part.write_text(to_yaml(config))
-    part.replace(path)
+    write_whole(path, to_yaml(config))
 
 
 def to_yaml(settings: Any) -> str:

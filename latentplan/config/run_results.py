@@ -17,6 +17,7 @@ from latentplan.config.files import read_config
 from latentplan.config.run_folder import LOCK_FILE, RUN_FILE, run_saves
 from latentplan.config.settings import Config, RunConfig, to_dict
 from latentplan.config.suites import check_task
+from latentplan.config.writing import write_whole
 
 METRICS_FILE, FINAL_FILE, STATUS_FILE = "metrics.csv", "final.json", "status.json"
 StateName = Literal["running", "finished", "stopped", "failed"]
@@ -109,9 +110,7 @@ def comparable_settings(config: Config) -> dict[str, Any]:
 def note_state(folder: Path, state: StateName, **facts: Any) -> None:
     """Writes the state of a run, and adds facts to those that were written before."""
     path = folder / STATUS_FILE
-    part = path.with_name(f".{path.name}.{os.getpid()}")
-    part.write_text(json.dumps(read_facts(folder) | {"state": state, "reason": None} | facts, indent=1) + "\n")
-    part.replace(path)
+    write_whole(path, json.dumps(read_facts(folder) | {"state": state, "reason": None} | facts, indent=1) + "\n")
 
 
 def read_facts(folder: Path) -> dict[str, Any]:

@@ -10,6 +10,8 @@ from typing import TYPE_CHECKING
 from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter
 
+from latentplan.config.writing import replaced_whole
+
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
@@ -62,11 +64,10 @@ def plot_curves(metrics_csv: str | os.PathLike[str], png: str | os.PathLike[str]
 
 
 def save_figure(figure: Figure, png: str | os.PathLike[str]) -> Path:
-    """Writes a figure as PNG under a temporary name and renames it, so that the file is never half written."""
+    """Writes a figure as PNG in place of a file, and returns the path."""
     path = Path(png)
-    partial = path.with_name(f".{path.name}.{os.getpid()}")
-    figure.savefig(partial, dpi=120, format="png")
-    partial.replace(path)
+    with replaced_whole(path) as part:
+        figure.savefig(part, dpi=120, format="png")
     return path
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import base64
-import os
 import re
 import string
 from collections.abc import Iterable, Sequence
@@ -55,14 +54,6 @@ def render_page(title: str, sections: Iterable[Section]) -> str:
             )
     template = string.Template(_TEMPLATE.read_text(encoding="utf-8"))
     return template.substitute(title=escape(title), links="\n".join(links), body="\n".join(bodies))
-
-
-def write_page(path: Path, page: str) -> Path:
-    """Writes a page under a temporary name and renames it, so that the file is never half written; returns the path."""
-    partial = path.with_name(f".{path.name}.{os.getpid()}")
-    partial.write_text(page, encoding="utf-8")
-    partial.replace(path)
-    return path
 
 
 def figure(content: str, caption: str) -> str:

@@ -13,6 +13,7 @@ import lightning
 import numpy as np
 
 from latentplan.config import CollectionConfig, Config, EnvironmentFault
+from latentplan.config.writing import replaced_whole
 from latentplan.models import WorldModel
 from latentplan.replay.buffer import Replay
 from latentplan.training.collection.collector import Collected
@@ -330,12 +331,10 @@ class MetricsFile:
             return [row for row in csv.DictReader(file) if None not in row.values()]
 
     def _write(self, columns: Sequence[str], rows: Iterable[Mapping[str, str]]) -> None:
-        part = self.path.with_name(f"{self.path.name}.part")
-        with part.open("w", newline="") as file:
+        with replaced_whole(self.path) as part, part.open("w", newline="") as file:
             writer = csv.DictWriter(file, columns)
             writer.writeheader()
             writer.writerows(rows)
-        part.replace(self.path)
 
 
 class Record(lightning.Callback):

@@ -31,13 +31,13 @@ from latentplan.config.files import dump_config, read_config
 from latentplan.config.origin import present_facts
 from latentplan.config.run_folder import RUN_FILE, SAVES_FOLDER, lock_folder, read_run_config, run_saves
 from latentplan.config.run_results import METRICS_FILE, note_state, read_evaluations, read_facts
+from latentplan.config.writing import write_whole
 from latentplan.envs import default_task
 from latentplan.evaluation.statistics import confidence_interval
 from latentplan.models import WorldModel
 from latentplan.models.fast import accelerate
 from latentplan.replay.buffer import Replay
 from latentplan.replay.disk import ReplayFiles, count_saved
-from latentplan.reporting.page import write_page
 from latentplan.reporting.report import ReportData, Returns, render_report
 from latentplan.training.callbacks import Collect, Record, copy_weights
 from latentplan.training.checks import check_folder, check_settings
@@ -404,7 +404,7 @@ class _Run:
         )
         try:
             data = replace(data, evaluations=read_evaluations(self.folder))
-            path = write_page(self.folder / REPORT_FILE, render_report(data))
+            path = write_whole(self.folder / REPORT_FILE, render_report(data))
         except Exception as error:
             warnings.warn(f"no report of the run: {error}", RuntimeWarning, stacklevel=1)
         else:

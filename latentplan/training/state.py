@@ -16,6 +16,7 @@ from latentplan.config import UserError
 from latentplan.config.commit import DamageError, Extent, Save, Saves, write_synced
 from latentplan.config.run_folder import RUN_FILE, SAVES_FOLDER
 from latentplan.config.run_results import METRICS_FILE
+from latentplan.config.writing import replaced_whole
 from latentplan.replay.buffer import read_saved
 
 if TYPE_CHECKING:
@@ -187,9 +188,8 @@ def restore_metrics(save: Save, folder: Path) -> None:
     if not (save.folder / METRICS_FILE).exists():
         path.unlink(missing_ok=True)
         return
-    part = path.with_name(f"{path.name}.part")
-    write_synced(part, (save.folder / METRICS_FILE).read_bytes())
-    part.replace(path)
+    with replaced_whole(path) as part:
+        write_synced(part, (save.folder / METRICS_FILE).read_bytes())
 
 
 def refuse_used(folder: Path, kind: str, flag: str) -> None:
