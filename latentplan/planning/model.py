@@ -34,7 +34,7 @@ from typing import Any, Protocol
 from weakref import WeakKeyDictionary
 
 import torch
-from einops import rearrange, repeat
+from einops import rearrange
 from torch import Tensor
 from torch.utils._pytree import register_pytree_node, tree_leaves, tree_map
 
@@ -220,7 +220,7 @@ def _register_dataclass(leaf: Any) -> bool:
 
 def repeat_rows(state: State, num: int) -> State:
     """Returns each row `num` times, batch-major: row r becomes rows r * num to r * num + num - 1."""
-    return tree_map(lambda leaf: repeat(leaf, "row ... -> (row num) ...", num=num), state)
+    return tree_map(lambda leaf: leaf.repeat_interleave(num, dim=0), state)
 
 
 def split_rows(state: State, batch: int) -> State:

@@ -101,10 +101,7 @@ class _ConvertingBackend(Backend):
         return functions
 
     def _weights(self, model: WorldModel) -> rollouts.Weights:
-        kind = model.device.type
-        with model.trunk_precision():
-            dtype = torch.get_autocast_dtype(kind) if torch.is_autocast_enabled(kind) else torch.float32
-        weights: rollouts.Weights = self._rollout_weights.of(model, dtype)
+        weights: rollouts.Weights = self._rollout_weights.of(model, model.trunk_dtype)
         return weights
 
 

@@ -13,6 +13,7 @@ from einops import rearrange
 from torch import Tensor
 
 from latentplan.planning.search.elites import Elites
+from latentplan.planning.search.products import contract
 
 LEAST_PROBABILITY = 0.02  # of a value, before the sum is made 1, so that no value is excluded for ever
 SHARE_OF_PREVIOUS = 0.5  # probability of the previous plan's value at a warm start
@@ -70,7 +71,7 @@ class Choices:
             elites: Elites of the present iteration.
             smoothing: Weight of the new frequencies, in (0, 1].
         """
-        frequencies = torch.einsum("be,beldv->bldv", elites.weights, self._one_hot(elites.actions))
+        frequencies = contract("be,beldv->bldv", elites.weights, self._one_hot(elites.actions))
         moved = torch.lerp(probabilities, frequencies, smoothing).clamp_min(LEAST_PROBABILITY) * self._exists
         moved = moved / moved.sum(dim=-1, keepdim=True)
         has_elites = rearrange(elites.weights.sum(dim=1) > 0, "batch -> batch 1 1 1")

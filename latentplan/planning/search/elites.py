@@ -7,7 +7,6 @@ from functools import reduce
 from typing import NamedTuple
 
 import torch
-from einops import rearrange
 from torch import Tensor
 
 
@@ -157,7 +156,7 @@ def move_towards(
         smoothing: Weight of the elites' statistics, in (0, 1].
         adapt_std: Whether the variance moves too.
     """
-    weights = rearrange(elites.weights, "batch elite -> batch elite 1 1")
+    weights = elites.weights[:, :, None, None]  # (batch, elite, 1, 1)
     has_elites = elites.weights.sum(dim=1)[:, None, None] > 0
     elite_mean = (weights * elites.actions).sum(dim=1)
     new_mean = torch.where(has_elites, torch.lerp(mean, elite_mean, smoothing), mean)

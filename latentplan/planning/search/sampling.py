@@ -8,6 +8,8 @@ from functools import lru_cache
 import torch
 from torch import Tensor
 
+from latentplan.planning.search.products import contract
+
 # Chosen on the problems of `scripts/bench/problems.py`: smooth sequences find other ways, white ones improve each step.
 SMOOTH_SCALE, WHITE_SCALE = 1.25, 0.5
 
@@ -66,7 +68,7 @@ class Streams:
         if noise_beta == 0.0 or horizon == 1 or num_white == num:
             return white, None
         factor = torch.tensor(_colour_factor(horizon, noise_beta), device=self._device, dtype=dtype)
-        smooth = torch.einsum("th,bnha->bnta", factor, white[:, : num - num_white])
+        smooth = contract("th,bnha->bnta", factor, white[:, : num - num_white])
         if num_white == 0:
             return smooth, None
         scale = torch.full((num, 1, 1), SMOOTH_SCALE, device=self._device, dtype=dtype)

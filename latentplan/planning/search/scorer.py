@@ -117,7 +117,7 @@ class Scorer:
             with_states: Whether the rollout has its states even if no term needs them.
         """
         batch, particles = actions.shape[0], self.num_particles
-        rows = rearrange(actions, "batch sample horizon action -> (batch sample) horizon action")
+        rows = actions.flatten(0, 1)  # (batch sample, horizon, action)
         if particles > 1:
             rows = repeat_rows(rows, particles)
         return self._imagine(start, rows, batch, particles, with_states or self._needs_states)
@@ -262,7 +262,7 @@ def _per_candidate(values: Tensor, rollout: Rollout, over_particles: str, name: 
     pattern = "(batch sample particle) -> batch sample"
     sizes = {"batch": rollout.batch, "particle": rollout.num_particles}
     if rollout.num_particles == 1:
-        return rearrange(values.to(rollout.rewards.dtype), "(batch sample) -> batch sample", batch=rollout.batch)
+        return values.to(rollout.rewards.dtype).unflatten(0, (rollout.batch, -1))
     return reduce(values.to(rollout.rewards.dtype), pattern, over_particles, **sizes)
 
 

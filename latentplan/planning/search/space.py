@@ -16,6 +16,7 @@ from torch import Tensor
 
 from latentplan.planning.model import Bound, per_step
 from latentplan.planning.search.choices import Choices
+from latentplan.planning.search.products import contract
 
 
 def read_bounds(
@@ -150,21 +151,21 @@ class Space:
         """Returns the actions (..., horizon, action) of clean points (..., length, action)."""
         if self._matrix is None:
             return points
-        actions = torch.einsum("hk,...ka->...ha", self._matrix, points)
+        actions = contract("hk,...ka->...ha", self._matrix, points)
         if self.choices is not None:
-            held = torch.einsum("hk,...ka->...ha", self._hold, points)
+            held = contract("hk,...ka->...ha", self._hold, points)
             actions = self.choices.join(actions, self.choices.snap(held))
         return self._limit_changes(self.bounds.fit(actions))
 
     def decode_var(self, var: Tensor) -> Tensor:
         """Returns the variance of the actions, (batch, horizon, action), from that of a point."""
-        return var if self._matrix is None else torch.einsum("hk,...ka->...ha", self._matrix.square(), var)
+        return var if self._matrix is None else contract("hk,...ka->...ha", self._matrix.square(), var)
 
     def encode(self, actions: Tensor) -> Tensor:
         """Returns the clean points (..., length, action) whose actions come closest to the given ones."""
         if self._matrix is None:
             return actions if self.is_plain else self.clean(actions)
-        points = torch.einsum("kh,...ha->...ka", self._inverse, actions)
+        points = contract("kh,...ha->...ka", self._inverse, actions)
         if self.choices is not None:  # a mean of choices is no choice
             points = self.choices.join(points, actions[..., self._steps, :])
         return self.clean(points)
