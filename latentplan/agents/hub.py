@@ -2,7 +2,7 @@
 
 The library finds the address of the hub and the user's token as its own command `hf` does. What a repository holds is
 not trusted: only files with the names of an agent's files are fetched, within limits of size, and the agent is checked
-as every agent is before it gets its place.
+as every agent is before it gets its place. Torch is imported for this check, so that mistakes before it answer at once.
 """
 
 from __future__ import annotations
@@ -15,7 +15,6 @@ from pathlib import Path
 from typing import Any
 
 from latentplan import __version__
-from latentplan.agents.checkpoint import load_agent
 from latentplan.agents.files import CARD, FILM, INFO, LARGEST, WEIGHTS, read_files
 from latentplan.agents.info import resolve_checkpoint
 from latentplan.config import UserError
@@ -57,7 +56,7 @@ def push_agent(path: str | Path, repo: str, *, private: bool = False, endpoint: 
     with tempfile.TemporaryDirectory() as made:
         staged = Path(made)
         _stage(folder, staged)
-        load_agent(staged)
+        _check(staged)
         api = hub.HfApi(endpoint=endpoint, library_name="latentplan", library_version=__version__)
         with _one_line(repo):
             api.create_repo(repo, private=private, exist_ok=True)
@@ -93,8 +92,7 @@ def pull_agent(repo: str, out: str | Path, *, revision: str | None = None, endpo
             large, or the hub cannot be reached.
     """
     hub, out = import_extra(CLIENT, "the model hub"), Path(out)
-    if out.is_symlink() or (out.exists() and (not out.is_dir() or any(out.iterdir()))):
-        raise UserError(f"{out} exists: give a new folder")
+    _require_free(out)
     api = hub.HfApi(endpoint=endpoint, library_name="latentplan", library_version=__version__)
     with _one_line(repo):
         found = api.model_info(repo, revision=revision, files_metadata=True)
@@ -116,12 +114,37 @@ def pull_agent(repo: str, out: str | Path, *, revision: str | None = None, endpo
                 )
             (agent / name).write_bytes(read_bytes(Path(given), PULLED[name]))
         try:
-            load_agent(agent)
+            _check(agent)
         except UserError as error:
             reason = str(error).replace(f"{agent}/", "").replace(str(agent), "the repository")
             raise UserError(f"the agent of {repo} cannot be used: {reason}") from None
         agent.replace(out)
     return commit
+
+
+def _check(folder: Path) -> None:
+    """Refuses an agent that cannot act.
+
+    Raises:
+        UserError: See `load_agent`.
+    """
+    from latentplan.agents.checkpoint import load_agent
+
+    load_agent(folder)
+
+
+def _require_free(out: Path) -> None:
+    """Refuses a folder that holds something, or cannot be there.
+
+    Raises:
+        UserError: Another folder has to be given.
+    """
+    try:
+        is_taken = out.is_symlink() or (out.exists() and (not out.is_dir() or any(out.iterdir())))
+    except OSError as error:  # such as a name that is too long
+        raise UserError(f"{out} cannot be made: {error.strerror}; give another folder") from None
+    if is_taken:
+        raise UserError(f"{out} exists: give a new folder")
 
 
 def _stage(folder: Path, staged: Path) -> None:
