@@ -18,7 +18,14 @@ ROOT = Path(__file__).resolve().parent.parent
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())
 EXTRAS = PROJECT["project"]["optional-dependencies"]
 LISTED = [
-    Requirement(text) for text in PROJECT["project"]["dependencies"] + EXTRAS["train"] + EXTRAS["bench"] + EXTRAS["dev"]
+    Requirement(text)
+    for text in [
+        *PROJECT["project"]["dependencies"],
+        *EXTRAS["train"],
+        *EXTRAS["bench"],
+        *EXTRAS["hub"],
+        *EXTRAS["dev"],
+    ]
 ]
 REQUIREMENTS = [requirement for requirement in LISTED if requirement.name != "latentplan"]
 
@@ -58,8 +65,8 @@ def test_python_3_13_gets_every_requirement_of_dm_control_but_labmaze():
     assert "dm-control" not in listed
 
 
-def test_development_brings_what_training_and_benchmarks_need():
-    assert {"latentplan[train]", "latentplan[bench]"} <= set(EXTRAS["dev"])
+def test_development_brings_what_training_benchmarks_and_the_hub_need():
+    assert {"latentplan[train]", "latentplan[bench]", "latentplan[hub]"} <= set(EXTRAS["dev"])
 
 
 def test_package_without_extras_needs_four_libraries():

@@ -13,7 +13,7 @@ from safetensors.torch import load, save
 
 from latentplan.agents.base import Agent
 from latentplan.agents.files import INFO, WEIGHTS, seal, write_files
-from latentplan.agents.info import read_contents, read_info, resolve_checkpoint, suggestion
+from latentplan.agents.info import read_contents, read_info, read_spaces, resolve_checkpoint, suggestion
 from latentplan.agents.modes import MODES, make_agent
 from latentplan.config import Config, PlannerConfig, UserError, from_dict, to_dict
 from latentplan.config.checks import shown
@@ -84,7 +84,7 @@ def load_model(path: str | Path, device: str = "cpu") -> tuple[WorldModel, Confi
     except (AttributeError, TypeError, ValueError) as error:
         raise UserError(f"the settings in {folder / INFO} cannot be used: {error}") from None
     try:
-        sizes = info["action_dim"], info.get("labels"), info.get("goal_dim") or 0, _read_spaces(info)
+        sizes = info["action_dim"], info.get("labels"), info.get("goal_dim") or 0, read_spaces(info)
         state = {name: value.float() for name, value in load(content).items()}
         with torch.device("meta"):  # compares shapes before a model is allocated whose size the file names
             WorldModel(config.model, *sizes).load_state_dict(state, assign=True)
@@ -143,18 +143,6 @@ def load_agent(path: str | Path, mode: str = "planner", device: str = "cpu", **s
     if wait_until_ready is not None:
         wait_until_ready()  # without a ready worker, the actor alone would decide in the first episode
     return agent
-
-
-def _read_spaces(info: dict[str, Any]) -> Spaces:
-    """The spaces that a description names.
-
-    Raises:
-        TypeError: The description names spaces of another form.
-        ValueError: A value is not allowed.
-    """
-    given: dict[str, Any] = info.get("spaces", {})
-    values: dict[str, Any] = {name: tuple(value) if isinstance(value, list) else value for name, value in given.items()}
-    return Spaces(**values)
 
 
 def _first_not_finite(state: dict[str, torch.Tensor]) -> str | None:

@@ -19,6 +19,8 @@ from latentplan.config.reading import read_bytes
 
 WEIGHTS = "weights.safetensors"
 INFO = "info.json"
+CARD = "README.md"  # describes the agent to people; not part of it, and in no manifest
+FILM = "replay.mp4"  # of the card; the model hub plays a film of this name beside the card
 LARGEST_FILE = 2**32  # bytes; weights of the shipped agents have some millions
 LARGEST = {INFO: 2**24, WEIGHTS: LARGEST_FILE}  # bytes; a description with the metrics of a long run has some 2**19
 KIND, FORMAT = "agent", 1

@@ -11,6 +11,7 @@ from latentplan.agents.files import INFO, WEIGHTS, is_checkpoint, read_files
 from latentplan.config import UserError
 from latentplan.config.checks import cut, nearest, shown
 from latentplan.config.reading import parse_json
+from latentplan.config.spaces import Spaces
 
 MOST_NAMES = 5  # known names in an error message
 LARGEST_COUNT = 10**15  # of frames, updates and minutes; larger numbers are damage
@@ -84,6 +85,21 @@ def read_contents(folder: Path) -> tuple[dict[str, Any], bytes]:
     if hashlib.sha256(contents[WEIGHTS]).hexdigest() != info["sha256"]:
         raise UserError(f"{folder / WEIGHTS} is damaged: its checksum differs from the checksum in {INFO}")
     return info, contents[WEIGHTS]
+
+
+def read_spaces(info: dict[str, Any]) -> Spaces:
+    """The spaces that a description names.
+
+    Args:
+        info: A description; see `read_info`.
+
+    Raises:
+        TypeError: The description names spaces of another form.
+        ValueError: A value is not allowed.
+    """
+    given: dict[str, Any] = info.get("spaces", {})
+    values: dict[str, Any] = {name: tuple(value) if isinstance(value, list) else value for name, value in given.items()}
+    return Spaces(**values)
 
 
 def resolve_checkpoint(path: str | Path) -> Path:

@@ -148,7 +148,7 @@ def run(request: Request) -> int:
 
     goals = read_goals(request.objective, request.constraint, chosen.domain)
     world = chosen if goals is None else goal_env(chosen)
-    env = _make_env(world, info["action_dim"])
+    env = open_env(world, info["action_dim"])
     try:
         clock = VirtualClock(request.control_hz, latency)
         agent = load_timed_agent(request.checkpoint, request.mode, clock, device, **changes)
@@ -166,7 +166,7 @@ def run(request: Request) -> int:
         env.close()
 
 
-def _make_env(config: EnvConfig, action_dim: int) -> Any:
+def open_env(config: EnvConfig, action_dim: int) -> Any:
     """The environment to play in; one of the user's, whose code may fail, gives an error of one line.
 
     Raises:

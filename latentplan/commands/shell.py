@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import re
 import signal
 import sys
 import threading
@@ -164,6 +165,25 @@ class LearningRequest(ComputeRequest):
         super().__post_init__()
         if self.checkpoint is None and self.resume is None:
             raise UserError("flag --checkpoint is missing; give the folder of a trained agent or of a run")
+
+
+@dataclass(frozen=True, kw_only=True)
+class HubRequest:
+    """The repository and the address of the model hub.
+
+    Attributes:
+        repo: Repository of the model hub, as OWNER/NAME.
+        endpoint: Address of the hub; None takes the variable HF_ENDPOINT, or the public hub.
+    """
+
+    repo: str = option(metavar="REPO", is_positional=True)
+    endpoint: str | None = option(None, metavar="URL", is_last=True)
+
+    def __post_init__(self) -> None:
+        if not re.fullmatch(r"[\w.-]{1,96}/[\w.-]{1,96}", self.repo, re.ASCII):
+            raise UserError(f"a repository is named OWNER/NAME, got {shown(self.repo)}")
+        if self.endpoint is not None and not self.endpoint.startswith(("http://", "https://")):
+            raise UserError(f"--endpoint must begin with https:// or http://, got {shown(self.endpoint)}")
 
 
 def name_folder(kind: str, info: Mapping[str, Any]) -> Path:

@@ -19,6 +19,7 @@ EXTRAS = {
     "wandb": ("wandb",),
     "trackio": ("trackio",),
     "mlflow": ("mlflow",),
+    "hub": ("huggingface_hub",),
 }
 """By extra, the modules that it installs and the package without extras does not."""
 

@@ -1,0 +1,153 @@
+"""`latentplan card`: write the card of an agent, a README.md in the format of the model hub."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from latentplan import __version__
+from latentplan.commands.flags import overrides
+from latentplan.commands.shell import ComputeRequest, saved_config
+from latentplan.config import EnvConfig, UserError, output_file
+from latentplan.config.checks import MAX_EPISODES, at_least, shown, within
+from latentplan.config.env_id import ENV_FLAGS, EnvChoice, choose_env
+from latentplan.config.parsing import option
+from latentplan.config.reading import LARGEST_SETTINGS, read_text
+
+if TYPE_CHECKING:
+    from latentplan.reporting.card import CardReturn
+
+FILM_FRAMES = 250
+MODES = ("planner", "actor")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Request(ComputeRequest):
+    """The command line of a card.
+
+    Attributes:
+        checkpoint: Folder of a trained agent, or of a run (its best checkpoint).
+        episodes: Episodes of planner and actor to play for the card, the first of which is filmed; None takes the
+            returns that the agent remembers.
+        seed: Seed of the starts: episode i starts from a state that depends only on the seed and i.
+        licence: Licence of the agent, by its identifier on the model hub, such as `mit` or `apache-2.0`.
+        force: Whether a README.md that this command did not write, or that was edited since, is replaced.
+        env: The environment, in place of the one that the agent learned in.
+    """
+
+    NOTES = "The card, README.md, and the film, replay.mp4, are written into the folder of the agent."
+
+    checkpoint: Path = option(metavar="DIR")
+    episodes: int | None = None
+    seed: int = 0
+    licence: str = "mit"
+    force: bool = False
+    env: dict[str, Any] = overrides(EnvChoice, ENV_FLAGS, prefix="env.")
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        at_least(self, seed=0)
+        if self.episodes is not None:
+            within(self, episodes=(1, MAX_EPISODES))
+        if not re.fullmatch(r"[a-z0-9][a-z0-9.-]{0,60}", self.licence):
+            raise UserError(f"--licence must be an identifier such as mit or apache-2.0, got {shown(self.licence)}")
+
+
+def run(request: Request) -> int:
+    """Write the card, print where it is, and return the exit code.
+
+    Raises:
+        UserError: The agent cannot be used, or a README.md of another origin is in its folder.
+    """
+    import hashlib
+
+    from latentplan.agents.files import CARD, FILM, INFO, read_files
+    from latentplan.agents.info import read_info, read_spaces, resolve_checkpoint
+
+    folder = resolve_checkpoint(request.checkpoint)
+    info = read_info(folder)
+    config = saved_config(folder, info)
+    chosen = choose_env(config.env, request.env)
+    path = output_file(folder / CARD, "--checkpoint")
+    if not request.force:
+        _require_own(path, folder / FILM if request.episodes else None)
+    try:
+        spaces = read_spaces(info)
+    except (TypeError, ValueError) as error:
+        raise UserError(f"{folder / INFO} cannot be used: {error}") from None
+    from latentplan.evaluation.statistics import confidence_interval
+    from latentplan.reporting.card import CardData, recorded_returns, render_card, seal_card
+
+    returns = recorded_returns(info, config, confidence_interval)
+    film = None
+    if request.episodes is not None:
+        returns = _measure(request, folder, info, chosen, folder / FILM) + returns
+        film = FILM
+    text = render_card(CardData(info, config, spaces, returns, film, request.licence))
+    card = seal_card(text, hashlib.sha256(read_files(folder, (INFO,))[INFO]).hexdigest())
+    part = path.with_name(f".{path.name}.part")
+    part.write_text(card, encoding="utf-8")
+    part.replace(path)
+    print(f"card: {path}" + (f", film: {folder / FILM}" if film else ""))
+    if not returns:
+        print("the agent remembers no returns of its weights; --episodes 10 measures them for the card")
+    return 0
+
+
+def _require_own(path: Path, film: Path | None) -> None:
+    """Refuses to replace a card or a film that a person may want to keep.
+
+    Args:
+        path: Path of the card.
+        film: Path of the film, if one will be written.
+
+    Raises:
+        UserError: One of them exists, and this command did not write it as it is.
+    """
+    from latentplan.reporting.card import read_seal
+
+    remedy = "--force true replaces it"
+    text = ""
+    if path.exists():
+        text = read_text(path, LARGEST_SETTINGS)
+        seal = read_seal(text)
+        if seal is None:
+            raise UserError(f"{path} was not written by this command; {remedy}")
+        if not seal.is_intact:
+            raise UserError(f"{path} was edited since this command wrote it; {remedy}")
+    if film is not None and film.exists() and f"]({film.name})" not in text:
+        raise UserError(f"{film} was not written by this command; {remedy}")
+
+
+def _measure(request: Request, folder: Path, info: dict[str, Any], chosen: EnvConfig, film: Path) -> list[CardReturn]:
+    """Plays planner and actor from the same starts, and films the planner's first episode."""
+    import contextlib
+
+    from latentplan.agents.checkpoint import load_agent
+    from latentplan.commands.evaluate import open_env
+    from latentplan.evaluation.episodes import evaluate_agent
+    from latentplan.evaluation.statistics import confidence_interval
+    from latentplan.reporting.card import summarize_returns
+    from latentplan.reporting.film import filming
+
+    assert request.episodes is not None
+    device, found = request.use_device(), []
+    env = open_env(chosen, info["action_dim"])
+    try:
+        length = getattr(env.unwrapped, "decisions_per_episode", None) or 0
+        for mode in MODES:
+            agent: Any = load_agent(folder, mode, device)
+            with contextlib.ExitStack() as stack:
+                write = None
+                if mode == "planner":
+                    write = stack.enter_context(filming(film, env, agent, every=-(-length // FILM_FRAMES) or 1))
+                result = evaluate_agent(agent, env, request.seed, request.episodes, on_step=write)
+            origin = f"for this card, seed {request.seed}, latentplan {__version__}"
+            entry = summarize_returns(mode, result["returns"], confidence_interval, origin, is_measured=True)
+            print(f"{mode}: mean return {entry.mean:.1f} of {entry.num_episodes} episodes", flush=True)
+            found.append(entry)
+    finally:
+        env.close()
+    return found
