@@ -194,9 +194,23 @@ class ModelAgent:
         latent = self._encode_frames(self._check_seen(frame, single)).cpu().numpy()
         return latent[0] if single else latent
 
-    def imagine(self) -> np.ndarray | None:
-        """The decoded last state of the first environment's plan, uint8 (32, 32, 3); None without a plan."""
+    def plan_actions(self) -> Tensor | None:
+        """What is left of the first environment's plan, from the latest action on, (1, step, action); None without."""
         return None
+
+    @torch.no_grad()
+    def imagine(self) -> np.ndarray | None:
+        """The decoded last state of the first environment's plan, uint8 (32, 32, 3); None without a plan.
+
+        Also sets `steps_ahead`.
+        """
+        actions = self.plan_actions()
+        if actions is None or self.state is None:
+            return None
+        first = State(*(part[:1] for part in first_turn(self.state)))
+        self.steps_ahead = actions.shape[1]
+        _, last = self.model.rollout(first, actions.to(first.deter.dtype))
+        return self.model.decoder.picture(last.features.float())[0].cpu().numpy()
 
     @torch.no_grad()
     def actor_action(self) -> np.ndarray:
@@ -266,18 +280,6 @@ class ModelAgent:
     def _choose(self, state: State) -> Tensor:
         """The action for a belief, in [-1, 1], (batch, action)."""
         raise AssertionError("a subclass of ModelAgent defines _choose")
-
-    def _decode_last_state(self, state: State, actions: Tensor) -> np.ndarray:
-        """The decoded state after the first environment's plan, uint8 (32, 32, 3); also sets `steps_ahead`.
-
-        Args:
-            state: The belief about each environment.
-            actions: The plan of each environment, (batch, horizon, action).
-        """
-        first = State(*(part[:1] for part in first_turn(state)))
-        self.steps_ahead = actions.shape[1]
-        _, last = self.model.rollout(first, actions[:1].to(first.deter.dtype))
-        return self.model.decoder.picture(last.features.float())[0].cpu().numpy()
 
     def _build_goals(
         self, objective: str | Expression | Term | None, constraints: str | Sequence[Constraint], planner: Planner

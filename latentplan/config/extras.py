@@ -13,6 +13,7 @@ EXTRAS = {
         *("shtab", "tensorboard", "yaml"),
     ),
     "bench": ("rliable",),
+    "view": ("starlette", "uvicorn", "websockets", "plotly"),
     "jax": ("jax",),
     "gymnasium": ("imageio", "pygame"),
     "robotics": ("gymnasium_robotics",),
