@@ -8,6 +8,7 @@ from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 import torch
+from einops import rearrange
 from torch import Tensor
 
 from latentplan.config import Config, UserError
@@ -54,7 +55,7 @@ class Imagined(NamedTuple):
     """Imagined rollouts.
 
     Attributes:
-        pictures: The decoded state after each step, uint8 (rollout, step, height / 2, width / 2, 3).
+        pictures: The decoded state after each step that is shown, uint8 (rollout, shown, height / 2, width / 2, 3).
         rewards: The predicted reward of each step, float32 (rollout, step).
         actions: The action of each step, float32 (rollout, step, action).
     """
@@ -230,26 +231,37 @@ class ModelAgent:
         return State(*(part[:1].float() for part in first_turn(self.state)))
 
     @torch.no_grad()
-    def imagine_along(self, beliefs: Sequence[State], actions: np.ndarray | None, steps: int) -> Imagined:
+    def imagine_along(
+        self, beliefs: Sequence[State], actions: np.ndarray | None, steps: int, shown: Sequence[int] | None = None
+    ) -> Imagined:
         """Rollouts of the model from beliefs, in pictures.
 
         Args:
             beliefs: Results of `belief`, one for each rollout, or a single one for all of them.
             actions: Actions (rollout, step, action); None lets the actor act in each rollout.
             steps: Model steps.
+            shown: Steps that are decoded, from 0, in order; None decodes all.
         """
         num = len(beliefs) if actions is None else len(actions)
         state = State(*(torch.cat(parts) for parts in zip(*beliefs, strict=True)))
         state = State(*(part.expand(num, -1).contiguous() for part in state))
-        given = None if actions is None else torch.as_tensor(actions, dtype=torch.float32, device=self.model.device)
-        pictures, rewards, taken = [], [], []
+        if actions is None:
+            mode = torch.zeros(num, steps, self.num_actions, device=self.model.device)
+            given = self.model.backend.propose(self.model, state, mode)
+        else:
+            given = torch.as_tensor(actions, dtype=torch.float32, device=self.model.device)
+        features, rewards = [], []
         for step in range(steps):
-            action = self.model.policy(state).float() if given is None else given[:, step]
-            state, reward = self.model.step(state, action)
-            pictures.append(self.model.decoder.picture(state.features.float()).cpu().numpy())
-            rewards.append(reward.float().cpu().numpy())
-            taken.append(action.cpu().numpy())
-        return Imagined(*(np.stack(parts, axis=1) for parts in (pictures, rewards, taken)))
+            state, reward = self.model.fast_step(state, given[:, step])
+            features.append(state.features.float())
+            rewards.append(reward.float())
+        decoded = torch.stack([features[step] for step in (range(steps) if shown is None else shown)], dim=1)
+        pictures = self.model.decoder.picture(rearrange(decoded, "rollout step feature -> (rollout step) feature"))
+        return Imagined(
+            rearrange(pictures.cpu().numpy(), "(rollout step) ... -> rollout step ...", rollout=num),
+            torch.stack(rewards, dim=1).cpu().numpy(),
+            given.cpu().numpy(),
+        )
 
     def _replace_actions(self, actions: np.ndarray) -> np.ndarray:
         """The actions (batch, action), in which rows that are not finite hold the row's last action, or zeros."""

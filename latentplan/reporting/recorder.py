@@ -198,8 +198,8 @@ class EpisodeRecorder:
         actions = plan.actions[:1].float().cpu().numpy()
         horizon = actions.shape[1]
         shown = spread(horizon, NUM_PICTURES)
-        by_plan = self.agent.imagine_along([self._beliefs[-1]], actions, horizon)
-        by_actor = self.agent.imagine_along([self._beliefs[-1]], None, horizon)
+        by_plan = self.agent.imagine_along([self._beliefs[-1]], actions, horizon, shown)
+        by_actor = self.agent.imagine_along([self._beliefs[-1]], None, horizon, shown)
         num_elites = getattr(self._controller.planner, "num_best", 1)
         search = [self._read_iteration(each, num_elites, shown) for each in plan.candidates]
         self.recording.inspections.append(
@@ -208,8 +208,8 @@ class EpisodeRecorder:
                 self._frames[-1],
                 [step + 1 for step in shown],
                 search,
-                by_plan.pictures[0, shown],
-                by_actor.pictures[0, shown],
+                by_plan.pictures[0],
+                by_actor.pictures[0],
                 float(by_plan.rewards.sum()),
                 float(by_actor.rewards.sum()),
             )
@@ -218,7 +218,7 @@ class EpisodeRecorder:
     def _read_iteration(self, iteration: Any, num_elites: int, shown: Sequence[int]) -> SearchStep:
         others, elites = choose_candidates(iteration, num_elites)
         rows = np.concatenate([elites, others])
-        pictures = self.agent.imagine_along([self._beliefs[-1]], rows, rows.shape[1]).pictures[:, shown]
+        pictures = self.agent.imagine_along([self._beliefs[-1]], rows, rows.shape[1], shown).pictures
         return SearchStep(
             others,
             elites,

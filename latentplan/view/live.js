@@ -102,12 +102,14 @@
     }
     mode.value = given.mode;
     find("plans").hidden = given.plans;
-    ["objective", "constraint"].forEach(function (name) {
-      if (document.activeElement !== find(name)) { find(name).value = given[name]; }
-    });
+    function fill(name, value) {  // but not where someone types
+      if (document.activeElement !== find(name)) { find(name).value = value; }
+    }
+    fill("objective", given.objective);
+    fill("constraint", given.constraint);
     SEARCH.forEach(function (name) {
       var own = given.own[name];
-      find(name).value = given.search[name] === null ? "" : given.search[name];
+      fill(name, given.search[name] === null ? "" : given.search[name]);
       find(name).placeholder = own === null ? (name === "deadline_ms" ? "none" : "half of the first") : own;
     });
     if (given.goal_horizon && given.search.horizon === null) {
@@ -206,7 +208,7 @@
     if (index === 1 && find("fan-1-card").hidden) { return; }
     var parts = own || { candidates: [], elites: [], mean: [] };
     var lines = [
-      ["candidates", parts.candidates, color("faint"), 0.7, 0.5],
+      ["candidates", parts.candidates, color("faint"), 1, 0.55],
       ["elites", parts.elites, color("series-1"), 1, 0.8],
       ["mean", [parts.mean], color("series-2"), 2.5, 1]
     ].map(function (part) {

@@ -322,14 +322,13 @@ class Session:
             return None
         planned, belief = self.agent.plan_actions(), self.agent.belief()
         num_steps = self.search.horizon if planned is None else planned.shape[1]
-        imagined = {}
+        shown, imagined = spread(num_steps, NUM_PICTURES), {}
         if planned is not None:
-            imagined["plan"] = self.agent.imagine_along([belief], planned.float().cpu().numpy(), num_steps)
-        imagined["actor"] = self.agent.imagine_along([belief], None, num_steps)
-        shown = spread(num_steps, NUM_PICTURES)
+            imagined["plan"] = self.agent.imagine_along([belief], planned.float().cpu().numpy(), num_steps, shown)
+        imagined["actor"] = self.agent.imagine_along([belief], None, num_steps, shown)
         return Future(
             steps=[step + 1 for step in shown],
-            picture=tile([each.pictures[0, shown] for each in imagined.values()]),
+            picture=tile([each.pictures[0] for each in imagined.values()]),
             rewards={name: float(each.rewards.sum()) for name, each in imagined.items()},
             num_steps=num_steps,
             fan=self._read_fan(),
