@@ -21,6 +21,8 @@ from latentplan.config.extras import require_extra
 from latentplan.config.parsing import option
 
 if TYPE_CHECKING:
+    import socket
+
     from latentplan.config import EnvConfig
 
 LARGEST_PORT = 65535
@@ -84,12 +86,18 @@ def run(request: Request) -> int:
     chosen = choose_env(config.env, request.env)
     check_search(search_settings(config, request.planner), config.model)
     check_expressions(request.objective, request.constraint, chosen.domain)
+    from latentplan.view.access import listen
+
     with contextlib.ExitStack() as stack:
-        _serve(request, chosen, info["action_dim"], stack)
+        listening = stack.enter_context(listen(request.host, request.port))
+        _serve(request, chosen, info["action_dim"], listening, stack)
     return 0
 
 
-def _serve(request: Request, chosen: EnvConfig, action_dim: int, stack: contextlib.ExitStack) -> None:
+def _serve(
+    request: Request, chosen: EnvConfig, action_dim: int, listening: socket.socket, stack: contextlib.ExitStack
+) -> None:
+    """Make agent, environment and server, and run them until an interrupt; the stack closes them."""
     import tempfile
     import webbrowser
 
@@ -103,7 +111,7 @@ def _serve(request: Request, chosen: EnvConfig, action_dim: int, stack: contextl
     from latentplan.view.session import Session, Settings, Trained
 
     name = f"{chosen.domain}-{chosen.task}"
-    server = ViewServer(request.host, request.port, f"{name}: live view")
+    server = ViewServer(listening, f"{name}: live view")
     stack.callback(server.stop)
     device = request.use_device(threads=1)  # the other cores draw the page
     world = goal_env(chosen)

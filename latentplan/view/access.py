@@ -1,13 +1,17 @@
-"""Who may open the live view: nobody but this machine's own pages, or whoever has the token."""
+"""Where the live view listens, and who may open it: this machine's own pages alone, or whoever has the token."""
 
 from __future__ import annotations
 
 import ipaddress
 import secrets
+import socket
 from collections.abc import Mapping
 from dataclasses import dataclass
 from http.cookies import CookieError, SimpleCookie
 from urllib.parse import SplitResult, parse_qs, urlsplit
+
+from latentplan.config import UserError
+from latentplan.config.checks import shown
 
 PARAMETER = "token"
 
@@ -71,6 +75,25 @@ class Access:
     def _is_token(self, given: str) -> bool:
         """Whether a text is the token, in a time that does not depend on the text."""
         return secrets.compare_digest(given.encode(), (self.token or "").encode()) and bool(self.token)
+
+
+def listen(host: str, port: int) -> socket.socket:
+    """A socket that listens at an address.
+
+    Args:
+        host: Name or address of the interface.
+        port: Port; 0 takes any free one.
+
+    Raises:
+        UserError: The address cannot be used.
+    """
+    try:
+        return socket.create_server((host, port), family=socket.AF_INET6 if ":" in host else socket.AF_INET)
+    except (OSError, TypeError, ValueError) as error:
+        reason = getattr(error, "strerror", None) or error
+        raise UserError(
+            f"--host {shown(host)} --port {port} cannot be used: {reason}; --port 0 takes a free port"
+        ) from None
 
 
 def is_loopback(host: str) -> bool:

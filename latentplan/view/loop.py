@@ -21,12 +21,15 @@ CHECK_S = 0.5
 
 
 def run_live(session: Session, server: ViewServer, control_hz: float) -> None:
-    """Runs the session while a page is open, until the server ends.
+    """Runs the session while a page is open, until an interrupt.
 
     Args:
         session: The session; only this thread may use it.
         server: The server, which has been started.
         control_hz: Decisions per second of the wall clock.
+
+    Raises:
+        RuntimeError: The server has ended by itself.
     """
     pace, every = Pace(1.0 / control_hz), max(1, round(control_hz / FUTURES_PER_S))
     while server.is_alive:
@@ -36,6 +39,7 @@ def run_live(session: Session, server: ViewServer, control_hz: float) -> None:
             continue
         step(session, server.hub, pace, looks_ahead=pace.num_decisions % every == 0)
         pace.finish()
+    raise RuntimeError("the server of the live view has ended")
 
 
 def step(session: Session, hub: Hub, pace: Pace, *, looks_ahead: bool) -> None:

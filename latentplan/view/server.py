@@ -21,7 +21,6 @@ from starlette.responses import PlainTextResponse, RedirectResponse, Response
 from starlette.routing import Route, WebSocketRoute
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
-from latentplan.config import UserError
 from latentplan.reporting.page import read_part
 from latentplan.view.access import PARAMETER, Access
 from latentplan.view.hub import Hub, Page
@@ -47,17 +46,13 @@ class ViewServer:
         hub: Passes messages between pages and simulation.
 
     Args:
-        host: Address of the interface.
-        port: Port; 0 takes any free one.
+        listening: Socket that listens for pages, see `listen`.
         title: Title of the page.
-
-    Raises:
-        UserError: The address cannot be used.
     """
 
-    def __init__(self, host: str, port: int, title: str) -> None:
-        self._socket = _bind(host, port)
-        port = self._socket.getsockname()[1]
+    def __init__(self, listening: socket.socket, title: str) -> None:
+        self._socket = listening
+        host, port = listening.getsockname()[:2]
         self.access, self.hub = Access.of(host, port), Hub()
         name = socket.gethostname() if host in ("0.0.0.0", "::") else f"[{host}]" if ":" in host else host
         self.url = f"http://{name}:{port}/" + (f"?{PARAMETER}={self.access.token}" if self.access.token else "")
@@ -123,15 +118,6 @@ class Guard:
             await send({"type": "websocket.close", "code": 1008, "reason": reason})  # before it opens: 403
         else:
             await PlainTextResponse(f"{reason}\n", 403)(scope, receive, send)
-
-
-def _bind(host: str, port: int) -> socket.socket:
-    family = socket.AF_INET6 if ":" in host else socket.AF_INET
-    try:
-        return socket.create_server((host, port), family=family)
-    except (OSError, OverflowError) as error:
-        reason = getattr(error, "strerror", None) or error
-        raise UserError(f"--host {host} --port {port} cannot be used: {reason}; --port 0 takes any free port") from None
 
 
 def _make_app(title: str, access: Access, hub: Hub) -> Starlette:

@@ -65,6 +65,7 @@ def test_view_serves_the_agent_until_ctrl_c(start):
     assert process.stderr.read() == ""
 
 
+@pytest.mark.slow
 def test_view_ends_by_sigterm_while_a_page_is_open(start):
     process, _, address = start()
     port = re.search(r":(\d+)/", address)[1]
@@ -87,7 +88,7 @@ def test_view_ends_by_sigterm_while_a_page_is_open(start):
         (("--control-hz", "0"), ("--control-hz", "above 0")),
         (("--seed", "-1"), ("--seed", "at least 0")),
         (("--planner.num_elites", "9"), ("num_elites (9)", "num_samples (8)")),
-        (("--host", "no such host", "--port", "0"), ("--host no such host",)),
+        (("--host", "no such host", "--port", "0"), ("--host 'no such host'",)),
         (("--hst", "127.0.0.1"), ("--hst", "--host")),
     ],
 )

@@ -10,6 +10,7 @@ from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect
 
 from latentplan.config import UserError
+from latentplan.view.access import listen
 from latentplan.view.loop import step
 from latentplan.view.pace import Pace
 from latentplan.view.server import ViewServer
@@ -18,7 +19,7 @@ from latentplan.view.server import ViewServer
 @pytest.fixture(scope="module")
 def server():
     """A view on the loopback interface."""
-    started = ViewServer("127.0.0.1", 0, "a <view>")
+    started = ViewServer(listen("127.0.0.1", 0), "a <view>")
     started.start()
     yield started
     started.stop()
@@ -28,7 +29,7 @@ def server():
 @pytest.fixture(scope="module")
 def locked():
     """A view on all interfaces, which has a token."""
-    started = ViewServer("0.0.0.0", 0, "a view")
+    started = ViewServer(listen("0.0.0.0", 0), "a view")
     started.start()
     yield started
     started.stop()
@@ -167,9 +168,14 @@ def test_no_page_is_open_after_the_last_one_was_closed(server):
 
 def test_port_in_use_is_refused_in_one_line(server):
     with pytest.raises(UserError, match=r"--port \d+ cannot be used: Address already in use"):
-        ViewServer("127.0.0.1", server.access.port, "another")
-    with pytest.raises(UserError, match="--host 999.1.1.1"):
-        ViewServer("999.1.1.1", 0, "another")
+        listen("127.0.0.1", server.access.port)
+
+
+@pytest.mark.parametrize("host", ["999.1.1.1", "no such host", "a" * 1000, "\0", "::ffff:1.2.3.4"])
+def test_address_that_is_not_of_this_machine_is_refused_in_one_line(host):
+    with pytest.raises(UserError, match="cannot be used") as error:
+        listen(host, 0)
+    assert "\n" not in str(error.value) and len(str(error.value)) < 300
 
 
 def wait_for_request(server, num=1):
