@@ -14,6 +14,7 @@ EXTRAS = {
     ),
     "bench": ("rliable",),
     "view": ("starlette", "uvicorn", "websockets", "plotly"),
+    "browser": ("playwright",),
     "jax": ("jax",),
     "gymnasium": ("imageio", "pygame"),
     "robotics": ("gymnasium_robotics",),
