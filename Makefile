@@ -1,4 +1,5 @@
 # `make train` and `make test` set up everything they need; `make train ARGS="--domain cartpole --minutes 5"`.
+# `make test-browser` tests the pages in headless Chromium, which it installs where there is none.
 # `make docs` builds the documentation into build/docs.
 # `make soak` fuzzes planners for long; `make soak ARGS="--checkpoint DIR"` counts missed deadlines on the wall clock.
 # `make soak-faults` disturbs a run for an hour: kills, a full disk, damaged saves, NaN, failing environments.
@@ -11,8 +12,9 @@ FUZZED := $(wildcard tests/*/test_*_properties.py)
 STAMP := .venv/.installed
 DOCS_STAMP := .venv/.docs-installed
 JAX_STAMP := .venv/.jax-installed
+BROWSER_STAMP := .venv/.browser-installed
 
-.PHONY: setup train test test-all check audit fuzz doctor bench soak soak-faults docs clean
+.PHONY: setup train test test-all test-browser check audit fuzz doctor bench soak soak-faults docs clean
 
 setup: $(STAMP)
 
@@ -23,7 +25,10 @@ test: $(STAMP)
 	$(BIN)/python -m pytest -n auto --dist loadfile
 
 test-all: $(STAMP)
-	$(BIN)/python -m pytest -n auto --dist loadfile -m "not soak"
+	$(BIN)/python -m pytest -n auto --dist loadfile -m "not soak and not browser"
+
+test-browser: $(BROWSER_STAMP)
+	$(BIN)/python -m pytest -m browser tests/browser $(ARGS)
 
 check: $(JAX_STAMP) test-all
 	$(BIN)/ruff check .
@@ -72,6 +77,11 @@ $(JAX_STAMP): $(STAMP)
 	$(BIN)/python -m pip install --constraint constraints.txt --editable '.[jax]'
 	@touch $@
 
+$(BROWSER_STAMP): $(STAMP)
+	$(BIN)/python -m pip install --constraint constraints.txt --editable '.[browser]'
+	@$(install_browser)
+	@touch $@
+
 # The first interpreter the project runs on.
 define find_python
 for candidate in $(PYTHON); do \
@@ -104,4 +114,12 @@ elif [ "$$(id -u)" = 0 ] && command -v apt-get >/dev/null; then \
 		apt-get install -y --no-install-recommends $$package || echo "could not install $$package" >&2; \
 	done; \
 else echo "headless rendering needs GL libraries; run: sudo apt-get install -y$$missing" >&2; fi
+endef
+
+# Debian has Chromium as a package; elsewhere playwright downloads its own.
+define install_browser
+for name in chromium chromium-browser google-chrome; do if command -v $$name >/dev/null; then exit 0; fi; done; \
+if [ "$$(id -u)" = 0 ] && grep -qs '^ID=debian' /etc/os-release; then \
+	apt-get update && apt-get install -y --no-install-recommends chromium; \
+else $(BIN)/python -m playwright install chromium; fi
 endef

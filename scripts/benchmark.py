@@ -22,6 +22,7 @@ COMMANDS = {
     "ablate": Command("bench.ablate", "return of a trained planner without each of its parts, in paired episodes"),
     "zero-shot": Command("bench.zero_shot", "goals that an agent was not trained for: planner, actor, random actions"),
     "realtime": Command("bench.realtime", "return and time by iterations, control rates, prediction and re-planning"),
+    "view": Command("bench.view", "decisions per second of the live view while a page is open in headless Chromium"),
     "soak": Command("bench.soak", "deadlines that agents and an idle loop miss on the wall clock"),
     "faults": Command("bench.faults", "a run that is killed, filled, corrupted and poisoned once a minute"),
     "survive": Command("bench.survive", "kills, kills within a save and flipped bits: tries and survivals"),

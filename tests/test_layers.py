@@ -27,8 +27,12 @@ ROOMS = {
         (*BELOW_AGENTS, "envs", "agents", "evaluation", "reporting"),
         {"lightning", "torch", "numpy", "einops", "rich", "tensorboard", "gymnasium", "yaml"},
     ),
+    "view": (
+        (*BELOW_AGENTS, "envs", "agents", "evaluation", "reporting"),
+        {"numpy", "starlette", "uvicorn", "plotly"},
+    ),
     "commands": (
-        (*BELOW_AGENTS, "envs", "agents", "evaluation", "reporting", "training"),
+        (*BELOW_AGENTS, "envs", "agents", "evaluation", "reporting", "training", "view"),
         {"torch", "numpy", "rich", "jsonargparse", "shtab", *SIMULATION, "cv2", "lightning"},
     ),
     "__init__": (("agents",), set()),

@@ -19,13 +19,8 @@ PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())
 EXTRAS = PROJECT["project"]["optional-dependencies"]
 LISTED = [
     Requirement(text)
-    for text in [
-        *PROJECT["project"]["dependencies"],
-        *EXTRAS["train"],
-        *EXTRAS["bench"],
-        *EXTRAS["hub"],
-        *EXTRAS["dev"],
-    ]
+    for text in PROJECT["project"]["dependencies"]
+    + [text for extra in ("train", "bench", "hub", "view", "browser", "dev") for text in EXTRAS[extra]]
 ]
 REQUIREMENTS = [requirement for requirement in LISTED if requirement.name != "latentplan"]
 
@@ -65,8 +60,8 @@ def test_python_3_13_gets_every_requirement_of_dm_control_but_labmaze():
     assert "dm-control" not in listed
 
 
-def test_development_brings_what_training_benchmarks_and_the_hub_need():
-    assert {"latentplan[train]", "latentplan[bench]", "latentplan[hub]"} <= set(EXTRAS["dev"])
+def test_development_brings_what_training_benchmarks_hub_and_live_view_need():
+    assert {"latentplan[train]", "latentplan[bench]", "latentplan[hub]", "latentplan[view]"} <= set(EXTRAS["dev"])
 
 
 def test_package_without_extras_needs_four_libraries():
@@ -123,7 +118,10 @@ def test_console_script_exists():
     assert function in [node.name for node in tree.body if isinstance(node, ast.FunctionDef)]
 
 
-@pytest.mark.parametrize("target", ["setup", "train", "test", "test-all", "check", "doctor", "bench", "soak", "docs"])
+TARGETS = ["setup", "train", "test", "test-all", "test-browser", "check", "doctor", "bench", "soak", "docs"]
+
+
+@pytest.mark.parametrize("target", TARGETS)
 def test_make_has_target(target):
     result = subprocess.run(["make", "-n", target], cwd=ROOT, capture_output=True, text=True)
     assert result.returncode == 0, result.stderr

@@ -8,7 +8,6 @@ from types import TracebackType
 from typing import Any
 
 import numpy as np
-import torch
 from torch import Tensor
 
 from latentplan.agents.base import ModelAgent
@@ -111,13 +110,10 @@ class BackgroundAgent(ModelAgent):
         """
         self.scheduler.set_objective(*self._build_goals(objective, constraints, self.scheduler.planner))
 
-    @torch.no_grad()
-    def imagine(self) -> np.ndarray | None:
-        """The decoded last state of the first environment's present plan, uint8 (32, 32, 3); None without a plan."""
+    def plan_actions(self) -> Tensor | None:
+        """What is left of the first environment's present plan, (1, step, action); None without a plan."""
         remaining = self.scheduler.buffer.remaining(self.scheduler.tick - 1)
-        if remaining is None or self.state is None:
-            return None
-        return self._decode_last_state(self.state, remaining)
+        return None if remaining is None else remaining[:1]
 
     def wait_until_ready(self, seconds: float = 60.0) -> bool:
         """Waits until the worker is ready or has failed, at most `seconds`; returns whether the worker is ready."""

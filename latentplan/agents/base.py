@@ -8,6 +8,7 @@ from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 import torch
+from einops import rearrange
 from torch import Tensor
 
 from latentplan.config import Config, UserError
@@ -54,7 +55,7 @@ class Imagined(NamedTuple):
     """Imagined rollouts.
 
     Attributes:
-        pictures: The decoded state after each step, uint8 (rollout, step, height / 2, width / 2, 3).
+        pictures: The decoded state after each step that is shown, uint8 (rollout, shown, height / 2, width / 2, 3).
         rewards: The predicted reward of each step, float32 (rollout, step).
         actions: The action of each step, float32 (rollout, step, action).
     """
@@ -194,9 +195,23 @@ class ModelAgent:
         latent = self._encode_frames(self._check_seen(frame, single)).cpu().numpy()
         return latent[0] if single else latent
 
-    def imagine(self) -> np.ndarray | None:
-        """The decoded last state of the first environment's plan, uint8 (32, 32, 3); None without a plan."""
+    def plan_actions(self) -> Tensor | None:
+        """What is left of the first environment's plan, from the latest action on, (1, step, action); None without."""
         return None
+
+    @torch.no_grad()
+    def imagine(self) -> np.ndarray | None:
+        """The decoded last state of the first environment's plan, uint8 (32, 32, 3); None without a plan.
+
+        Also sets `steps_ahead`.
+        """
+        actions = self.plan_actions()
+        if actions is None or self.state is None:
+            return None
+        first = State(*(part[:1] for part in first_turn(self.state)))
+        self.steps_ahead = actions.shape[1]
+        _, last = self.model.rollout(first, actions.to(first.deter.dtype))
+        return self.model.decoder.picture(last.features.float())[0].cpu().numpy()
 
     @torch.no_grad()
     def actor_action(self) -> np.ndarray:
@@ -216,26 +231,37 @@ class ModelAgent:
         return State(*(part[:1].float() for part in first_turn(self.state)))
 
     @torch.no_grad()
-    def imagine_along(self, beliefs: Sequence[State], actions: np.ndarray | None, steps: int) -> Imagined:
+    def imagine_along(
+        self, beliefs: Sequence[State], actions: np.ndarray | None, steps: int, shown: Sequence[int] | None = None
+    ) -> Imagined:
         """Rollouts of the model from beliefs, in pictures.
 
         Args:
             beliefs: Results of `belief`, one for each rollout, or a single one for all of them.
             actions: Actions (rollout, step, action); None lets the actor act in each rollout.
             steps: Model steps.
+            shown: Steps that are decoded, from 0, in order; None decodes all.
         """
         num = len(beliefs) if actions is None else len(actions)
         state = State(*(torch.cat(parts) for parts in zip(*beliefs, strict=True)))
         state = State(*(part.expand(num, -1).contiguous() for part in state))
-        given = None if actions is None else torch.as_tensor(actions, dtype=torch.float32, device=self.model.device)
-        pictures, rewards, taken = [], [], []
+        if actions is None:
+            mode = torch.zeros(num, steps, self.num_actions, device=self.model.device)
+            given = self.model.backend.propose(self.model, state, mode)
+        else:
+            given = torch.as_tensor(actions, dtype=torch.float32, device=self.model.device)
+        features, rewards = [], []
         for step in range(steps):
-            action = self.model.policy(state).float() if given is None else given[:, step]
-            state, reward = self.model.step(state, action)
-            pictures.append(self.model.decoder.picture(state.features.float()).cpu().numpy())
-            rewards.append(reward.float().cpu().numpy())
-            taken.append(action.cpu().numpy())
-        return Imagined(*(np.stack(parts, axis=1) for parts in (pictures, rewards, taken)))
+            state, reward = self.model.fast_step(state, given[:, step])
+            features.append(state.features.float())
+            rewards.append(reward.float())
+        decoded = torch.stack([features[step] for step in (range(steps) if shown is None else shown)], dim=1)
+        pictures = self.model.decoder.picture(rearrange(decoded, "rollout step feature -> (rollout step) feature"))
+        return Imagined(
+            rearrange(pictures.cpu().numpy(), "(rollout step) ... -> rollout step ...", rollout=num),
+            torch.stack(rewards, dim=1).cpu().numpy(),
+            given.cpu().numpy(),
+        )
 
     def _replace_actions(self, actions: np.ndarray) -> np.ndarray:
         """The actions (batch, action), in which rows that are not finite hold the row's last action, or zeros."""
@@ -266,18 +292,6 @@ class ModelAgent:
     def _choose(self, state: State) -> Tensor:
         """The action for a belief, in [-1, 1], (batch, action)."""
         raise AssertionError("a subclass of ModelAgent defines _choose")
-
-    def _decode_last_state(self, state: State, actions: Tensor) -> np.ndarray:
-        """The decoded state after the first environment's plan, uint8 (32, 32, 3); also sets `steps_ahead`.
-
-        Args:
-            state: The belief about each environment.
-            actions: The plan of each environment, (batch, horizon, action).
-        """
-        first = State(*(part[:1] for part in first_turn(state)))
-        self.steps_ahead = actions.shape[1]
-        _, last = self.model.rollout(first, actions[:1].to(first.deter.dtype))
-        return self.model.decoder.picture(last.features.float())[0].cpu().numpy()
 
     def _build_goals(
         self, objective: str | Expression | Term | None, constraints: str | Sequence[Constraint], planner: Planner

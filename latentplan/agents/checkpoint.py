@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +26,15 @@ from latentplan.models import WorldModel
 from latentplan.models.fast import accelerate
 from latentplan.replay.memory import free_memory
 
-__all__ = ["load_agent", "load_model", "read_info", "resolve_checkpoint", "save_checkpoint", "seal_checkpoint"]
+__all__ = [
+    "load_agent",
+    "load_model",
+    "make_loaded_agent",
+    "read_info",
+    "resolve_checkpoint",
+    "save_checkpoint",
+    "seal_checkpoint",
+]
 
 
 def save_checkpoint(folder: Path, model: WorldModel, config: Config, info: dict[str, Any]) -> None:
@@ -120,29 +129,58 @@ def load_agent(path: str | Path, mode: str = "planner", device: str = "cpu", **s
     Raises:
         UserError: The checkpoint, the mode or a setting cannot be used.
     """
-    if mode not in MODES:
-        raise UserError(f"mode must be one of {', '.join(MODES)}, got {shown(mode)}")
-    entry = MODES[mode]
-    options = {name: settings.pop(name) for name in entry.options if name in settings}
-    if settings and not entry.plans:
-        raise UserError(f"{next(iter(settings))} has no effect in mode {mode}: it does not plan")
-    model, config, info = load_model(path, device)
-    known = to_dict(config.planner)
-    for name in settings:
-        if name not in known:
-            names = (*known, *entry.options)
-            raise UserError(f"unknown planner setting {name!r}{suggestion(name, {key: key for key in names})}")
-    try:
-        planner = PlannerConfig(**override_planner(known, settings))
-        if entry.plans:
-            check_parts([estimate_search(planner, config.model, device != "cpu")], free_memory())
-        agent = make_agent(mode, model, config, info["discount"], planner=planner, **options)
-    except (TypeError, ValueError) as error:
-        raise UserError(f"planner settings: {error}") from None
+    _check_mode(mode, settings)  # before the weights are read
+    agent = make_loaded_agent(*load_model(path, device), mode, **settings)
     wait_until_ready = getattr(agent, "wait_until_ready", None)
     if wait_until_ready is not None:
         wait_until_ready()  # without a ready worker, the actor alone would decide in the first episode
     return agent
+
+
+def make_loaded_agent(
+    model: WorldModel, config: Config, info: Mapping[str, Any], mode: str = "planner", **settings: Any
+) -> Agent:
+    """An agent that acts with a model which `load_model` returned; several agents may share the model.
+
+    Args:
+        model: The world model.
+        config: The settings of its run.
+        info: The description of its checkpoint.
+        mode: As for `load_agent`; the worker of a `background` agent may not be ready yet.
+        **settings: As for `load_agent`.
+
+    Raises:
+        UserError: The mode or a setting cannot be used.
+    """
+    options = _check_mode(mode, settings)
+    given = {name: value for name, value in settings.items() if name not in options}
+    known = to_dict(config.planner)
+    for name in given:
+        if name not in known:
+            names = (*known, *MODES[mode].options)
+            raise UserError(f"unknown planner setting {name!r}{suggestion(name, {key: key for key in names})}")
+    try:
+        planner = PlannerConfig(**override_planner(known, given))
+        if MODES[mode].plans:
+            check_parts([estimate_search(planner, config.model, model.device.type != "cpu")], free_memory())
+        return make_agent(mode, model, config, info["discount"], planner=planner, **options)
+    except (TypeError, ValueError) as error:
+        raise UserError(f"planner settings: {error}") from None
+
+
+def _check_mode(mode: str, settings: Mapping[str, Any]) -> dict[str, Any]:
+    """The mode's own options among the settings.
+
+    Raises:
+        UserError: There is no such mode, or it does not plan and has settings of a planner.
+    """
+    if mode not in MODES:
+        raise UserError(f"mode must be one of {', '.join(MODES)}, got {shown(mode)}")
+    options = {name: value for name, value in settings.items() if name in MODES[mode].options}
+    if len(settings) > len(options) and not MODES[mode].plans:
+        first = next(name for name in settings if name not in options)
+        raise UserError(f"{first} has no effect in mode {mode}: it does not plan")
+    return options
 
 
 def _first_not_finite(state: dict[str, torch.Tensor]) -> str | None:

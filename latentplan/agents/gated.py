@@ -114,11 +114,10 @@ class GatedAgent(PlanningAgent):
         """Share of decisions so far at which a search was requested; 0 before the first decision."""
         return self._num_planned / self._num_decisions if self._num_decisions else 0.0
 
-    @torch.no_grad()
-    def imagine(self) -> np.ndarray | None:
-        """The decoded last state of the first environment's plan, uint8 (32, 32, 3); None without a new plan."""
+    def plan_actions(self) -> Tensor | None:
+        """The first environment's plan, (1, horizon, action); None without a new plan."""
         source = self.last_source if isinstance(self.last_source, str) else self.last_source[0]
-        return super().imagine() if source == "plan" else None
+        return super().plan_actions() if source == "plan" else None
 
     def act(self, frame: Seen) -> np.ndarray:
         """The action in [-1, 1], float32 (action,) or (batch, action), for uint8 frame(s); see `ModelAgent.act`."""

@@ -107,12 +107,11 @@ class PlanningAgent(ModelAgent):
         """
         self.controller.set_objective(*self._build_goals(objective, constraints, self.controller.planner))
 
-    @torch.no_grad()
-    def imagine(self) -> np.ndarray | None:
-        """The decoded last state of the first environment's plan, uint8 (32, 32, 3); None where the actor acted."""
-        if self.controller.plan is None or self.state is None or self.was_surprised:
+    def plan_actions(self) -> Tensor | None:
+        """The first environment's plan, (1, horizon, action); None where the actor acted."""
+        if self.controller.plan is None or self.was_surprised:
             return None
-        return self._decode_last_state(self.state, self.controller.plan.actions)
+        return self.controller.plan.actions[:1]
 
     def _choose(self, state: State) -> Tensor:
         with self.model.trunk_precision():

@@ -134,7 +134,7 @@ def run(request: Request) -> int:
     if request.planner:
         check_search(planner, config.model)
     read_durations(request.latency or MEASURED)
-    _check_expressions(request, chosen.domain)
+    check_expressions(request.objective, request.constraint, chosen.domain)
     from latentplan.agents.modes import MODES
     from latentplan.evaluation.clock import VirtualClock, read_latency
     from latentplan.evaluation.timed import load_timed_agent
@@ -186,15 +186,19 @@ def open_env(config: EnvConfig, action_dim: int) -> Any:
     return env
 
 
-def _check_expressions(request: Request, domain: str) -> None:
-    """Refuses an objective or a constraint that is no expression, before torch is imported."""
+def check_expressions(objective: str | None, constraint: str | None, domain: str) -> None:
+    """Refuses an objective or a constraint that is no expression, before torch is imported.
+
+    Raises:
+        UserError: A text is no expression over the domain's quantities.
+    """
     from latentplan.config.quantities import scales
     from latentplan.objectives.parser import parse_constraints, parse_schedule
 
-    if request.objective is not None:
-        parse_schedule(request.objective, scales(domain))
-    if request.constraint is not None:
-        parse_constraints(request.constraint, scales(domain))
+    if objective is not None:
+        parse_schedule(objective, scales(domain))
+    if constraint is not None:
+        parse_constraints(constraint, scales(domain))
 
 
 def _play_and_report(

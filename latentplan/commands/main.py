@@ -37,6 +37,7 @@ class Command(NamedTuple):
 COMMANDS = {
     "train": Command("latentplan.commands.train", "learn to control a body from pixels, then evaluate and film it"),
     "eval": Command("latentplan.commands.evaluate", "play a trained agent: return, decision latency, film"),
+    "view": Command("latentplan.commands.view", "show an agent at work in the browser, and change its goal meanwhile"),
     "distill": Command("latentplan.commands.distill", "teach a trained agent's actor to act as its planner does"),
     "goals": Command("latentplan.commands.goals", "teach a trained agent to pursue goals that are named later"),
     "runs": Command("latentplan.commands.runs", "list training runs: task, frames, minutes, returns and state"),

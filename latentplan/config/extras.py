@@ -13,6 +13,8 @@ EXTRAS = {
         *("shtab", "tensorboard", "yaml"),
     ),
     "bench": ("rliable",),
+    "view": ("starlette", "uvicorn", "websockets", "plotly"),
+    "browser": ("playwright",),
     "jax": ("jax",),
     "gymnasium": ("imageio", "pygame"),
     "robotics": ("gymnasium_robotics",),

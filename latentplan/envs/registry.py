@@ -19,6 +19,7 @@ optional; each of them enables one feature:
                             `info["vectors"]` then holds the numbers that the agent sees beside the frame, if any
     labels                  scale of each named quantity; `info["labels"]` then holds the values, float32 (label,)
     render_large(size)      a larger picture, uint8 (size, size, 3), for films
+    push(force), pushed_body, weight    a force on the body in newtons, (3,), for the live view; see `SuiteEnv`
     substeps_per_decision, step_schedule    actions that change within a decision, for worlds that do not wait
     record_quantities       values after each control step in `info`, for scores of objectives named at test time
 """

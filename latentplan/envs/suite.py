@@ -108,6 +108,29 @@ class SuiteEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         """Positions, velocities and activations of the body, float64 (state,)."""
         return self.physics.get_state()
 
+    @property
+    def pushed_body(self) -> str:
+        """Name of the body that `push` pushes: the first one that can move, such as the torso."""
+        return str(self.physics.model.id2name(self._find_root(), "body"))
+
+    @property
+    def weight(self) -> float:
+        """Weight of everything that moves with that body, in newtons."""
+        model = self.physics.model
+        return float(model.body_subtreemass[self._find_root()] * np.linalg.norm(model.opt.gravity))
+
+    def push(self, force: Sequence[float]) -> None:
+        """Applies a force to the middle of the first body that can move, until the next call or reset.
+
+        Args:
+            force: The force in newtons, along the axes of the world, (3,); zeros end the push.
+        """
+        self.physics.data.xfrc_applied[self._find_root(), :3] = force
+
+    def _find_root(self) -> int:
+        """The first body with a joint."""
+        return int(np.flatnonzero(self.physics.model.body_dofnum)[0])
+
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[np.ndarray, dict[str, Any]]:

@@ -134,11 +134,15 @@ class ScoredEnv(gymnasium.Wrapper[Any, Any, Any, Any]):
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         """Begins an episode, and its score."""
+        self.restart_score()
+        return self.env.reset(seed=seed, options=options)
+
+    def restart_score(self) -> None:
+        """Begins the score and the first objective, as `reset` does, wherever the episode is."""
         self._num_frames = self._num_violated = 0
         self._totals = np.zeros(len(self._names))
         self.objective_scores, self.clauses, self._reported_phase = [], [], None
         self._report_objective()
-        return self.env.reset(seed=seed, options=options)
 
     def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
         """Steps the environment and scores each of its control steps."""

@@ -17,7 +17,7 @@ from latentplan.reporting.frame import Frame
 LARGEST_FILM = 6_000_000
 WIDEST_CARD = 48  # characters of a row in a card of one column
 MEDIA = {".webm": "video/webm", ".mp4": "video/mp4"}
-_TEMPLATE = Path(__file__).with_name("page.html")
+_FOLDER = Path(__file__).parent
 _NUMBER = re.compile(r"[-+]?[\d,.]+( ms| %)?|-")
 
 
@@ -52,8 +52,14 @@ def render_page(title: str, sections: Iterable[Section]) -> str:
                 f'<section id="{anchor}"><h2>{escape(section.name)}</h2><p>{escape(section.intro)}</p>'
                 f'<div class="grid">{grid}</div></section>'
             )
-    template = string.Template(_TEMPLATE.read_text(encoding="utf-8"))
-    return template.substitute(title=escape(title), links="\n".join(links), body="\n".join(bodies))
+    template = string.Template(read_part("page.html"))
+    parts = {"style": read_part("page.css"), "theme": read_part("theme.js")}
+    return template.substitute(title=escape(title), links="\n".join(links), body="\n".join(bodies), **parts)
+
+
+def read_part(name: str) -> str:
+    """The text of a file that pages are made of: `page.html`, `page.css` (the look) or `theme.js` (light and dark)."""
+    return (_FOLDER / name).read_text(encoding="utf-8")
 
 
 def figure(content: str, caption: str) -> str:
@@ -82,9 +88,18 @@ def table(rows: Sequence[Sequence[str]], caption: str = "") -> str:
 
 def picture(frame: Frame, alt: str) -> str:
     """A picture, RGB uint8 (height, width, 3), as PNG whose pixels stay sharp when it is enlarged."""
+    return f'<img class="pixels" alt="{escape(alt)}" src="{data_address(encode_png(frame))}">'
+
+
+def encode_png(frame: Frame) -> bytes:
+    """A picture, RGB uint8 (height, width, 3), as the content of a PNG file."""
     _, png = cv2.imencode(".png", cv2.cvtColor(frame, cv2.COLOR_RGB2BGR))
-    data = base64.b64encode(png.tobytes()).decode()
-    return f'<img class="pixels" alt="{escape(alt)}" src="data:image/png;base64,{data}">'
+    return bytes(png.tobytes())
+
+
+def data_address(png: bytes) -> str:
+    """The content of a PNG file as an address that an `img` shows."""
+    return f"data:image/png;base64,{base64.b64encode(png).decode()}"
 
 
 def film(path: Path, name: str, largest: int = LARGEST_FILM) -> str:

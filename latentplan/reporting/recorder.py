@@ -197,10 +197,10 @@ class EpisodeRecorder:
         self._wanted.pop(0)
         actions = plan.actions[:1].float().cpu().numpy()
         horizon = actions.shape[1]
-        shown = _spread(horizon, NUM_PICTURES)
-        by_plan = self.agent.imagine_along([self._beliefs[-1]], actions, horizon)
-        by_actor = self.agent.imagine_along([self._beliefs[-1]], None, horizon)
-        num_elites = getattr(self._controller.planner, "num_elites", 1)
+        shown = spread(horizon, NUM_PICTURES)
+        by_plan = self.agent.imagine_along([self._beliefs[-1]], actions, horizon, shown)
+        by_actor = self.agent.imagine_along([self._beliefs[-1]], None, horizon, shown)
+        num_elites = getattr(self._controller.planner, "num_best", 1)
         search = [self._read_iteration(each, num_elites, shown) for each in plan.candidates]
         self.recording.inspections.append(
             Inspection(
@@ -208,23 +208,17 @@ class EpisodeRecorder:
                 self._frames[-1],
                 [step + 1 for step in shown],
                 search,
-                by_plan.pictures[0, shown],
-                by_actor.pictures[0, shown],
+                by_plan.pictures[0],
+                by_actor.pictures[0],
                 float(by_plan.rewards.sum()),
                 float(by_actor.rewards.sum()),
             )
         )
 
     def _read_iteration(self, iteration: Any, num_elites: int, shown: Sequence[int]) -> SearchStep:
-        returns = iteration.returns[0].float().cpu().numpy()
-        is_feasible = iteration.is_feasible[0].cpu().numpy()
-        order = np.argsort(np.where(is_feasible & np.isfinite(returns), -returns, np.inf), kind="stable")
-        actions = iteration.actions[0].float().cpu().numpy()
-        best, rest = order[:num_elites], order[num_elites:]
-        elites = actions[best[_spread(len(best), NUM_CANDIDATES // 2)]]
-        others = actions[rest[_spread(len(rest), NUM_CANDIDATES - len(elites))]]
+        others, elites = choose_candidates(iteration, num_elites)
         rows = np.concatenate([elites, others])
-        pictures = self.agent.imagine_along([self._beliefs[-1]], rows, rows.shape[1]).pictures[:, shown]
+        pictures = self.agent.imagine_along([self._beliefs[-1]], rows, rows.shape[1], shown).pictures
         return SearchStep(
             others,
             elites,
@@ -246,7 +240,7 @@ class EpisodeRecorder:
         steps = min(COMPARED_STEPS, len(self._beliefs))
         if not self._has_model or not self.waits or steps < 1:
             return
-        starts = _spread(len(self._beliefs) - steps + 1, NUM_STARTS)
+        starts = spread(len(self._beliefs) - steps + 1, NUM_STARTS)
         actions = np.stack([self.recording.actions[start : start + steps] for start in starts])
         imagined = self.agent.imagine_along([self._beliefs[start] for start in starts], actions, steps)
         real = np.stack([[_shrink(self._frames[start + step + 1]) for step in range(steps)] for start in starts])
@@ -255,15 +249,35 @@ class EpisodeRecorder:
         difference = np.abs(imagined.pictures.astype(np.float32) - real)
         self.recording.picture_error = difference.mean(axis=(2, 3, 4))
         self.recording.reward_error = np.abs(imagined.rewards - rewards).astype(np.float32)
-        shown = _spread(steps, NUM_PICTURES)
-        for row in _spread(len(starts), NUM_STRIPS):
+        shown = spread(steps, NUM_PICTURES)
+        for row in spread(len(starts), NUM_STRIPS):
             steps_shown = [step + 1 for step in shown]
             self.recording.strips.append(
                 Strip(int(starts[row]), steps_shown, real[row][shown], imagined.pictures[row][shown])
             )
 
 
-def _spread(length: int, num: int) -> list[int]:
+def choose_candidates(iteration: Any, num_elites: int) -> tuple[Floats, Floats]:
+    """Some candidates of an iteration of the first environment's search, to be drawn.
+
+    Args:
+        iteration: The iteration; see `latentplan.planning.plan.Iteration`.
+        num_elites: Number of elites of the search.
+
+    Returns:
+        Candidates that are no elites, (sample, horizon, action), and elites, (elite, horizon, action); from the highest
+        predicted return to the lowest.
+    """
+    returns = iteration.returns[0].float().cpu().numpy()
+    is_feasible = iteration.is_feasible[0].cpu().numpy()
+    order = np.argsort(np.where(is_feasible & np.isfinite(returns), -returns, np.inf), kind="stable")
+    actions = iteration.actions[0].float().cpu().numpy()
+    best, rest = order[:num_elites], order[num_elites:]
+    elites = actions[best[spread(len(best), NUM_CANDIDATES // 2)]]
+    return actions[rest[spread(len(rest), NUM_CANDIDATES - len(elites))]], elites
+
+
+def spread(length: int, num: int) -> list[int]:
     """At most `num` whole numbers from 0 to `length - 1`, evenly spaced, with both ends."""
     if length <= 0 or num <= 0:
         return []

@@ -131,7 +131,7 @@ def _returns(data: ReportData) -> list[str]:
         rows.append([each.mode, str(len(each.returns)), f"{np.mean(each.returns):.1f}", interval, *ends])
         lines.append(Line(each.mode, np.arange(1, len(each.returns) + 1), each.returns, style="o"))
     levels = [(f"mean, {each.mode}", float(np.mean(each.returns))) for each in data.returns]
-    labels = Labels("Return of each episode", "episode", "return", levels=levels)
+    labels = Labels("Return of each episode", "episode", "return (sum of rewards)", levels=levels)
     return [table(rows), figure(plot_lines(lines, labels, whole_x=True), "Return of each episode.")]
 
 
@@ -177,7 +177,7 @@ def _decision_times(data: ReportData) -> list[str]:
     rows += [["median", f"{p50:.2f}"], ["95 %", f"{p95:.2f}"], ["99 %", f"{p99:.2f}"]]
     for name, value in data.deadlines_ms.items():
         late = float(np.mean(data.decision_ms > value))
-        rows.append([f"share later than the {name}", f"{late:.1%}"])
+        rows.append([f"share later than the {name}", _percent(late)])
     return [figure(drawn, "Times beyond the right end are counted in the last bar."), table(rows)]
 
 
@@ -190,7 +190,7 @@ def _imagination(recording: Recording) -> list[str]:
         parts.append(figure(picture(grid, f"Camera above imagination. {caption}"), caption))
     errors = (
         (recording.picture_error, "picture error (of 255)", "Mean absolute difference of pictures"),
-        (recording.reward_error, "reward error", "Mean absolute error of the predicted reward"),
+        (recording.reward_error, "reward error (reward per decision)", "Mean absolute error of the predicted reward"),
     )
     for values, label, name in errors:
         if values.size:
@@ -212,7 +212,9 @@ def _search(inspection: Inspection) -> str:
         parts = [picture(pictures, alt)]
         for dimension in range(min(SHOWN_DIMENSIONS, each.mean.shape[1])):
             labels = Labels(
-                f"Iteration {index}: action {dimension + 1} of candidates and elites", "step", f"action {dimension + 1}"
+                f"Iteration {index}: action {dimension + 1} of candidates and elites",
+                "step of the plan",
+                f"action {dimension + 1} (-1 to 1)",
             )
             candidates, elites, mean = (rows[..., dimension] for rows in (each.candidates, each.elites, each.mean))
             parts.append(plot_fan(candidates, elites, mean, labels))
@@ -235,7 +237,8 @@ def _planner_and_actor(recording: Recording) -> list[str]:
             Line("planner", decisions, taken[:, dimension]),
             Line("actor", decisions, actor[:, dimension]),
         ]
-        labels = Labels(f"Action {dimension + 1} of planner and actor", "decision", f"action {dimension + 1}")
+        name = f"action {dimension + 1}"
+        labels = Labels(f"{name.capitalize()} of planner and actor", "decision", f"{name} (-1 to 1)")
         parts.append(figure(plot_lines(lines, labels), labels.alt + "."))
     distance = np.linalg.norm(taken - actor, axis=1)
     labels = Labels("Distance of the planner's action from the actor's", "decision", "distance of actions")
@@ -278,7 +281,9 @@ def _goals(recording: Recording) -> list[str]:
         lines = [Line(text, np.arange(len(met)), np.array(met, float)) for text, met in recording.clauses.items()]
         labels = Labels("Clauses that are met", "decision", "met (1) or not (0)")
         parts.append(figure(plot_lines(lines, labels), labels.alt + "."))
-        rows = [["clause", "met"]] + [[text, f"{np.mean(met):.1%}"] for text, met in recording.clauses.items()]
+        rows = [["clause", "met"]] + [
+            [text, f"{100.0 * np.mean(met):.1f} %"] for text, met in recording.clauses.items()
+        ]
         parts.append(table(rows))
     return parts
 
@@ -306,6 +311,10 @@ def tile(rows: Sequence[Frame]) -> Frame:
             top, left = row * (height + GAP), column * (width + GAP)
             canvas[top : top + height, left : left + width] = each
     return canvas
+
+
+def _percent(share: float | np.floating[Any]) -> str:
+    return f"{100.0 * float(share):.1f} %"
 
 
 def _shown(value: Any) -> str:

@@ -107,7 +107,7 @@ def plot_lines(lines: Sequence[Line], labels: Labels, *, large_x: bool = False, 
         if large_x:
             axes.xaxis.set_major_formatter(EngFormatter(sep=""))
         if whole_x:
-            axes.xaxis.set_major_locator(MaxNLocator(integer=True))
+            axes.xaxis.set_major_locator(MaxNLocator(integer=True, min_n_ticks=1))
 
     return _draw(draw, labels)
 
@@ -123,7 +123,7 @@ def plot_histogram(values: Sequence[tuple[str, ArrayLike]], labels: Labels, bins
 
 
 def plot_fan(candidates: ArrayLike, elites: ArrayLike, mean: ArrayLike, labels: Labels) -> str:
-    """Sequences of one action dimension over the steps of a plan, as SVG.
+    """Sequences of one action dimension over the steps of a plan, from 1, as SVG.
 
     Args:
         candidates: Candidates that are no elites, (sample, horizon).
@@ -134,12 +134,13 @@ def plot_fan(candidates: ArrayLike, elites: ArrayLike, mean: ArrayLike, labels: 
 
     def draw(axes: Axes) -> None:
         for index, (name, rows, alpha) in enumerate((("candidates", candidates, 0.25), ("elites", elites, 0.7))):
-            paths = [list(enumerate(row)) for row in np.asarray(rows)]
+            paths = [list(enumerate(row, start=1)) for row in np.asarray(rows)]
             color = (FAINT, COLORS[0])[index]
             axes.add_collection(LineCollection(paths, colors=color, alpha=alpha, linewidths=0.7, label=name))
-        axes.plot(mean, color=COLORS[1], lw=1.8, label="mean")
+        steps = np.arange(1, len(np.asarray(mean)) + 1)
+        axes.plot(steps, mean, color=COLORS[1], lw=1.8, label="mean")
         axes.set_ylim(-1.08, 1.08)
-        axes.xaxis.set_major_locator(MaxNLocator(integer=True))
+        axes.xaxis.set_major_locator(MaxNLocator(integer=True, min_n_ticks=1))
 
     return _draw(draw, labels)
 
