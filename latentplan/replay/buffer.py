@@ -79,7 +79,7 @@ class Batch(NamedTuple):
 
 
 class Replay:
-    """A ring buffer of rows for each environment, allocated once, and a lane of recorded rows that are never overwritten.
+    """A ring buffer of rows for each environment, allocated once, and a lane of recorded rows that are kept for good.
 
     The rows of a lane are numbered from 0 as they are added; row n lies at place n % size of the lane.
 

@@ -1,14 +1,19 @@
-"""Keeps collected episodes as files."""
+"""Keeps episodes as files: those that a run collects, and those that anything else plays in an environment."""
 
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
+import gymnasium
 import numpy as np
 
 from latentplan.config import EnvConfig, UserError, make_folder
+from latentplan.envs.process import read_facts
 from latentplan.envs.spaces import Actions, Interface
+from latentplan.envs.vector import GuardedEnv
 from latentplan.training.demonstrations.episode_file import list_episode_files, write_episode
+from latentplan.training.demonstrations.fitting import read_interface
 from latentplan.training.demonstrations.recording import RecordedEpisode
 
 
@@ -91,6 +96,43 @@ class EpisodeKeeper:
         write_episode(path, episode, self._interface, self._quantities, self._env)
 
 
+class KeepingEnv(gymnasium.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarray]):
+    """An environment that keeps every episode that ends, whoever acts in it.
+
+    Args:
+        env: An environment of `latentplan.envs.make_env` or `latentplan.envs.wrap_user_env`.
+        folder: Folder of the files; made if needed.
+        config: Settings of the environment.
+
+    Raises:
+        UserError: The folder cannot be made, or holds episodes already.
+    """
+
+    def __init__(self, env: gymnasium.Env[np.ndarray, np.ndarray], folder: Path | str, config: EnvConfig) -> None:
+        super().__init__(env)
+        refuse_used_folder(Path(folder))
+        facts = env.facts if isinstance(env, GuardedEnv) else read_facts(env)
+        self._keeper = EpisodeKeeper(Path(folder), config, read_interface(facts), tuple(facts["labels"] or ()), 1)
+        self._number = 0
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        """Begins an episode; one that has not ended is not kept."""
+        frame, info = self.env.reset(seed=seed, options=options)
+        self._number += 1
+        self._keeper.begin(np.ones(1, bool), frame[None], _known(info))
+        return frame, info
+
+    def step(self, action: np.ndarray) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
+        """Steps the environment, and writes the episode if it has ended."""
+        frame, reward, terminated, truncated, info = self.env.step(action)
+        ends = np.array([terminated])
+        clipped = np.clip(np.asarray(action, np.float32), -1.0, 1.0)
+        self._keeper.add(clipped[None], frame[None], np.array([reward], np.float64), ends, _known(info))
+        if terminated or truncated:
+            self._keeper.write(0, self._number)
+        return frame, reward, bool(terminated), bool(truncated), info
+
+
 def refuse_used_folder(folder: Path) -> None:
     """Refuses a folder that holds episodes of another run.
 
@@ -98,7 +140,13 @@ def refuse_used_folder(folder: Path) -> None:
         UserError: The folder holds episodes.
     """
     if folder.is_dir() and list_episode_files(folder):
-        raise UserError(f"{folder} already holds recorded episodes: choose another --collection.keep_episodes")
+        raise UserError(f"{folder} already holds recorded episodes: choose another folder to keep episodes in")
+
+
+def _known(info: dict[str, Any]) -> np.ndarray | None:
+    """Quantities and vectors of an environment's info, (1, label); None without any."""
+    known = [info[name] for name in ("labels", "vectors") if info.get(name) is not None]
+    return np.concatenate(known)[None] if known else None
 
 
 def _moment(lane: int, frames: np.ndarray, labels: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:

@@ -38,7 +38,7 @@ def _open(path: Path) -> list[Recording]:
     files = list_episode_files(path)
     if not files:
         raise UserError(
-            f"{FLAG}: {path} holds no recorded episodes: neither files *.hdf5 of collection.keep_episodes, nor a Minari "
-            "dataset (data/metadata.json), nor a LeRobot dataset (meta/info.json)"
+            f"{FLAG}: {path} holds no recorded episodes: neither files *.hdf5 of collection.keep_episodes, nor a "
+            "Minari dataset (data/metadata.json), nor a LeRobot dataset (meta/info.json)"
         )
     return [EpisodeFile(file) for file in files]
