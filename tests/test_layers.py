@@ -25,7 +25,7 @@ ROOMS = {
     "evaluation": ((*BELOW_AGENTS, "envs", "agents"), {"numpy", "scipy", "torch", "gymnasium"}),
     "training": (
         (*BELOW_AGENTS, "envs", "agents", "evaluation", "reporting"),
-        {"lightning", "torch", "numpy", "einops", "rich", "tensorboard", "gymnasium", "yaml"},
+        {"lightning", "torch", "numpy", "einops", "rich", "tensorboard", "gymnasium", "yaml", "cv2", "minari"},
     ),
     "view": (
         (*BELOW_AGENTS, "envs", "agents", "evaluation", "reporting"),

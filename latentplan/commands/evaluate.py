@@ -50,6 +50,7 @@ class Request(ComputeRequest):
         video: Film of the first episode, .mp4 or .webm.
         json: Result as JSON.
         report: Page with film, returns, training curves, decision times, imagination and searches.
+        keep_episodes: Folder for the episodes, one HDF5 file each, from which a run can learn.
         control_hz: Decisions per second of a world that goes on while the agent computes; None makes the world wait.
         latency: Time that a decision takes in a world that does not wait: `measured`, or a file of milliseconds.
         seed: Seed of the starts: episode i starts from a state that depends only on the seed and i.
@@ -68,6 +69,7 @@ class Request(ComputeRequest):
     video: Path | None = option(None, metavar="FILE", is_output=True)
     json: Path | None = option(None, metavar="FILE", is_output=True)
     report: Path | None = option(None, metavar="FILE.html", is_output=True)
+    keep_episodes: Path | None = option(None, metavar="DIR")
     control_hz: float | None = None
     latency: str | None = option(None, metavar="measured|FILE")
     seed: int = 0
@@ -88,6 +90,12 @@ class Request(ComputeRequest):
             within(self, planning_budget=(0.0, 1.0))
             if self.mode != "gated":
                 raise UserError(f"--planning-budget has no effect in mode {self.mode}; use --mode gated")
+        if self.keep_episodes is not None:
+            for flag, value in {"--control-hz": self.control_hz, "--objective": self.objective}.items():
+                if value is not None:
+                    raise UserError(
+                        f"--keep-episodes cannot be given with {flag}, which changes its actions or rewards"
+                    )
         if self.latency is not None and self.control_hz is None:
             raise UserError("--latency has no effect in a world that waits; give --control-hz too")
         if self.video is not None:
@@ -150,6 +158,10 @@ def run(request: Request) -> int:
     world = chosen if goals is None else goal_env(chosen)
     env = open_env(world, info["action_dim"])
     try:
+        if request.keep_episodes is not None:
+            from latentplan.training.collection.keeping import KeepingEnv
+
+            env = KeepingEnv(env, request.keep_episodes, world)
         clock = VirtualClock(request.control_hz, latency)
         agent = load_timed_agent(request.checkpoint, request.mode, clock, device, **changes)
         about = _describe(request, info, world, planner, goals)

@@ -9,7 +9,7 @@ from typing import Any
 from latentplan.commands.flags import overrides
 from latentplan.config import Config, UserError
 from latentplan.config.env_id import FLAG, import_named, lay_env
-from latentplan.config.files import Preset, compose, read_layer
+from latentplan.config.files import BUDGETS, Preset, compose, read_layer
 from latentplan.config.parsing import option
 from latentplan.config.run_folder import read_run_config
 
@@ -20,6 +20,7 @@ SHORT_FLAGS = {
     "env.pixels": "--env.pixels",
     "run.frames": "--frames",
     "run.minutes": "--minutes",
+    "run.updates": "--updates",
     "run.device": "--device",
     "run.seed": "--seed",
     "run.run_dir": "--run-dir",
@@ -40,7 +41,7 @@ class Request:
         settings: Settings that were given, by section and name.
     """
 
-    RESUMABLE = ("--frames", "--minutes", "--device", "--env-id")
+    RESUMABLE = ("--frames", "--minutes", "--updates", "--device", "--env-id")
     NOTES = "Values shown are the defaults before configs/<domain>.yaml and the preset are laid over them."
 
     settings: dict[str, Any] = overrides(Config, SHORT_FLAGS)
@@ -87,8 +88,8 @@ def resolve(request: Request) -> Config:
             f"{FLAG} {request.env_id} is not the environment of {request.resume}, which learns in "
             f"{saved.env.domain}-{saved.env.task}; only the same can be given"
         )
-    if "frames" in changes or "minutes" in changes:  # a new budget replaces the saved one, of either kind
-        changes = {"frames": None, "minutes": None, **changes}
+    if set(BUDGETS) & set(changes):  # a new budget replaces the saved one, of any kind
+        changes = dict.fromkeys(BUDGETS) | changes
     try:
         return replace(saved, run=replace(saved.run, **changes))
     except ValueError as error:

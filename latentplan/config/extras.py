@@ -18,6 +18,8 @@ EXTRAS = {
     "jax": ("jax",),
     "gymnasium": ("imageio", "pygame"),
     "robotics": ("gymnasium_robotics",),
+    "data": ("h5py", "minari"),
+    "lerobot": ("pyarrow", "av"),
     "wandb": ("wandb",),
     "trackio": ("trackio",),
     "mlflow": ("mlflow",),

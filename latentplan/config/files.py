@@ -26,6 +26,7 @@ Layer = dict[str, dict[str, Any]]
 
 SECTIONS: dict[str, Any] = {field.name: field.default_factory for field in dataclasses.fields(Config)}
 Preset = Literal["auto", "cpu", "gpu"]
+BUDGETS = ("frames", "minutes", "updates")  # of the section `run`
 DOMAINS = tuple(SUITES[DEFAULT_SUITE].tasks)
 
 
@@ -165,8 +166,8 @@ def _overlay(*layers: Layer) -> Layer:
     merged: Layer = {}
     for layer in layers:
         run = layer.get("run", {})
-        for given, other in (("frames", "minutes"), ("minutes", "frames")):
-            if given in run and other not in run:  # a budget of one kind replaces an earlier budget of the other
+        if given := [name for name in BUDGETS if name in run]:  # budgets replace earlier budgets of other kinds
+            for other in set(BUDGETS) - set(given):
                 merged.get("run", {}).pop(other, None)
         for section, fields in layer.items():
             merged[section] = {**merged.get(section, {}), **fields}

@@ -122,6 +122,10 @@ class CollectionConfig:
             as declared) before the run saves and stops. Each fault cuts one episode short.
         step_timeout_s: Seconds that a reset or a step may take of an environment in a process of its own: of several
             environments, and of one that is not of `dm_control` while `overlap` holds.
+        enabled: Whether the run collects. Without collection it learns from `replay.demonstrations` alone, and plays
+            episodes only to evaluate.
+        keep_episodes: Folder for every collected episode, one HDF5 file each, which `replay.demonstrations` reads;
+            None keeps none. Needs `latentplan[data]`.
     """
 
     behaviour: Behaviour = "both"
@@ -137,6 +141,8 @@ class CollectionConfig:
     overlap: bool = True
     max_restarts: int = 10
     step_timeout_s: float = 60.0
+    enabled: bool = True
+    keep_episodes: str | None = option(None, metavar="DIR")
 
     def __post_init__(self) -> None:
         one_of(self, behaviour=BEHAVIOURS)

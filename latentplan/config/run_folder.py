@@ -60,6 +60,11 @@ def read_run_config(folder: Path) -> tuple[Config, str | None]:
     except (OSError, ValueError) as error:
         reason = error if isinstance(error, UserError) else f"{path} cannot be read"
         return saved, f"{reason}: the settings of the last save take its place"
+    if own.replay.demonstrations != saved.replay.demonstrations:
+        raise UserError(
+            f"replay.demonstrations in {path} cannot change in a run that resumes, whose recorded episodes are in its "
+            f"saves: give {list(saved.replay.demonstrations)} again, or start a new run"
+        )
     changes = [
         f"{section}.{name} from {before!r} to {after!r}"
         for section in SECTIONS

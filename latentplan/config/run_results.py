@@ -42,15 +42,16 @@ def read_evaluations(folder: Path) -> list[Evaluation]:
         UserError: The files of the run are damaged.
     """
     try:
-        found = {each.env_frames: each for each in _read_metrics(folder / METRICS_FILE)}
+        found = {_moment(each): each for each in _read_metrics(folder / METRICS_FILE)}
         if (folder / FINAL_FILE).exists():
             final = json.loads((folder / FINAL_FILE).read_text())
-            found[final["env_frames"]] = Evaluation(*(final[name] for name in Evaluation._fields))
+            last = Evaluation(*(final[name] for name in Evaluation._fields))
+            found[_moment(last)] = last
     except KeyError as error:
         raise UserError(f"the results in {folder} cannot be read: they lack {error}") from None
     except (OSError, ValueError, TypeError) as error:
         raise UserError(f"the results in {folder} cannot be read: {error}") from None
-    return [found[frames] for frames in sorted(found)]
+    return [found[moment] for moment in sorted(found)]
 
 
 def read_log(info: Mapping[str, Any]) -> list[Evaluation]:
@@ -139,6 +140,11 @@ def find_state(folder: Path) -> tuple[StateName, str | None]:
     if state in ("finished", "stopped"):
         return state, None
     return ("finished" if _has_final_evaluation(folder) else "stopped"), None
+
+
+def _moment(evaluation: Evaluation) -> tuple[int, int]:
+    """When a run was evaluated: its frames, or its updates where it has collected none."""
+    return evaluation.env_frames, 0 if evaluation.env_frames else evaluation.updates
 
 
 def _is_whole(entry: Mapping[str, Any]) -> bool:

@@ -124,13 +124,17 @@ class ReplayConfig:
     """The replay buffer.
 
     Attributes:
-        capacity: Decisions kept; None keeps the whole run where its length in frames is known, else 200,000 decisions,
-            and never fewer than a resumed run already holds.
+        capacity: Collected decisions kept; None keeps the whole run where its length in frames is known, else 200,000
+            decisions, and never fewer than a resumed run already holds.
         on_device: Whether frames are stored on the training device instead of in main memory.
+        demonstrations: Recorded episodes that a new run starts with: files and folders of `collection.keep_episodes`,
+            folders of Minari datasets and of LeRobot datasets (v3). They stay in replay for the whole run, beside
+            `capacity`.
     """
 
     capacity: int | None = None
     on_device: bool = False
+    demonstrations: tuple[str, ...] = option((), separator=",", metavar="FILE")
 
     def __post_init__(self) -> None:
         above_zero(self, "capacity")
@@ -165,7 +169,8 @@ class RunConfig:
 
     Attributes:
         frames: Simulator frames to train for, counted before action repeat; None sets no limit.
-        minutes: Minutes of wall clock to train for; None sets no limit. With both, the run ends at the first limit.
+        minutes: Minutes of wall clock to train for; None sets no limit. A run ends at the first limit that it reaches.
+        updates: Updates to train for; None sets no limit.
         seed: Seed of every random stream of the run.
         device: Device to learn on; `auto` takes CUDA where it is usable.
         threads: CPU threads for each half of an update (model and behaviour learn in parallel), in [1, 1024]; None
@@ -180,6 +185,7 @@ class RunConfig:
     device: Device = "auto"
     threads: int | None = None
     run_dir: str | None = None
+    updates: int | None = None
     logger: tuple[str, ...] = option(("tensorboard",), separator=",")
 
     def __post_init__(self) -> None:
@@ -188,7 +194,7 @@ class RunConfig:
             if name not in LOGGERS:
                 raise ValueError(f"logger must be of {', '.join(LOGGERS)}, got {shown(name)}")
         at_least(self, seed=0)
-        above_zero(self, "frames", "minutes")
+        above_zero(self, "frames", "minutes", "updates")
         if self.threads is not None:
             within(self, threads=(1, MAX_THREADS))
 
@@ -199,7 +205,8 @@ class Config:
 
     Raises:
         UserError: Two settings contradict each other: collected episodes shorter than training sequences, a CUDA graph
-            without a replay on the device, or agents that see turned frames without learning from turned frames.
+            without a replay on the device, agents that see turned frames without learning from turned frames, or no
+            collection without demonstrations.
     """
 
     env: EnvConfig = field(default_factory=EnvConfig)
@@ -222,6 +229,23 @@ class Config:
         if self.learning.cuda_graph and not self.replay.on_device:
             why = "a graph reads its sequences from the device; set both, or neither"
             raise UserError(f"learning.cuda_graph needs replay.on_device: {why}")
+        if not self.collection.enabled:
+            self._check_offline()
+
+    def _check_offline(self) -> None:
+        """Refuses settings that have no effect, or are missing, in a run that collects nothing."""
+        if not self.replay.demonstrations:
+            raise UserError(
+                "collection.enabled false needs something else to learn from: name recorded episodes with "
+                "--replay.demonstrations"
+            )
+        if self.run.frames is not None:
+            raise UserError(
+                "run.frames counts collected frames, and collection.enabled false collects none: give --updates or "
+                "--minutes"
+            )
+        if self.collection.keep_episodes is not None:
+            raise UserError("collection.keep_episodes has no effect where collection.enabled is false: leave it out")
 
 
 def to_dict(config: Any) -> dict[str, Any]:

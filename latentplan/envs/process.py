@@ -20,7 +20,7 @@ from latentplan.envs.threads import single_threaded_children
 
 START_SECONDS = 300.0  # for the imports and the first objects of an environment
 CLOSING_SECONDS = 5.0
-ATTRIBUTES = ("observation_space", "action_space", "metadata", "decisions_per_episode", "labels", "spaces")
+ATTRIBUTES = ("observation_space", "action_space", "metadata", "decisions_per_episode", "labels", "spaces", "interface")
 
 Factory = Callable[[], gymnasium.Env[Any, Any]]
 

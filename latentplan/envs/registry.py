@@ -17,6 +17,8 @@ optional; each of them enables one feature:
     spaces                  `latentplan.config.spaces.Spaces`: the shape of frames where it is another, and
                             the numbers of the action that stand for categories
                             `info["vectors"]` then holds the numbers that the agent sees beside the frame, if any
+    interface               `latentplan.envs.spaces.Interface`: names of pictures and vectors, and the action space in
+                            the environment's own units, in which episodes are recorded
     labels                  scale of each named quantity; `info["labels"]` then holds the values, float32 (label,)
     render_large(size)      a larger picture, uint8 (size, size, 3), for films
     push(force), pushed_body, weight    a force on the body in newtons, (3,), for the live view; see `SuiteEnv`

@@ -16,6 +16,7 @@ from latentplan.config import EnvConfig, UserError
 from latentplan.config.spaces import MOST_CATEGORIES, MOST_NUMBERS, Spaces
 from latentplan.envs.faults import check_picture, check_unit_picture, check_vector, take_keys
 
+ONLY_PICTURE = "picture"  # name of the picture of an environment that shows one and no Dict
 CHANNELS = (1, 3, 4)  # gray, RGB, RGB with alpha
 PICTURES = "a picture (height, width, 3), gray or with alpha, of uint8 or of floats in [0, 1]"
 
@@ -38,15 +39,24 @@ class _Numbers:
 
     def value(self, numbers: np.ndarray) -> Any:
         """The value of the space for numbers in [-1, 1], float64 (number,)."""
+        shaped = self.scale(numbers).astype(self.space.dtype).reshape(self.space.shape)
+        return shaped[()] if isinstance(self.space, spaces.Discrete) else shaped
+
+    def scale(self, numbers: np.ndarray) -> np.ndarray:
+        """Numbers in [-1, 1] in the units of the space, float64 (..., number)."""
         part = (np.clip(numbers, -1.0, 1.0) + 1.0) * 0.5
-        scaled = (self.low + part * (self.high - self.low)).clip(self.low, self.high)
-        if not np.issubdtype(self.space.dtype, np.floating):
-            scaled = np.rint(scaled)
         if any(self.choices):
             counts = np.array(self.choices)
-            scaled = self.low + np.minimum(np.floor(part * counts), counts - 1)
-        shaped = scaled.astype(self.space.dtype).reshape(self.space.shape)
-        return shaped[()] if isinstance(self.space, spaces.Discrete) else shaped
+            return self.low + np.minimum(np.floor(part * counts), counts - 1)
+        scaled = (self.low + part * (self.high - self.low)).clip(self.low, self.high)
+        return scaled if np.issubdtype(self.space.dtype, np.floating) else np.rint(scaled)
+
+    def unscale(self, values: np.ndarray) -> np.ndarray:
+        """The inverse of `scale`, float64 (..., number); a choice becomes the middle of its part of the interval."""
+        if any(self.choices):
+            return (2.0 * (values - self.low) + 1.0) / np.array(self.choices) - 1.0
+        width = self.high - self.low
+        return 2.0 * (values - self.low) / np.where(width > 0.0, width, 1.0) - (width > 0.0)
 
 
 class Actions:
@@ -65,12 +75,17 @@ class Actions:
     Attributes:
         dim: Numbers of an action.
         choices: See `Spaces`; empty if all numbers are continuous.
+        bounds: All numbers of the space in its own units: the lowest and the highest value of each, and its categories
+            (0 for a continuous number), float64 (3, own number). These are the numbers of an action, and those of
+            choices of one category.
     """
 
     def __init__(self, space: gymnasium.Space[Any]) -> None:
         self._space = space
         self._parts = list(_read_parts(space, "action_space"))
         choices = [num for part in self._parts for num in part.choices]
+        ends = [np.concatenate([getattr(part, end) for part in self._parts] or [[]]) for end in ("low", "high")]
+        self.bounds = np.stack([*ends, np.array(choices, np.float64)])
         self._is_given = [num != 1 for num in choices]
         self.dim = sum(self._is_given)
         given = tuple(num for num in choices if num != 1)
@@ -85,9 +100,50 @@ class Actions:
         """The value of the space for an action, finite numbers (dim,), clipped to [-1, 1]."""
         numbers = np.zeros(len(self._is_given))
         numbers[self._is_given] = action
-        values = iter(np.split(numbers, np.cumsum([len(part.choices) for part in self._parts])[:-1]))
+        values = iter(self._split(numbers))
         parts = iter([part.value(own) for part, own in zip(self._parts, values, strict=True)])
         return _rebuild(self._space, parts)
+
+    def to_own(self, actions: np.ndarray) -> np.ndarray:
+        """Actions (..., dim) in the units of the space, float64 (..., own number), in the order of `bounds`."""
+        numbers = np.zeros((*actions.shape[:-1], len(self._is_given)))
+        numbers[..., self._is_given] = actions
+        values = zip(self._parts, self._split(numbers), strict=True)
+        return np.concatenate([part.scale(own) for part, own in values], axis=-1)
+
+    def from_own(self, values: np.ndarray) -> np.ndarray:
+        """The inverse of `to_own`: actions in [-1, 1], float32 (..., dim)."""
+        parts = zip(self._parts, self._split(np.asarray(values, np.float64)), strict=True)
+        numbers = np.concatenate([part.unscale(own) for part, own in parts], axis=-1)
+        return numbers[..., self._is_given].clip(-1.0, 1.0).astype(np.float32)
+
+    def flatten(self, values: Any) -> np.ndarray:
+        """Values of the space, nested as the space with the axis of time first, as numbers float64 (time, own number).
+
+        Raises:
+            ValueError: The values do not have the form of the space.
+        """
+        found = list(_leaves(self._space, values))
+        return np.concatenate([np.asarray(leaf, np.float64).reshape(len(leaf), -1) for leaf in found], axis=1)
+
+    def _split(self, numbers: np.ndarray) -> list[np.ndarray]:
+        """Numbers of the whole space (..., own number) as those of its parts."""
+        return np.split(numbers, np.cumsum([len(part.choices) for part in self._parts])[:-1], axis=-1)
+
+
+@dataclass(frozen=True)
+class Interface:
+    """What an environment shows and takes, by its own names and in its own units, as recorded episodes keep it.
+
+    Attributes:
+        pictures: Names of the pictures that lie side by side in a frame, in order.
+        vectors: Names of the vectors beside the frame, in order, and the numbers of each.
+        action_space: The environment's own action space.
+    """
+
+    pictures: tuple[str, ...]
+    vectors: tuple[tuple[str, int], ...]
+    action_space: gymnasium.Space[Any]
 
 
 @dataclass(frozen=True)
@@ -203,6 +259,17 @@ class Observations:
                 f"env.vectors name {vector_dim} numbers, and at most {MOST_NUMBERS} are allowed: name fewer"
             )
         self.spaces = Spaces(frame_size=frame_size, cameras=len(self._pictures), vector_dim=vector_dim)
+
+    @property
+    def pictures(self) -> tuple[str, ...]:
+        """Names of the pictures of a frame, in order; `picture` for the only one of a space that is no Dict."""
+        return tuple(self._keys) or (ONLY_PICTURE,)
+
+    @property
+    def vectors(self) -> tuple[tuple[str, int], ...]:
+        """Names of the vectors, in order, and the numbers of each."""
+        sizes = [math.prod(shape) for shape in self._vector_shapes]
+        return tuple(zip(self._vectors, sizes, strict=True))
 
     def read_vectors(self, observation: Any) -> np.ndarray:
         """The numbers beside the frame, a new float32 array (vector_dim,).
@@ -328,6 +395,25 @@ def _read_box(space: spaces.Box, name: str) -> _Numbers:
         )
     low, high = (np.ravel(bound).astype(np.float64) for bound in (space.low, space.high))
     return _Numbers(space, low, high, (0,) * len(low))
+
+
+def _leaves(space: gymnasium.Space[Any], values: Any) -> Iterator[Any]:
+    """The values of the parts of a space, in the order of `_read_parts`.
+
+    Raises:
+        ValueError: The values do not have the form of the space.
+    """
+    if isinstance(space, spaces.Dict | spaces.Tuple):
+        is_dict = isinstance(space, spaces.Dict)
+        places = list(space.spaces) if is_dict else range(len(space.spaces))
+        if not isinstance(values, dict if is_dict else tuple | list) or len(values) != len(space.spaces):
+            raise ValueError(f"no values of {_describe(space)}")
+        for place in places:
+            if is_dict and place not in values:
+                raise ValueError(f"no values of {_describe(space)}")
+            yield from _leaves(space[place], values[place])
+    else:
+        yield values
 
 
 def _rebuild(space: gymnasium.Space[Any], parts: Iterator[Any]) -> Any:

@@ -18,6 +18,7 @@ from latentplan.config.spaces import Spaces
 from latentplan.envs.gl import explain_gl_errors, require_backend
 from latentplan.envs.registry import default_task
 from latentplan.envs.render import FrameRenderer, draw_floor_behind
+from latentplan.envs.spaces import Interface
 from latentplan.envs.substeps import control_step, split_schedule
 from latentplan.envs.true_quantities import ObjectiveReward, measure, true_values
 
@@ -48,6 +49,7 @@ class SuiteEnv(gymnasium.Env[np.ndarray, np.ndarray]):
             `quantities`, float64 (control step, quantity) in the order of `scales(domain)`, and `rewards`, float64
             (control step,).
         spaces: What the networks have to know of actions and observations.
+        interface: Ids of the cameras, names of the vectors, and the actuators' range.
         labels: Names of the quantities in `info["labels"]`, each with its scale.
         substeps_per_decision: Steps of the simulator per decision: the finest resolution at which actions change.
     """
@@ -72,7 +74,8 @@ class SuiteEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         self._cameras = _check_cameras(self.physics, config)
         self._frame_size = config.frame_size
         self._vectors = config.vectors
-        vector_dim = len(self._measure_vectors()) if self._vectors else 0
+        vectors = tuple((name, len(self._measure_vectors((name,)))) for name in self._vectors)
+        vector_dim = sum(size for _, size in vectors)
         self.spaces = Spaces(frame_size=config.frame_size, cameras=len(self._cameras), vector_dim=vector_dim)
         if config.floor == "endless":
             draw_floor_behind(self.physics)
@@ -97,6 +100,8 @@ class SuiteEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         self._action_high = np.where(bounded, spec.maximum, 1.0)
         self.observation_space = gymnasium.spaces.Box(0, 255, self.spaces.frame_shape, np.uint8)
         self.action_space = gymnasium.spaces.Box(-1.0, 1.0, spec.shape, np.float32)
+        own = gymnasium.spaces.Box(self._action_low, self._action_high, dtype=np.float64)
+        self.interface = Interface(tuple(map(str, self._cameras)), vectors, own)
         self._seed_task(seed)
 
     @property
@@ -232,25 +237,25 @@ class SuiteEnv(gymnasium.Env[np.ndarray, np.ndarray]):
     def _info(self, env_frames: int) -> dict[str, Any]:
         info = {"env_frames": env_frames, "labels": measure(self.domain, self.physics)}
         if self._vectors:
-            info["vectors"] = self._measure_vectors()
+            info["vectors"] = self._measure_vectors(self._vectors)
         if self._recorded:
             quantities, rewards = zip(*self._recorded, strict=True)
             info |= {"quantities": np.stack(quantities), "rewards": np.array(rewards)}
             self._recorded.clear()
         return info
 
-    def _measure_vectors(self) -> np.ndarray:
-        """The parts of the task's observation that the settings name, float32 (number,).
+    def _measure_vectors(self, names: Sequence[str]) -> np.ndarray:
+        """Parts of the task's observation, float32 (number,).
 
         Raises:
             UserError: The task's observation has no such part.
         """
         observed = self._task_env.task.get_observation(self.physics)
         known = {**observed, PROPRIOCEPTION: np.concatenate([np.ravel(value) for value in observed.values()])}
-        for name in self._vectors:
+        for name in names:
             if name not in known:
                 raise UserError(f"env.vectors names {shown(name)}; the task has {', '.join(known)}")
-        return np.concatenate([np.ravel(known[name]) for name in self._vectors]).astype(np.float32)
+        return np.concatenate([np.ravel(known[name]) for name in names]).astype(np.float32)
 
     def _control_step_reward(self, reward: float) -> float:
         """The reward of the latest control step; also recorded, with the quantities, if `record_quantities` is set.

@@ -12,7 +12,7 @@ from gymnasium.error import ResetNeeded
 from latentplan.config import EnvConfig, UserError
 from latentplan.envs.faults import check_reward
 from latentplan.envs.rendered import MODE, RenderedEnv
-from latentplan.envs.spaces import Actions, Observations, accept_spaces, resize
+from latentplan.envs.spaces import Actions, Interface, Observations, accept_spaces, resize
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -92,6 +92,7 @@ class PixelEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         decisions_per_episode: Decisions until the time limit of the environment's spec or of a `TimeLimit` wrapper.
             None without a time limit; then an episode is truncated after `MAX_DECISIONS` decisions.
         spaces: What the networks have to know of actions and observations.
+        interface: What the inner environment shows and takes.
     """
 
     metadata = {"render_modes": ["rgb_array"]}
@@ -109,6 +110,7 @@ class PixelEnv(gymnasium.Env[np.ndarray, np.ndarray]):
             raise UserError(f"action_repeat must be at least 1, got {action_repeat}")
         accepted = accept_spaces(env.observation_space, env.action_space, config)
         self._observations, self._actions, self.spaces = accepted.observations, accepted.actions, accepted.spaces
+        self.interface = Interface(self._observations.pictures, self._observations.vectors, env.action_space)
         self._env = env
         self._first_seed = seed
         self._picture = np.zeros((self.spaces.frame_size, self.spaces.frame_size, 3), dtype=np.uint8)

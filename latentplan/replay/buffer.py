@@ -79,22 +79,28 @@ class Batch(NamedTuple):
 
 
 class Replay:
-    """A ring buffer of rows for each environment, allocated once.
+    """A ring buffer of rows for each environment, allocated once, and a lane of recorded rows that are kept for good.
 
-    The rows of a lane are numbered from 0 as they are added; row n lies at place n % `lane_size` of the lane.
+    The rows of a lane are numbered from 0 as they are added; row n lies at place n % size of the lane.
 
     Attributes:
+        lane_size: Rows of the lane of an environment.
+        num_lanes: Lanes of environments, and the lane of recorded rows, which is the last one, if there is one.
+        sizes: Rows of each lane, int64 (lane,).
+        starts: Place of each lane's first row among the rows of all lanes, int64 (lane,).
+        num_recorded: Rows of the lane of recorded rows; 0 without one.
         first: Number of the oldest row that each lane holds, int64 (lane,).
         written: Number of rows that were added to each lane, int64 (lane,).
 
     Args:
-        capacity: Total number of rows, split evenly over lanes.
+        capacity: Number of collected rows, split evenly over the environments.
         action_dim: Size of the action.
         deter_dim: Size of the stored belief.
         num_lanes: Number of environments, each with a lane of its own.
         device: Device of the rows and of the batches.
         num_labels: Number of quantities that the simulator reports with each frame.
         frame_shape: Shape of a frame.
+        num_recorded: Rows of episodes that were recorded before the run.
 
     Raises:
         UserError: The rows do not fit into nine tenths of the free memory.
@@ -109,10 +115,13 @@ class Replay:
         device: torch.device,
         num_labels: int = 0,
         frame_shape: tuple[int, ...] = FRAME_SHAPE,
+        num_recorded: int = 0,
     ) -> None:
         self.lane_size = -(-capacity // num_lanes)
-        self.num_lanes, self.device = num_lanes, device
-        total = self.lane_size * num_lanes
+        self.num_recorded, self.device = num_recorded, device
+        self.sizes = np.array([self.lane_size] * num_lanes + [num_recorded] * (num_recorded > 0), dtype=np.int64)
+        self.starts = self.sizes.cumsum() - self.sizes
+        self.num_lanes, total = len(self.sizes), int(self.sizes.sum())
         self.num_bytes = count_replay_bytes(total, action_dim, deter_dim, num_labels, math.prod(frame_shape))
         check_memory(self.num_bytes, device)
         self.frames = torch.zeros(total, *frame_shape, dtype=torch.uint8, device=device)
@@ -121,30 +130,35 @@ class Replay:
         self.rewards = torch.zeros(total, device=device)
         self.continues = torch.ones(total, device=device)
         self.labels = torch.zeros(total, num_labels, device=device)
-        self.episode = np.full((num_lanes, self.lane_size), -1, dtype=np.int64)
-        self.is_end = np.zeros((num_lanes, self.lane_size), dtype=bool)  # rows whose action led to a terminal state
-        self.first = np.zeros(num_lanes, dtype=np.int64)
-        self.written = np.zeros(num_lanes, dtype=np.int64)
+        self.episode = np.full(total, -1, dtype=np.int64)
+        self.is_end = np.zeros(total, dtype=bool)  # rows whose action led to a terminal state
+        self.first = np.zeros(self.num_lanes, dtype=np.int64)
+        self.written = np.zeros(self.num_lanes, dtype=np.int64)
 
     def __len__(self) -> int:
         """Number of rows held."""
         return int((self.written - self.first).sum())
 
+    @property
+    def has_recorded_end(self) -> bool:
+        """Whether a recorded episode ended in a terminal state."""
+        return self.num_recorded > 0 and bool(self.is_end[self.starts[-1] :].any())
+
     def add(self, lane: int, rows: Rows) -> None:
         """Appends consecutive rows to a lane; a full lane overwrites its oldest rows."""
         count = len(rows.frames)
-        newest = np.arange(count)[-self.lane_size :]
-        positions = (self.written[lane] + newest) % self.lane_size
+        newest = np.arange(count)[-int(self.sizes[lane]) :]
+        places = self.places(lane, self.written[lane] + newest)
         has_rows = self.written[lane] > self.first[lane]
-        previous = self.episode[lane, (self.written[lane] - 1) % self.lane_size] if has_rows else -1
-        self.episode[lane, positions] = previous + np.cumsum(rows.is_first)[newest]
-        self.is_end[lane, positions] = rows.continues[newest] == 0.0
-        index = torch.as_tensor(positions + lane * self.lane_size, device=self.device)
+        previous = self.episode[self.places(lane, self.written[lane] - 1)] if has_rows else -1
+        self.episode[places] = previous + np.cumsum(rows.is_first)[newest]
+        self.is_end[places] = rows.continues[newest] == 0.0
+        index = torch.as_tensor(places, device=self.device)
         for name in ("frames", *COLUMNS):
             store = getattr(self, name)
             store[index] = torch.as_tensor(getattr(rows, name)[newest], device=self.device).to(store.dtype)
         self.written[lane] += count
-        self.first[lane] = max(self.first[lane], self.written[lane] - self.lane_size)
+        self.first[lane] = max(self.first[lane], self.written[lane] - self.sizes[lane])
 
     def draw(self, batch_size: int, sequence_length: int, rng: np.random.Generator) -> Tensor:
         """Rows of uniformly drawn sequences, (batch, time + 1).
@@ -163,8 +177,7 @@ class Replay:
         """
         lanes, starts = self._draw_starts(batch_size, sequence_length, rng)
         steps = np.arange(sequence_length + 1)
-        positions = (starts[:, None] + steps) % self.lane_size + (lanes * self.lane_size)[:, None]
-        return torch.as_tensor(positions, device=self.device)
+        return torch.as_tensor(self.places(lanes[:, None], starts[:, None] + steps), device=self.device)
 
     def gather(self, rows: Tensor) -> Batch:
         """The sequences at rows (batch, time + 1); no value is read back from the device."""
@@ -197,15 +210,24 @@ class Replay:
 
     def held_rows(self, lane: int) -> Tensor:
         """Rows of this replay that hold a lane's rows, from the oldest to the newest, int64 (n,)."""
-        numbers = torch.arange(int(self.first[lane]), int(self.written[lane]), device=self.device)
-        return numbers % self.lane_size + lane * self.lane_size
+        numbers = np.arange(self.first[lane], self.written[lane])
+        return torch.as_tensor(self.places(lane, numbers), device=self.device)
+
+    def places(self, lanes: Any, numbers: Any) -> Any:
+        """Rows of this replay that hold the rows with some numbers in their lanes.
+
+        Args:
+            lanes: A lane, or lanes that broadcast against the numbers.
+            numbers: Numbers of rows, int64.
+        """
+        return numbers % self.sizes[lanes] + self.starts[lanes]
 
     def _draw_starts(self, count: int, length: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
         """Lane and first position of `count` sequences of `length` decisions, (count,) each."""
         held, oldest = self.written - self.first, self.first
         lanes, starts = np.empty(0, np.int64), np.empty(0, np.int64)
         too_short = f"no episode in replay has sequence_length ({length}) decisions"
-        if self.lane_size <= length:
+        if self.sizes.max() <= length:
             raise UserError(f"{too_short}: raise --replay.capacity")
         if held.max() <= length:
             raise UserError(
@@ -215,10 +237,10 @@ class Replay:
             lane = rng.choice(self.num_lanes, size=2 * count, p=held / held.sum())
             offset = rng.integers(0, held[lane])
             start, num_following = oldest[lane] + offset, held[lane] - offset
-            steps = (start[:, None] + np.arange(length + 1)) % self.lane_size
-            is_same = self.episode[lane[:, None], steps] == self.episode[lane[:, None], steps[:, :1]]
+            steps = self.places(lane[:, None], start[:, None] + np.arange(length + 1))
+            is_same = self.episode[steps] == self.episode[steps[:, :1]]
             last = is_same.cumprod(1).sum(1) - 1  # steps until the last row of the episode, at most the length
-            is_terminal = self.is_end[lane, steps[np.arange(len(last)), last - 1]] & (last > 0)
+            is_terminal = self.is_end[steps[np.arange(len(last)), last - 1]] & (last > 0)
             keep = (last < num_following) & ((last == length) | is_terminal)
             lanes, starts = np.concatenate([lanes, lane[keep]]), np.concatenate([starts, start[keep]])
             if len(starts) >= count:

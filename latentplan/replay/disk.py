@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -49,9 +49,10 @@ class ReplayFiles:
             extents |= log.extents()
         index = torch.cat([replay.held_rows(lane) for lane in range(replay.num_lanes)])
         columns = {name: getattr(replay, name)[index].cpu() for name in COLUMNS}
-        episode = torch.from_numpy(replay.episode).flatten()[index.cpu()]
+        episode = torch.from_numpy(replay.episode)[index.cpu()]
         bounds = {name: torch.from_numpy(getattr(replay, name).copy()) for name in ("first", "written")}
-        torch.save(columns | bounds | {"episode": episode}, part / ROWS_FILE)
+        recorded = {"num_recorded": replay.num_recorded} if replay.num_recorded else {}
+        torch.save(columns | bounds | {"episode": episode} | recorded, part / ROWS_FILE)
         return extents
 
     def read(self, save: Save) -> None:
@@ -71,14 +72,14 @@ class ReplayFiles:
             )
         offset = 0
         for lane, (first, end) in enumerate(zip(saved["first"].tolist(), saved["written"].tolist(), strict=True)):
-            held = min(end - first, replay.lane_size)
+            held = min(end - first, int(replay.sizes[lane]))
             rows = slice(offset + end - first - held, offset + end - first)
             offset += end - first
             replay.first[lane], replay.written[lane] = end - held, end
             index = replay.held_rows(lane)
-            positions = index.cpu().numpy() - lane * replay.lane_size
-            replay.episode[lane, positions] = saved["episode"][rows].numpy()
-            replay.is_end[lane, positions] = saved["continues"][rows].numpy() == 0.0
+            places = index.cpu().numpy()
+            replay.episode[places] = saved["episode"][rows].numpy()
+            replay.is_end[places] = saved["continues"][rows].numpy() == 0.0
             for name in COLUMNS:
                 getattr(replay, name)[index] = saved[name][rows].to(replay.device)
             self._logs[lane].restore(save.logs)
@@ -87,8 +88,8 @@ class ReplayFiles:
     def _blocks(self, lane: int, start: int, end: int) -> Iterator[bytes]:
         replay = self.replay
         for first in range(start, end, ROWS_PER_BLOCK):
-            rows = torch.arange(first, min(first + ROWS_PER_BLOCK, end)) % replay.lane_size + lane * replay.lane_size
-            yield replay.frames[rows.to(replay.device)].cpu().numpy().tobytes()
+            rows = replay.places(lane, np.arange(first, min(first + ROWS_PER_BLOCK, end)))
+            yield replay.frames[torch.as_tensor(rows, device=replay.device)].cpu().numpy().tobytes()
 
     def _read_frames(self, lane: int, start: int, end: int) -> None:
         replay, log, found = self.replay, self._logs[lane], 0
@@ -97,9 +98,9 @@ class ReplayFiles:
             if low >= high:
                 continue
             stored = np.memmap(path, np.uint8, "r", shape=(count, *replay.frames.shape[1:]))
-            rows = torch.arange(low, high) % replay.lane_size + lane * replay.lane_size
+            rows = torch.as_tensor(replay.places(lane, np.arange(low, high)), device=replay.device)
             frames = torch.from_numpy(np.array(stored[low - first : high - first]))
-            replay.frames[rows.to(replay.device)] = frames.to(replay.device)
+            replay.frames[rows] = frames.to(replay.device)
             found += high - low
         if found != end - start:
             raise UserError(f"the logs in {self.folder} are damaged: they must hold {end - start:,} frames")
@@ -110,7 +111,24 @@ def save_replay(replay: Replay, folder: Path, note: Mapping[str, Any]) -> None:
     Saves(folder, "replay", FORMAT).commit(ReplayFiles(folder, replay).write, note)
 
 
-def count_saved(save: Save) -> tuple[int, int]:
-    """Environments of a saved replay, and the largest number of rows that one of them holds."""
+class Counts(NamedTuple):
+    """What a saved replay holds.
+
+    Attributes:
+        num_lanes: Environments.
+        lane_rows: The largest number of rows of one of them.
+        recorded_rows: Rows of episodes that were recorded before the run; 0 without any.
+    """
+
+    num_lanes: int
+    lane_rows: int
+    recorded_rows: int
+
+
+def count_saved(save: Save) -> Counts:
+    """What a saved replay holds, without its frames."""
     saved = read_saved(save.folder / ROWS_FILE, keys=("first", "written"))
-    return len(saved["written"]), int((saved["written"] - saved["first"]).max())
+    recorded = int(saved.get("num_recorded", 0))  # saves of earlier versions lack it
+    rows = (saved["written"] - saved["first"]).tolist()
+    lanes = rows[:-1] if recorded else rows
+    return Counts(len(lanes), max(lanes), recorded)

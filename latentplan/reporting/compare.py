@@ -21,6 +21,7 @@ SEED = "run.seed"
 NUM_POINTS = 60
 MODES = ("planner", "actor")
 CLOCKS = {"env_frames": "frames", "minutes": "minutes"}
+OFFLINE_CLOCKS = {"updates": "updates", "minutes": "minutes"}  # of runs that have collected no frames
 
 
 @dataclass(frozen=True)
@@ -72,7 +73,7 @@ def mean_curve(group: Group, mode: str, clock: str, interval: Interval) -> Line 
     Args:
         group: The runs.
         mode: `planner` or `actor`.
-        clock: `env_frames` or `minutes`.
+        clock: `env_frames`, `updates` or `minutes`.
         interval: Ends of the interval of the mean of a few returns; NaN for one return.
 
     Returns:
@@ -171,14 +172,15 @@ def _curves(groups: Sequence[Group], interval: Interval) -> list[str]:
     """For each task and mode, the curves in frames and in minutes."""
     figures = []
     for task in dict.fromkeys(group.task for group in groups):
+        own = [group for group in groups if group.task == task]
+        has_frames = any(run.env_frames for group in own for run in group.runs)
         for mode in MODES:
-            for clock, unit in CLOCKS.items():
-                own = [group for group in groups if group.task == task]
+            for clock, unit in (CLOCKS if has_frames else OFFLINE_CLOCKS).items():
                 lines = [mean_curve(group, mode, clock, interval) for group in own]
                 drawn = [line for line in lines if line is not None]
                 if drawn:
                     labels = Labels(f"{task}: return of the {mode} against {unit}", unit, f"return of the {mode}")
-                    figures.append(figure(plot_lines(drawn, labels, large_x=clock == "env_frames"), labels.alt))
+                    figures.append(figure(plot_lines(drawn, labels, large_x=clock != "minutes"), labels.alt))
         if known := published_returns_of(task):
             figures.append(table(published_rows(known), f"{task}: published mean returns"))
     return figures

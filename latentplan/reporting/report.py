@@ -27,6 +27,7 @@ GAP = 1
 SHOWN_DIMENSIONS = 2
 NUM_BINS = 40
 CLOCKS = {"env_frames": "frames", "minutes": "minutes"}
+OFFLINE_CLOCKS = {"updates": "updates", "minutes": "minutes"}  # of a run that has collected no frames
 
 
 @dataclass(frozen=True)
@@ -141,13 +142,13 @@ def _training_curves(data: ReportData) -> list[str]:
     if data.evaluations:
         last = data.evaluations[-1].env_frames
         levels = _published_levels(known, last)
-        for clock, unit in CLOCKS.items():
+        for clock, unit in (CLOCKS if last else OFFLINE_CLOCKS).items():
             times = [getattr(each, clock) for each in data.evaluations]
             lines = [
                 Line(mode, times, [getattr(each, mode) for each in data.evaluations]) for mode in ("planner", "actor")
             ]
             labels = Labels(f"Evaluation return against {unit}", unit, "mean return", levels=levels)
-            parts.append(figure(plot_lines(lines, labels, large_x=clock == "env_frames"), labels.alt + "."))
+            parts.append(figure(plot_lines(lines, labels, large_x=clock != "minutes"), labels.alt + "."))
     if known and parts:
         parts.append(table(published_rows(known), f"{data.task}: published mean returns by frames"))
     return parts

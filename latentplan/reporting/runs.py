@@ -68,6 +68,9 @@ class RunSummary:
             left.append(run.minutes - self.minutes)
         if run.frames and self.env_frames:
             left.append(self.minutes * (run.frames / self.env_frames - 1.0))
+        if run.updates and self.evaluations and self.evaluations[-1].updates:
+            last = self.evaluations[-1]
+            left.append(last.minutes * run.updates / last.updates - self.minutes)
         return max(0.0, min(left)) if left else None
 
 
@@ -141,9 +144,10 @@ def format_return(value: float | None) -> str:
 
 
 def format_evaluation(entry: Evaluation) -> str:
-    """An evaluation as one line."""
+    """An evaluation as one line, with the updates of a run that has collected no frames."""
+    clock = f"{entry.env_frames:>9,} frames" if entry.env_frames else f"{entry.updates:>9,} updates"
     return (
-        f"{entry.env_frames:>9,} frames  {entry.minutes:6.1f} min  planner {entry.planner:6.1f}  "
+        f"{clock}  {entry.minutes:6.1f} min  planner {entry.planner:6.1f}  "
         f"actor {entry.actor:6.1f}  difference {entry.planner - entry.actor:+6.1f}"
     )
 

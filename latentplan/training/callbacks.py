@@ -47,7 +47,7 @@ class Collect(lightning.Callback):
         state: Clocks of the run, which this callback advances.
         worker: Collects and evaluates.
         videos: Folder for the films of evaluations.
-        requests: Requests of the save from which the run resumes; empty in a new run.
+        requests: Requests of the save from which the run resumes; None in a new run.
         memory: State of the collector in that save; None in a new run.
 
     Attributes:
@@ -73,7 +73,7 @@ class Collect(lightning.Callback):
         self.memory = memory
         self.is_epoch_over = False
         self.evaluated_weights: dict[str, np.ndarray] = {}
-        self._is_continued = requests is not None
+        self._is_continued = True
         self._earlier_restarts = state.worker_restarts
 
     def on_train_epoch_start(self, trainer: lightning.Trainer, learner: Learner) -> None:  # type: ignore[override]
@@ -107,9 +107,10 @@ class Collect(lightning.Callback):
         """Environments that were made anew after a fault, over the run until its last round that was stored."""
         return 0 if self.memory is None else int(self.memory["restarts"])
 
-    def film_path(self, env_frames: int) -> Path:
-        """Where the film of the evaluation at these frames lies, if it was filmed."""
-        return self.videos / f"{env_frames:09d}.webm"
+    def film_path(self, clocks: Mapping[str, Any]) -> Path:
+        """Where the film of the evaluation at these clocks lies, if it was filmed; named by frames, or by updates."""
+        frames, updates = clocks["env_frames"], clocks["updates"]
+        return self.videos / (f"{frames:09d}.webm" if frames else f"update-{updates:09d}.webm")
 
     def has_requests(self) -> bool:
         """Whether the worker was asked for something and has not answered."""
@@ -126,6 +127,9 @@ class Collect(lightning.Callback):
 
     def continue_requests(self) -> None:
         """Bring the worker to where it was, and make its requests again."""
+        if self.replay.has_recorded_end:
+            self.worker.submit("notice_end")
+            self.worker.result()
         if self.memory is not None:
             self.worker.submit("restore", self.memory)
             self.worker.result()
@@ -152,9 +156,30 @@ class Collect(lightning.Callback):
                 raise
 
     def _start_epoch(self, learner: Learner) -> None:
-        settings, state = self.config.collection, self.state
+        state = self.state
         if self._continue() and state.in_epoch:
             return
+        weights = copy_weights(learner.averaged)
+        if self.config.collection.enabled:
+            self._collect_first(weights)
+        if not state.interrupted:
+            self.store_results()
+        if state.interrupted:
+            return
+        collect = self._next_round()
+        clocks = {"env_frames": state.env_frames, "decisions": state.decisions, "updates": learner.updates}
+        is_due = (collect is not None or not self.config.collection.enabled) and self._is_evaluation_due(clocks)
+        evaluate = clocks | {"minutes": round(state.minutes, 3)} if is_due else None
+        self.requests = {"collect": collect, "evaluate": evaluate, "weights": weights}
+        state.in_epoch, state.epoch_updates = True, 0  # from here on, a resumed run makes these requests again
+        if collect is not None:
+            self._submit_round()
+        if evaluate is not None:
+            self._submit_evaluation()
+
+    def _collect_first(self, weights: dict[str, np.ndarray]) -> None:
+        """Collects the prefill, and the first round after it; a finished run that is extended needs a round too."""
+        settings, state = self.config.collection, self.state
         while (missing := min(settings.prefill_decisions - state.decisions, self._decisions_left())) > 0:
             if self.requests["collect"] is None:
                 arguments = {"behaviour": "random", "decisions": missing, "counter": state.rounds, "goal": None}
@@ -163,24 +188,27 @@ class Collect(lightning.Callback):
             self.store_results()
             if state.interrupted:
                 return
-        weights = copy_weights(learner.averaged)
         has_new_rows = state.rounds != state.learned_rounds  # false when a finished run is extended
         if self.requests["collect"] is None and not has_new_rows:
             self.requests |= {"collect": self._next_round(), "weights": weights}
             self._submit_round()
-        self.store_results()
-        if state.interrupted:
-            return
-        collect = self._next_round()
-        is_due = collect is not None and state.env_frames >= state.next_evaluation
-        clocks = {"env_frames": state.env_frames, "decisions": state.decisions, "updates": learner.updates}
-        evaluate = clocks | {"minutes": round(state.minutes, 3)} if is_due else None
-        self.requests = {"collect": collect, "evaluate": evaluate, "weights": weights}
-        state.in_epoch, state.epoch_updates = True, 0  # from here on, a resumed run makes these requests again
-        if collect is not None:
-            self._submit_round()
-        if evaluate is not None:
-            self._submit_evaluation()
+
+    def _is_evaluation_due(self, clocks: Mapping[str, int]) -> bool:
+        """Whether an evaluation is due at these clocks."""
+        self.state.next_evaluation = min(self.state.next_evaluation, self._evaluation_after(clocks))
+        return self._count_frames(clocks) >= self.state.next_evaluation
+
+    def _evaluation_after(self, clocks: Mapping[str, int]) -> int:
+        """The frames at which the first evaluation after these clocks is due."""
+        every = self.config.evaluation.every_frames
+        return (self._count_frames(clocks) // every + 1) * every
+
+    def _count_frames(self, clocks: Mapping[str, int]) -> int:
+        """Frames collected so far; without collection those that a run collects in the time of as many updates."""
+        collection, repeat = self.config.collection, self.config.env.action_repeat
+        if collection.enabled:
+            return clocks["env_frames"]
+        return int(clocks["updates"] * repeat / collection.updates_per_decision)
 
     def _store_results(self) -> None:
         if self.requests["collect"] is not None:
@@ -194,8 +222,7 @@ class Collect(lightning.Callback):
             entry = clocks | {mode: float(np.mean(values)) for mode, values in returns.items()}
             self.state.evaluations.append(entry)
             # Set only now, so that a resumed run repeats an evaluation that was interrupted.
-            every = self.config.evaluation.every_frames
-            self.state.next_evaluation = (entry["env_frames"] // every + 1) * every
+            self.state.next_evaluation = self._evaluation_after(entry)
             self.requests["evaluate"] = None
 
     def replace_worker(self, error: WorkerEnded) -> None:
@@ -233,10 +260,10 @@ class Collect(lightning.Callback):
         return True
 
     def _next_round(self) -> dict[str, Any] | None:
-        """Arguments of the next round; None if the budget has no frames left."""
+        """Arguments of the next round; None if the budget has no frames left, or the run collects nothing."""
         settings, state = self.config.collection, self.state
         decisions = min(settings.round_decisions, self._decisions_left())
-        if decisions <= 0:
+        if decisions <= 0 or not settings.enabled:
             return None
         behaviour, goal = choose_behaviour(settings, state.rounds, state.env_frames)
         return {"behaviour": behaviour, "decisions": decisions, "counter": state.rounds, "goal": goal}
@@ -251,8 +278,8 @@ class Collect(lightning.Callback):
         self.worker.submit("collect", self.requests["weights"], *self.requests["collect"].values())
 
     def _submit_evaluation(self) -> None:
-        settings, frames = self.config.evaluation, self.requests["evaluate"]["env_frames"]
-        film = self.film_path(frames) if settings.video else None
+        settings = self.config.evaluation
+        film = self.film_path(self.requests["evaluate"]) if settings.video else None
         self.worker.submit("evaluate", settings.episodes, film, self.requests["weights"])
 
     def _store_round(self, collected: Collected) -> EnvironmentFault | None:
@@ -390,10 +417,10 @@ class Record(lightning.Callback):
             returns = {"planner_return": entry["planner"], "actor_return": entry["actor"]}
             difference = {"planner_minus_actor": entry["planner"] - entry["actor"]}
             self._append({name: entry[name] for name in CLOCKS} | returns | difference)
-            self.trackers.log_film(self.collect.film_path(entry["env_frames"]), step=entry["env_frames"])
+            self.trackers.log_film(self.collect.film_path(entry), step=entry["env_frames"] or entry["updates"])
             self.progress.show_evaluation(entry)
         self._num_written_evaluations = len(self.state.evaluations)
 
     def _append(self, row: dict[str, float]) -> None:
-        self.trackers.log(row, step=int(row["env_frames"]))
+        self.trackers.log(row, step=int(row["env_frames"] or row["updates"]))
         self.file.append(row)

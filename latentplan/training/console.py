@@ -54,7 +54,7 @@ class Progress:
             return
         self._rate = (updates - self._last_updates) / (now - self._last_time)
         self._last_time, self._last_updates = now, updates
-        line = self._format_line(state)
+        line = self._format_line(state, updates)
         if self._live is None:
             self.console.print(line)
         else:
@@ -66,12 +66,14 @@ class Progress:
         self._evaluation = f"planner {planner:.0f}, actor {actor:.0f}"
         self.console.print(format_evaluation(Evaluation(*(entry[name] for name in Evaluation._fields))))
 
-    def _format_line(self, state: RunState) -> str:
+    def _format_line(self, state: RunState, updates: int) -> str:
         left = [self.run.minutes - state.minutes] if self.run.minutes else []
         if self.run.frames and state.env_frames:
             left.append(state.minutes * (self.run.frames / state.env_frames - 1.0))
+        if self.run.updates and updates:
+            left.append(state.minutes * (self.run.updates / updates - 1.0))
         parts = [
-            f"{state.env_frames:,} frames",
+            f"{state.env_frames:,} frames" if state.env_frames else f"{updates:,} updates",
             f"{state.minutes:.1f} min",
             f"{self._rate:.1f} updates/s",
             f"episode {self.episode_return:.0f}" if self.episode_return is not None else "",

@@ -19,12 +19,16 @@ UPDATE_S = 1e-3  # of the smallest update
 
 
 def count_replay_rows(config: Config, num_saved: int = 0) -> int:
-    """Rows of the replay: `replay.capacity`, or else enough for everything that the run collects.
+    """Rows of the replay for collection: `replay.capacity`, or else enough for everything that the run collects.
+
+    A run that collects nothing has one row for each environment, so that it may collect when it resumes.
 
     Args:
         config: Settings of the run.
         num_saved: Rows that were saved. Without `replay.capacity` all of them fit.
     """
+    if not config.collection.enabled:
+        return max(config.env.num_envs, num_saved)
     if config.replay.capacity is not None:
         return config.replay.capacity
     if config.run.frames is None:

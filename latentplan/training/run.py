@@ -6,7 +6,6 @@ import contextlib
 import errno
 import json
 import logging
-import math
 import shlex
 import sys
 import uuid
@@ -37,14 +36,16 @@ from latentplan.evaluation.statistics import confidence_interval
 from latentplan.models import WorldModel
 from latentplan.models.fast import accelerate
 from latentplan.replay.buffer import Replay
-from latentplan.replay.disk import ReplayFiles, count_saved
+from latentplan.replay.disk import Counts, ReplayFiles, count_saved
 from latentplan.reporting.report import ReportData, Returns, render_report
 from latentplan.training.callbacks import Collect, Record, copy_weights
 from latentplan.training.checks import check_folder, check_settings
 from latentplan.training.collection.collector import Description, EnvFactory
 from latentplan.training.collection.episodes import Stopped, to_arrays
+from latentplan.training.collection.keeping import refuse_used_folder
 from latentplan.training.collection.process import Worker, WorkerEnded, make_worker
 from latentplan.training.console import Progress
+from latentplan.training.demonstrations.seeding import read_demonstrations, seed_replay
 from latentplan.training.estimates import count_replay_rows
 from latentplan.training.learner.batches import ReplayBatches, ReplayData
 from latentplan.training.learner.curriculum import Curriculum
@@ -101,8 +102,8 @@ def train(config: Config, make_env: EnvFactory | None = None) -> Result:
     Raises:
         UserError: The settings, the environment or the machine do not allow the run.
     """
-    if config.run.frames is None and config.run.minutes is None:
-        raise UserError("a run needs an end: give --frames or --minutes")
+    if config.run.frames is None and config.run.minutes is None and config.run.updates is None:
+        raise UserError("a run needs an end: give --frames, --minutes or --updates")
     domain, task = config.env.domain, config.env.task
     if make_env is not None:
         if config.env.objective is not None:
@@ -120,6 +121,8 @@ def train(config: Config, make_env: EnvFactory | None = None) -> Result:
     check_folder(str(config.run.run_dir))
     folder = Path(str(config.run.run_dir))
     refuse_used(folder, "run", "--run-dir")
+    if config.collection.keep_episodes is not None:
+        refuse_used_folder(Path(config.collection.keep_episodes))
     return _start(config, folder, make_env, resume=False)
 
 
@@ -128,6 +131,7 @@ def resume(
     *,
     frames: int | None = None,
     minutes: float | None = None,
+    updates: int | None = None,
     device: Device | None = None,
     make_env: EnvFactory | None = None,
 ) -> Result:
@@ -138,8 +142,9 @@ def resume(
 
     Args:
         run_dir: Folder of the run.
-        frames: New total budget of frames. If `frames` and `minutes` are both None, the old budget stays.
+        frames: New total budget of frames. If `frames`, `minutes` and `updates` are all None, the old budget stays.
         minutes: New total budget of minutes.
+        updates: New total budget of updates.
         device: New device; None keeps the old device.
         make_env: Makes the user's environment, as for `train`.
 
@@ -158,8 +163,8 @@ def resume(
     if config.env.domain == USER_DOMAIN and make_env is None:
         raise UserError("this run learns in your own environment: resume it from Python, with make_env")
     run = config.run
-    if frames is not None or minutes is not None:
-        run = replace(run, frames=frames, minutes=minutes)
+    if frames is not None or minutes is not None or updates is not None:
+        run = replace(run, frames=frames, minutes=minutes, updates=updates)
     if device is not None:
         run = replace(run, device=device)
     return _start(replace(config, run=run), folder, make_env, resume=True)
@@ -219,6 +224,7 @@ class _Run:
         self.saves = run_saves(folder)
         self.saves.remove_leftovers()
         save = self._find_save() if resume else None
+        self.demonstrations = [] if resume else read_demonstrations(config, make_env)
         self.device = choose_device(config.run)
         self.console = Progress(config.run)
         set_up_torch(config.run.threads or choose_threads(config.collection.overlap), self.device)
@@ -246,14 +252,18 @@ class _Run:
             model = WorldModel(config.model, facts.action_dim, facts.labels, spaces=facts.spaces).to(self.device)
         accelerate(model)
         replay_device = self.device if config.replay.on_device else torch.device("cpu")
+        saved_rows = Counts(0, 0, sum(each.num_rows for each in self.demonstrations))
+        if save is not None:
+            saved_rows = count_saved(save)
         self.replay = Replay(
-            count_replay_rows(config, 0 if save is None else math.prod(count_saved(save))),
+            count_replay_rows(config, saved_rows.num_lanes * saved_rows.lane_rows),
             model.action_dim,
             config.model.deter_dim,
             config.env.num_envs,
             replay_device,
             len(model.labels) + model.spaces.vector_dim,
             model.spaces.frame_shape,
+            saved_rows.recorded_rows,
         )
         self.files = ReplayFiles(self.folder / SAVES_FOLDER, self.replay)
         self.saved, self.state = saved, RunState() if saved is None else saved.state
@@ -265,6 +275,12 @@ class _Run:
             self.files.read(save)
             restore_learner(self.learner, saved.learner, self.folder)
             restore_metrics(save, self.folder)
+        else:
+            seed_replay(self.replay, self.demonstrations)
+        has_seen_end = saved is not None and saved.memory is not None and bool(saved.memory["has_seen_end"])
+        if has_seen_end or self.replay.has_recorded_end:
+            self.worker.submit("notice_end")
+            self.worker.result()
 
     def _interrupt(self, number: int) -> None:
         self.state.interrupted = number
@@ -302,7 +318,7 @@ class _Run:
             save.save_run(trainer, self.learner)  # so that a run that ends before its next save can be resumed
             dump_config(config, self.folder / RUN_FILE)
         try:
-            if is_unfinished := not stop.is_spent():
+            if is_unfinished := not stop.is_spent(self.learner):
                 self._fit(trainer)
             if is_unfinished or collect.has_requests():
                 with contextlib.suppress(Stopped):
@@ -359,8 +375,9 @@ class _Run:
         info = clocks | {"final_evaluation": returns}
         (self.folder / "final.json").write_text(json.dumps(info | summary, indent=1))
         save.save_agent("last", self.learner.averaged, info)
+        done = f"{clocks['env_frames']:,} frames" if clocks["env_frames"] else f"{clocks['updates']:,} updates"
         self.console.console.print(
-            f"trained {clocks['env_frames']:,} frames in {clocks['minutes']:.1f} min: planner "
+            f"trained {done} in {clocks['minutes']:.1f} min: planner "
             f"{summary['planner']:.1f}, actor {summary['actor']:.1f} ({episodes} episodes)"
         )
         best = self.state.best_return
@@ -372,7 +389,7 @@ class _Run:
         self.state.set_minutes(clocks["minutes"])
         save.save_run(trainer, self.learner)
         if self.trackers is not None:
-            self.trackers.log_film(film, step=clocks["env_frames"])
+            self.trackers.log_film(film, step=clocks["env_frames"] or clocks["updates"])
         if page is not None:
             self._write_report(returns, page, film)
         self.console.console.print(f"run folder: {self.folder}")
@@ -439,7 +456,7 @@ class _Run:
             self.console.console.print(f"warning: the best agent so far cannot be read: {error}", soft_wrap=True)
             return float("-inf")
         self.console.console.print(
-            f"evaluating the best agent so far, of {info['env_frames']:,} frames, on the same starts"
+            f"evaluating the best agent so far, of {info['updates']:,} updates, on the same starts"
         )
         mean = float(np.mean(self._evaluate(model, actor=False)["planner"]))
         self.console.console.print(f"its planner earned {mean:.1f}; checkpoints/best is the better of the two")
@@ -450,15 +467,17 @@ class _Run:
         parameters = sum(parameter.numel() for parameter in self.learner.model.parameters())
         budget = [f"{run.frames:,} frames"] if run.frames else []
         budget += [f"{run.minutes:g} minutes"] if run.minutes else []
+        budget += [f"{run.updates:,} updates"] if run.updates else []
         renderer = ", ".join(f"{name} {value}" for name, value in description.renderer.items())
-        rows = self.replay.lane_size * self.replay.num_lanes
+        rows, recorded = int(self.replay.sizes.sum()), self.replay.num_recorded
+        recorded_note = f", {recorded:,} of them recorded" if recorded else ""
         lines = {
             "task": f"{env.domain}-{env.task}, action repeat {env.action_repeat}{self.curriculum.note}",
             **({} if config.env.objective is None else {"objective": config.env.objective}),
             "device": f"{self.device}, {torch.get_num_threads()} threads",
             "renderer": f"{renderer}; {description.render_ms:.1f} ms per frame, quality {config.env.render_quality}",
             "parameters": f"{parameters:,}; discount {description.discount:g}",
-            "replay": f"{self.replay.num_bytes / 2**20:,.0f} MiB for {rows:,} frames",
+            "replay": f"{self.replay.num_bytes / 2**20:,.0f} MiB for {rows:,} frames{recorded_note}",
             "budget": " or ".join(budget),
             "run folder": str(self.folder),
         }

@@ -134,7 +134,8 @@ class Save(lightning.Callback):
         planner = self.config.planner
         if planner.use_continues is None:
             memory = self.collect.memory  # the collector remembers an end that the replay has overwritten
-            planner = replace(planner, use_continues=bool(memory and memory["has_seen_end"]))
+            has_seen_end = bool(memory and memory["has_seen_end"]) or self.files.replay.has_recorded_end
+            planner = replace(planner, use_continues=has_seen_end)
         save_checkpoint(self.folder / "checkpoints" / name, model, replace(self.config, planner=planner), facts)
 
     def clocks(self, learner: Learner) -> dict[str, Any]:
@@ -246,14 +247,16 @@ class Stop(lightning.Callback):
         if self.state.interrupted or self._is_time_spent():
             trainer.should_stop = True
 
-    def on_train_epoch_end(self, trainer: lightning.Trainer, learner: lightning.LightningModule) -> None:
+    def on_train_epoch_end(self, trainer: lightning.Trainer, learner: Learner) -> None:  # type: ignore[override]
         """Stop after the epoch that learned from the last round."""
-        if self.state.interrupted or self.is_spent():
+        if self.state.interrupted or self.is_spent(learner):
             trainer.should_stop = True
 
-    def is_spent(self) -> bool:
-        """Whether the minutes are used up, or the frames are and the learner has learned from all of them."""
-        frames, state = self.run.frames, self.state
+    def is_spent(self, learner: Learner) -> bool:
+        """Whether minutes or updates are used up, or the frames are and the learner has learned from all of them."""
+        frames, updates, state = self.run.frames, self.run.updates, self.state
+        if updates is not None and learner.updates >= updates:
+            return True
         has_learned = not state.in_epoch and state.learned_rounds == state.rounds
         return self._is_time_spent() or (frames is not None and state.env_frames >= frames and has_learned)
 

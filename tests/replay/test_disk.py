@@ -127,7 +127,7 @@ def test_read_keeps_the_newest_rows_in_another_capacity(before, after, tmp_path)
     assert len(loaded) == min(len(replay), after)
     assert_aligned(sample(loaded))
     newest = [entry[2::-1] for entry in NumberedRows(0, (7, 4, 9)).entries[-len(loaded) :]]
-    held = loaded.frames[torch.from_numpy(loaded.episode[0] >= 0)]
+    held = loaded.frames[torch.from_numpy(loaded.episode >= 0)]
     assert sorted(map(tuple, held[:, 0, 0].tolist())) == sorted(newest)
     loaded.add(0, NumberedRows(0, (5,)).rows())
     disk.save()

@@ -36,6 +36,8 @@ from latentplan.replay.buffer import Rows
 from latentplan.reporting.film import filming_if_possible
 from latentplan.reporting.recorder import EpisodeRecorder, GuardedRecorder
 from latentplan.training.collection.episodes import Episodes, Stopped, to_arrays, to_tensors
+from latentplan.training.collection.keeping import EpisodeKeeper
+from latentplan.training.demonstrations.fitting import read_interface
 
 TRIES = 2  # of the environment before a run starts
 FILMED_FRAMES = 250
@@ -89,6 +91,8 @@ class Description:
 class Collector:
     """Acts in `config.env.num_envs` environments to collect experience, and in one more to evaluate.
 
+    With `collection.enabled` false there is only the environment to evaluate in.
+
     Args:
         config: Settings of the run.
         make_user_env: Makes the user's own environment; None makes the suite's task.
@@ -109,20 +113,12 @@ class Collector:
         }
         self._eval_env = make_guarded_env(config.env, self.restarts, make_user_env, **guards)
         try:
-            self.envs = make_vector_env(
-                config.env,
-                config.env.num_envs,
-                config.run.seed,
-                make_user_env,
-                config.collection.episode_decisions,
-                self.restarts,
-                **guards,
-            )
+            self._episodes = self._make_episodes(guards) if config.collection.enabled else None
             facts = self._eval_env.facts
         except BaseException:
             self._eval_env.close()
             raise
-        action_dim = int(np.prod(self.envs.single_action_space.shape or ()))
+        action_dim = int(np.prod(self._eval_env.action_space.shape or ()))
         self._decisions: int | None = facts["decisions_per_episode"]
         self.discount = discount = config.learning.discount or _choose_discount(self._decisions)
         self.labels: dict[str, float] = facts["labels"] or {}
@@ -141,7 +137,6 @@ class Collector:
             mode: make_agent(mode, self.model, config, discount) for mode in ("planner", "actor")
         }
         self._random = RandomAgent(action_dim)
-        self._episodes = Episodes(self.envs, config.run.seed)
         self._frames: np.ndarray | None = None
         self._labels = np.zeros((config.env.num_envs, len(self.labels) + self.spaces.vector_dim), np.float32)
         self._has_ended = np.ones(config.env.num_envs, dtype=bool)
@@ -153,6 +148,21 @@ class Collector:
         self._recorder: GuardedRecorder | None = None
         self._decision_ms = np.zeros(0)
         self.should_stop: Callable[[], bool] = lambda: False
+
+    def _make_episodes(self, guards: dict[str, Any]) -> Episodes:
+        """The environments that collect, and the keeper of their episodes."""
+        config = self.config
+        num_envs, seed, cut = config.env.num_envs, config.run.seed, config.collection.episode_decisions
+        envs = make_vector_env(config.env, num_envs, seed, self._make_user_env, cut, self.restarts, **guards)
+        if config.collection.keep_episodes is None:
+            return Episodes(envs, seed)
+        try:
+            facts, folder = self._eval_env.facts, Path(config.collection.keep_episodes)
+            keeper = EpisodeKeeper(folder, config.env, read_interface(facts), tuple(facts["labels"] or ()), num_envs)
+            return Episodes(envs, seed, keeper)
+        except BaseException:
+            envs.close(timeout=CLOSING_SECONDS)
+            raise
 
     def describe(self) -> Description:
         """Facts of the environment that the learner needs; renders a few frames to time them."""
@@ -241,7 +251,8 @@ class Collector:
         memory = to_tensors(memory)
         self.restarts.count = memory["restarts"]
         if memory["has_seen_end"]:
-            self._notice_end()
+            self.notice_end()
+        assert self._episodes is not None
         frames, labels, is_same = self._episodes.replay(memory["episodes"])
         self._frames, self._returns = frames, memory["returns"].numpy().copy()
         if self._labels.shape[1]:
@@ -257,6 +268,7 @@ class Collector:
         """What `restore` needs, as NumPy arrays and plain values, which pass between processes; None before a start."""
         if self._frames is None:
             return None
+        assert self._episodes is not None
         agent = self._current_agent
         names = {id(own): name for name, own in self._agents.items()}
         memory = {
@@ -328,7 +340,8 @@ class Collector:
 
     def close(self) -> None:
         """Ends simulators and their processes."""
-        self.envs.close(timeout=CLOSING_SECONDS)  # without a timeout, close waits forever for a step that failed
+        if self._episodes is not None:  # without a timeout, close waits forever for a step that failed
+            self._episodes.envs.close(timeout=CLOSING_SECONDS)
         self._eval_env.close()
 
     def _play(self, agent: Any, seeds: Sequence[int], on_step: OnStep | None = None) -> list[Episode]:
@@ -353,6 +366,7 @@ class Collector:
     def _restart_ended(self, agent: ModelAgent | RandomAgent) -> None:
         if not self._has_ended.any():
             return
+        assert self._episodes is not None
         is_new = self._frames is None
         self._frames, info = self._episodes.restart(self._has_ended)
         if not is_new:
@@ -361,7 +375,7 @@ class Collector:
             self._labels[self._has_ended] = np.asarray(info["labels"])[self._has_ended]
         self._returns[self._has_ended] = 0.0
 
-    def _notice_end(self) -> None:
+    def notice_end(self) -> None:
         """Lets all plans weigh rewards by the probability that the episode goes on, unless the settings decide."""
         if self._has_seen_end or self.config.planner.use_continues is not None:
             return
@@ -371,7 +385,7 @@ class Collector:
                 agent.weigh_ends()
 
     def _step(self, agent: ModelAgent | RandomAgent, log: _Log) -> None:
-        assert self._frames is not None
+        assert self._frames is not None and self._episodes is not None
         frames, labels, first = self._frames.copy(), self._labels.copy(), self._has_ended.copy()
         vectors = labels[:, len(self.labels) :]
         actions = agent.act((frames, vectors) if self.spaces.vector_dim else frames)
@@ -381,7 +395,7 @@ class Collector:
         self._check_rewards(rewards, first)
         self._check_frames(frames)
         if terminated.any():
-            self._notice_end()
+            self.notice_end()
         self._has_ended = terminated | truncated
         self._returns += rewards
         if self._labels.shape[1]:

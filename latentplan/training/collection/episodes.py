@@ -11,6 +11,7 @@ import torch
 from gymnasium.vector import VectorEnv
 
 from latentplan.config import derive_seed
+from latentplan.training.collection.keeping import EpisodeKeeper
 
 
 class Stopped(Exception):
@@ -27,10 +28,13 @@ class Episodes:
     Args:
         envs: The environments.
         seed: Seed of the run.
+        keeper: Keeps the episodes that end in `step`; None keeps none. An episode that a fault cut is not kept.
     """
 
-    def __init__(self, envs: VectorEnv[np.ndarray, np.ndarray, Any], seed: int) -> None:
-        self.envs, self.seed = envs, seed
+    def __init__(
+        self, envs: VectorEnv[np.ndarray, np.ndarray, Any], seed: int, keeper: EpisodeKeeper | None = None
+    ) -> None:
+        self.envs, self.seed, self.keeper = envs, seed, keeper
         self._begun = [0] * envs.num_envs  # episodes so far, of each environment
         self._actions: list[list[np.ndarray]] = [[] for _ in range(envs.num_envs)]
         self._is_started = False
@@ -54,7 +58,12 @@ class Episodes:
         """The result of one step of all environments with actions (env, action)."""
         for record, action in zip(self._actions, actions, strict=True):
             record.append(np.array(action))
-        return self.envs.step(actions)
+        result = self._step(actions)
+        if self.keeper is not None:
+            _, _, terminated, truncated, info = result
+            for lane in np.flatnonzero((terminated | truncated) & ~info["failed"]).tolist():
+                self.keeper.write(lane, self._begun[lane])
+        return result
 
     def memory(self, frames: np.ndarray, has_ended: np.ndarray) -> list[dict[str, Any]]:
         """The record of each environment's running episode, for `replay`.
@@ -97,7 +106,7 @@ class Episodes:
                 own[at] if at >= 0 else np.zeros(own.shape[1:], np.float32)
                 for own, at in zip(actions, place, strict=True)
             ]
-            frames, _, terminated, truncated, info = self.envs.step(np.stack(taken))
+            frames, _, terminated, truncated, info = self._step(np.stack(taken))
             self._over = np.asarray(terminated) | np.asarray(truncated)
             is_same &= ~(self._over & (place >= 0))
         self._actions = [list(taken) for taken in actions]
@@ -115,10 +124,19 @@ class Episodes:
     def _reset(self, where: np.ndarray) -> tuple[np.ndarray, dict[str, Any]]:
         seeds: Any = [derive_seed(self.seed, f"episodes {lane}", begun) for lane, begun in enumerate(self._begun)]
         self._over = np.zeros(len(seeds), dtype=bool)
-        if not self._is_started:
-            self._is_started = True
-            return self.envs.reset(seed=seeds)
-        return self.envs.reset(seed=seeds, options={"reset_mask": where})
+        options = {"reset_mask": where} if self._is_started else None
+        self._is_started = True
+        frames, info = self.envs.reset(seed=seeds, options=options)
+        if self.keeper is not None:
+            self.keeper.begin(where, frames, info.get("labels"))
+        return frames, info
+
+    def _step(self, actions: np.ndarray) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
+        """One step of all environments, which the keeper of episodes remembers."""
+        frames, rewards, terminated, truncated, info = self.envs.step(actions)
+        if self.keeper is not None:
+            self.keeper.add(actions, frames, rewards, terminated, info.get("labels"))
+        return frames, rewards, terminated, truncated, info
 
 
 def to_arrays(value: Any) -> Any:

@@ -127,7 +127,7 @@ class GoalLearner:
         self.target = copy.deepcopy(model.goal_heads).requires_grad_(False)
         parameters = [*model.goal_heads.requires_grad_(True).parameters()]
         self.optimizer = torch.optim.Adam(parameters, lr=settings.learning_rate, eps=1e-6, fused=True)
-        rows = torch.from_numpy(replay.episode.reshape(-1) >= 0).nonzero().squeeze(1)
+        rows = torch.from_numpy(replay.episode >= 0).nonzero().squeeze(1)
         self.beliefs = _infer_beliefs(model, replay, rows)
         observed = replay.labels[rows][:, : len(model.goal_names)].to(model.device)
         self.source = BoxSource(observed, model.goal_scales, self._generator("span"))

@@ -93,9 +93,17 @@ def load_replay(save: Save, model: WorldModel) -> Replay:
     Raises:
         UserError: The replay does not fit the model.
     """
-    num_lanes, num_rows = count_saved(save)
-    sizes = (model.action_dim, model.config.deter_dim, num_lanes, torch.device("cpu"), len(model.labels))
-    replay = Replay(num_lanes * num_rows, *sizes, frame_shape=model.spaces.frame_shape)
+    counts = count_saved(save)
+    replay = Replay(
+        max(1, counts.num_lanes * counts.lane_rows),
+        model.action_dim,
+        model.config.deter_dim,
+        counts.num_lanes,
+        torch.device("cpu"),
+        len(model.labels),
+        model.spaces.frame_shape,
+        counts.recorded_rows,
+    )
     ReplayFiles(save.folder.parent, replay).read(save)
     return replay
 
@@ -217,7 +225,12 @@ def play(config: Config, model: WorldModel, decisions: int, seed: int, report: C
     Returns:
         A replay with one row per decision, and one more per episode.
     """
-    single = replace(config, env=replace(config.env, num_envs=1), run=replace(config.run, seed=seed))
+    single = replace(
+        config,
+        env=replace(config.env, num_envs=1),
+        run=replace(config.run, seed=seed),
+        collection=replace(config.collection, enabled=True, keep_episodes=None),
+    )
     size = 2 * (decisions + ROUND_DECISIONS)  # an episode has one row more than decisions
     sizes = (model.action_dim, model.config.deter_dim, 1, torch.device("cpu"), len(model.labels))
     replay = Replay(size, *sizes, frame_shape=model.spaces.frame_shape)
@@ -251,7 +264,7 @@ def describe_box(names: Sequence[str], low: Sequence[float], high: Sequence[floa
 
 def _draw_goal(model: WorldModel, replay: Replay, generator: torch.Generator) -> str:
     """An expression for a random box around the quantities observed so far."""
-    rows = np.flatnonzero(replay.episode.reshape(-1) >= 0)
+    rows = np.flatnonzero(replay.episode >= 0)
     observed = replay.labels[torch.from_numpy(rows)][:, : len(model.goal_names)]
     low, high, _ = BoxSource(observed, model.goal_scales.cpu(), generator).draw(1, generator)
     return describe_box(model.goal_names, low[0].tolist(), high[0].tolist())

@@ -46,7 +46,9 @@ class ReplayBatches(IterableDataset[Batch | Tensor]):
         first = done - state.epoch_updates
         rng = np.random.default_rng(derive_seed(self.config.run.seed, "batches", first))
         takes_rows = isinstance(self.learner, GraphedLearner)
-        for update in range(first, first + self.length):
+        budget = self.config.run.updates
+        end = first + self.length if budget is None else min(first + self.length, max(done, budget))
+        for update in range(first, end):
             rows = self.replay.draw(learning.batch_size, learning.sequence_length, rng)
             if update >= done:
                 yield rows if takes_rows else self.curriculum(self.replay.gather(rows))

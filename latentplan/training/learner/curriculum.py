@@ -28,7 +28,7 @@ class Curriculum(lightning.Callback):
     """Replaces replayed rewards by the rewards of `curriculum_task` in the first `curriculum_frames` frames of a run.
 
     The value head is then reset. Otherwise the old values of states that the agent no longer visits would stay high and
-    attract the agent.
+    attract the agent. A run that collects nothing has no curriculum.
 
     Args:
         config: Settings of the run. Rewards stay unchanged if the curriculum's task is the run's own task or objective.
@@ -44,7 +44,8 @@ class Curriculum(lightning.Callback):
 
     def __init__(self, config: Config, labels: Mapping[str, float], state: RunState) -> None:
         self.state = state
-        self._frames, self._repeat = config.learning.curriculum_frames, config.env.action_repeat
+        self._frames = config.learning.curriculum_frames if config.collection.enabled else 0
+        self._repeat = config.env.action_repeat
         self._terms: tuple[tuple[float, Node], ...] = ()
         self._columns, self.note = {name: column for column, name in enumerate(labels)}, ""
         task = config.learning.curriculum_task

@@ -234,7 +234,7 @@ def test_close_returns_after_a_step_that_failed(two_environments, monkeypatch):
     """Runs last in this file: the environments are closed after it."""
     monkeypatch.setattr("latentplan.training.collection.collector.CLOSING_SECONDS", 0.2)
     two_environments.collect(None, "random", 4, 0)
-    monkeypatch.setattr(two_environments.envs, "_info", lambda *_: 1 / 0)
+    monkeypatch.setattr(two_environments._episodes.envs, "_info", lambda *_: 1 / 0)
     with pytest.raises(ZeroDivisionError):
         two_environments.collect(None, "random", 4, 1)
     two_environments.close()

@@ -1,0 +1,154 @@
+"""Keeps episodes as files: those that a run collects, and those that anything else plays in an environment."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import numpy as np
+
+from latentplan.config import EnvConfig, UserError, make_folder
+from latentplan.envs.process import read_facts
+from latentplan.envs.spaces import Actions, Interface
+from latentplan.envs.vector import GuardedEnv
+from latentplan.training.demonstrations.episode_file import list_episode_files, write_episode
+from latentplan.training.demonstrations.fitting import read_interface
+from latentplan.training.demonstrations.recording import RecordedEpisode
+
+
+class EpisodeKeeper:
+    """Remembers the running episode of each environment, and writes it when it has ended.
+
+    A file is named by the environment and the number of its episode, so that a run which repeats an episode after it
+    was killed writes the same file again.
+
+    Args:
+        folder: Folder of the files; made if needed.
+        env: Settings of the environments.
+        interface: What an environment shows and takes.
+        labels: Names of the true quantities that come with each frame.
+        num_envs: Number of environments.
+
+    Raises:
+        UserError: The folder cannot be made.
+    """
+
+    def __init__(
+        self, folder: Path, env: EnvConfig, interface: Interface, labels: tuple[str, ...], num_envs: int
+    ) -> None:
+        make_folder(folder)
+        self.folder, self._env, self._interface, self._quantities = folder, env, interface, labels
+        self._actions = Actions(interface.action_space)
+        self._moments: list[list[tuple[np.ndarray, np.ndarray]]] = [[] for _ in range(num_envs)]
+        self._decisions: list[list[tuple[np.ndarray, float, bool]]] = [[] for _ in range(num_envs)]
+
+    def begin(self, where: np.ndarray, frames: np.ndarray, labels: np.ndarray | None) -> None:
+        """Begins new episodes.
+
+        Args:
+            where: Environments that were reset, bool (env,).
+            frames: Frames of all environments, uint8 (env, height, width, 3 * camera).
+            labels: Quantities and vectors at these frames, (env, label); None without any.
+        """
+        for lane in np.flatnonzero(where).tolist():
+            self._moments[lane], self._decisions[lane] = [_moment(lane, frames, labels)], []
+
+    def add(
+        self,
+        actions: np.ndarray,
+        frames: np.ndarray,
+        rewards: np.ndarray,
+        terminated: np.ndarray,
+        labels: np.ndarray | None,
+    ) -> None:
+        """Adds one step of every environment: actions (env, action) in [-1, 1], and what they led to."""
+        for lane, decisions in enumerate(self._decisions):
+            decisions.append((np.array(actions[lane]), float(rewards[lane]), bool(terminated[lane])))
+            self._moments[lane].append(_moment(lane, frames, labels))
+
+    def write(self, lane: int, number: int) -> None:
+        """Writes the episode of an environment, which has ended.
+
+        Args:
+            lane: Index of the environment.
+            number: Number of its episode.
+
+        Raises:
+            UserError: The file cannot be written.
+        """
+        frames, labels = (np.stack(part) for part in zip(*self._moments[lane], strict=True))
+        actions, rewards, terminated = zip(*self._decisions[lane], strict=True)
+        pictures = np.split(frames, len(self._interface.pictures), axis=-1)
+        observations = dict(zip(self._interface.pictures, pictures, strict=True))
+        place = len(self._quantities)
+        for name, size in self._interface.vectors:
+            observations[name] = labels[:, place : place + size]
+            place += size
+        episode = RecordedEpisode(
+            observations,
+            self._actions.to_own(np.stack(actions).astype(np.float64)),
+            np.array(rewards, np.float64),
+            terminated[-1],
+            labels[:, : len(self._quantities)] if self._quantities else None,
+        )
+        path = self.folder / f"episode-{lane:03d}-{number:06d}.hdf5"
+        write_episode(path, episode, self._interface, self._quantities, self._env)
+
+
+class KeepingEnv(gymnasium.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarray]):
+    """An environment that keeps every episode that ends, whoever acts in it.
+
+    Args:
+        env: An environment of `latentplan.envs.make_env` or `latentplan.envs.wrap_user_env`.
+        folder: Folder of the files; made if needed.
+        config: Settings of the environment.
+
+    Raises:
+        UserError: The folder cannot be made, or holds episodes already.
+    """
+
+    def __init__(self, env: gymnasium.Env[np.ndarray, np.ndarray], folder: Path | str, config: EnvConfig) -> None:
+        super().__init__(env)
+        refuse_used_folder(Path(folder))
+        facts = env.facts if isinstance(env, GuardedEnv) else read_facts(env)
+        self._keeper = EpisodeKeeper(Path(folder), config, read_interface(facts), tuple(facts["labels"] or ()), 1)
+        self._number = 0
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        """Begins an episode; one that has not ended is not kept."""
+        frame, info = self.env.reset(seed=seed, options=options)
+        self._number += 1
+        self._keeper.begin(np.ones(1, bool), frame[None], _known(info))
+        return frame, info
+
+    def step(self, action: np.ndarray) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
+        """Steps the environment, and writes the episode if it has ended."""
+        frame, reward, terminated, truncated, info = self.env.step(action)
+        ends = np.array([terminated])
+        clipped = np.clip(np.asarray(action, np.float32), -1.0, 1.0)
+        self._keeper.add(clipped[None], frame[None], np.array([reward], np.float64), ends, _known(info))
+        if terminated or truncated:
+            self._keeper.write(0, self._number)
+        return frame, reward, bool(terminated), bool(truncated), info
+
+
+def refuse_used_folder(folder: Path) -> None:
+    """Refuses a folder that holds episodes of another run.
+
+    Raises:
+        UserError: The folder holds episodes.
+    """
+    if folder.is_dir() and list_episode_files(folder):
+        raise UserError(f"{folder} already holds recorded episodes: choose another folder to keep episodes in")
+
+
+def _known(info: dict[str, Any]) -> np.ndarray | None:
+    """Quantities and vectors of an environment's info, (1, label); None without any."""
+    known = [info[name] for name in ("labels", "vectors") if info.get(name) is not None]
+    return np.concatenate(known)[None] if known else None
+
+
+def _moment(lane: int, frames: np.ndarray, labels: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
+    known = np.zeros(0, np.float32) if labels is None else np.array(labels[lane], np.float32)
+    return frames[lane].copy(), known

@@ -1,0 +1,58 @@
+"""Loads recorded episodes into the replay of a new run."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+from latentplan.config import Config
+from latentplan.config.suites import DEFAULT_SUITE
+from latentplan.envs.vector import make_guarded_env
+from latentplan.training.demonstrations.fitting import FittedRecording, fit_all, make_target
+from latentplan.training.demonstrations.opening import open_recordings
+
+if TYPE_CHECKING:
+    from latentplan.replay.buffer import Replay
+    from latentplan.training.collection.collector import EnvFactory
+
+
+def read_demonstrations(config: Config, make_user_env: EnvFactory | None) -> list[FittedRecording]:
+    """The recordings that the settings name, after a check that they fit the run's environment.
+
+    The environment is made once, to ask for its spaces, and closed again.
+
+    Args:
+        config: Settings of the run.
+        make_user_env: Makes the user's own environment; None makes the environment of the settings.
+
+    Raises:
+        UserError: A recording cannot be read, or does not fit.
+    """
+    recordings = open_recordings(config.replay.demonstrations)
+    if not recordings:
+        return []
+    is_foreign = make_user_env is not None or config.env.suite != DEFAULT_SUITE
+    env = make_guarded_env(
+        config.env,
+        None,
+        make_user_env,
+        isolate=config.collection.overlap and is_foreign,
+        step_timeout_s=config.collection.step_timeout_s,
+    )
+    try:
+        target = make_target(config.env, env.facts, config.model.deter_dim)
+    finally:
+        env.close()
+    return fit_all(recordings, target, config.learning.sequence_length)
+
+
+def seed_replay(replay: Replay, recordings: Sequence[FittedRecording]) -> None:
+    """Adds all episodes to the replay's lane of recorded rows, in order.
+
+    Raises:
+        UserError: An episode is damaged.
+    """
+    for recording in recordings:
+        for index, length in enumerate(recording.lengths):
+            if length > 0:
+                replay.add(replay.num_lanes - 1, recording.read(index))

@@ -1,0 +1,142 @@
+"""Kept episodes: the file of an episode holds what the run collected, whole or not at all."""
+
+import json
+import os
+from dataclasses import replace
+
+import h5py
+import numpy as np
+import pytest
+
+from latentplan.config import EnvConfig, UserError
+from latentplan.envs import wrap_user_env
+from latentplan.training.collection.keeping import KeepingEnv
+from latentplan.training.demonstrations.episode_file import EpisodeFile, write_episode
+from latentplan.training.demonstrations.fitting import FittedRecording, fit_all
+from latentplan.training.demonstrations.opening import open_recordings
+from tests.training.demonstrations.recorded import CONFIG, TwoParts, target
+from tests.training.dot import Dot
+
+
+def keep(folder, kind=TwoParts, episodes=2, **settings):
+    """Plays random episodes in an environment that keeps them; returns frames, actions and rewards of the last one."""
+    config = EnvConfig(**{"action_repeat": 1, "domain": "user", "task": "Dot", "vectors": ("place",), **settings})
+    env, rng = KeepingEnv(wrap_user_env(kind(), config.action_repeat, config=config), folder, config), None
+    rng = np.random.default_rng(0)
+    for seed in range(episodes):
+        frames, actions, rewards, is_over = [env.reset(seed=seed)[0]], [], [], False
+        while not is_over:
+            actions.append(rng.uniform(-1, 1, 1).astype(np.float32))
+            frame, reward, terminated, truncated, _ = env.step(actions[-1])
+            frames.append(frame), rewards.append(reward)
+            is_over = terminated or truncated
+    env.reset(seed=9)  # an episode that does not end
+    env.step(actions[-1])
+    return np.stack(frames), np.stack(actions), np.array(rewards)
+
+
+@pytest.fixture
+def folder(tmp_path):
+    keep(tmp_path / "kept")
+    return tmp_path / "kept"
+
+
+def test_kept_episode_returns_as_rows(tmp_path):
+    frames, actions, rewards = keep(tmp_path / "kept")
+    first, second = open_recordings([str(tmp_path / "kept")])
+    assert [path.name for path in (first.path, second.path)] == [f"episode-000-{n:06d}.hdf5" for n in (1, 2)]
+    rows = FittedRecording(second, target(TwoParts, vectors=("place",))).read(0)
+    assert np.array_equal(rows.frames, frames)
+    assert np.allclose(rows.actions[:-1], actions, atol=1e-6)
+    assert np.array_equal(rows.rewards[:-1], rewards.astype(np.float32))
+    assert rows.labels.shape == (21, 1) and rows.continues.all()
+
+
+def test_file_holds_the_units_of_the_environment(folder):
+    with h5py.File(folder / "episode-000-000001.hdf5") as file:
+        assert json.loads(file.attrs["environment"])["task"] == "Dot"
+        assert (file["actions"].attrs["low"], file["actions"].attrs["high"]) == (-2.0, 2.0)
+        assert 1.0 < np.abs(file["actions"][()]).max() <= 2.0
+        assert file["observations/camera"].shape == (21, 64, 64, 3)
+        assert file["truncations"][()].tolist() == [False] * 19 + [True] and not file["terminations"][()].any()
+
+
+def test_same_episode_gives_the_same_file(folder, tmp_path):
+    keep(tmp_path / "again")
+    for name in os.listdir(folder):
+        assert (folder / name).read_bytes() == (tmp_path / "again" / name).read_bytes()
+
+
+def test_environment_of_the_suite_keeps_cameras_quantities_and_the_range_of_its_actuators(tmp_path):
+    from latentplan.envs import make_env
+
+    config = EnvConfig(domain="cartpole", task="balance", action_repeat=100, cameras=("1", "0"), vectors=("velocity",))
+    env = KeepingEnv(make_env(config), tmp_path, config)
+    env.reset(seed=0)
+    for _ in range(10):
+        frame, _, _, _, info = env.step(np.array([0.5], np.float32))
+    env.close()
+    (recording,) = open_recordings([str(tmp_path)])
+    episode = recording.read(0)
+    assert np.array_equal(np.concatenate([episode.observations[name][-1] for name in "10"], axis=2), frame)
+    assert recording.quantities == tuple(env.unwrapped.labels) and np.array_equal(
+        episode.quantities[-1], info["labels"]
+    )
+    assert np.array_equal(episode.observations["velocity"][-1], info["vectors"])
+    assert recording.origin == "dm_control-cartpole-balance" and recording.lengths == [10]
+
+
+def test_write_that_fails_leaves_the_file_before(folder, monkeypatch):
+    path = folder / "episode-000-000001.hdf5"
+    before, episode = path.read_bytes(), EpisodeFile(path).read(0)
+
+    def full(*_):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(os, "fsync", full)
+    with pytest.raises(UserError, match="cannot be written: No space left on device"):
+        write_episode(path, episode, target(TwoParts, vectors=("place",)).interface, (), CONFIG)
+    assert path.read_bytes() == before
+    assert len(open_recordings([str(folder)])) == 2  # the part is not taken for an episode
+
+
+@pytest.mark.parametrize("damage", ["cut", "byte", "entry", "length", "version", "format"])
+def test_damaged_file_is_refused_in_one_line(damage, folder):
+    path = folder / "episode-000-000001.hdf5"
+    content = bytearray(path.read_bytes())
+    with h5py.File(path, "a") as file:
+        place = file["observations/camera"].id.get_chunk_info(0).byte_offset
+        if damage == "entry":
+            del file["rewards"]
+        elif damage == "length":
+            rewards = file["rewards"][:-1]
+            del file["rewards"]
+            file["rewards"] = rewards
+        elif damage in ("version", "format"):
+            file.attrs[damage] = 99
+    if damage in ("cut", "byte"):
+        content[place + 20] ^= 1
+        path.write_bytes(content if damage == "byte" else content[:place])
+    with pytest.raises(UserError, match="damaged|update it|no episode file") as error:
+        EpisodeFile(path).read(0)
+    assert "\n" not in str(error.value)
+
+
+def test_other_steps_cameras_and_tasks_are_noticed(folder):
+    recordings = open_recordings([str(folder)])
+    aim = target(TwoParts, vectors=("place",))
+    with pytest.raises(UserError, match="give --env.action_repeat 1"):
+        fit_all(recordings, replace(aim, env=replace(aim.env, action_repeat=3)), 5)
+    with pytest.raises(UserError, match="shows camera, and the environment other"):
+        fit_all(recordings, replace(aim, interface=replace(aim.interface, pictures=("other",))), 5)
+    with pytest.raises(UserError, match=r"lacks the quantities that user reports .*\(speed, ...\)"):
+        fit_all(recordings, replace(aim, labels=("speed",)), 5)
+    with pytest.raises(UserError, match=r"no recorded episode has learning.sequence_length \(21\) decisions"):
+        fit_all(recordings, aim, 21)
+    with pytest.warns(RuntimeWarning, match=r"user-Dot, and this run learns dm_control-user-Other: .*\(2 of 2"):
+        fit_all(recordings, replace(aim, env=replace(aim.env, task="Other")), 5)
+
+
+def test_used_folder_is_refused(folder):
+    with pytest.raises(UserError, match="already holds recorded episodes"):
+        KeepingEnv(wrap_user_env(Dot()), folder, CONFIG)
