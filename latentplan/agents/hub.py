@@ -188,7 +188,7 @@ def _choose_files(repo: str, sizes: Mapping[str, int | None]) -> list[str]:
 
 
 def _limited_progress(name: str, largest: int) -> type:
-    """A progress bar of the client that ends a download which goes on beyond the size that was told before.
+    """A progress bar of the client that ends a download that goes on beyond a size.
 
     Args:
         name: Name of the file.

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import hashlib
 import re
+import tempfile
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -34,7 +36,7 @@ class Request(ComputeRequest):
         seed: Seed of the starts: episode i starts from a state that depends only on the seed and i.
         licence: Licence of the agent, by its identifier on the model hub, such as `mit` or `apache-2.0`.
         force: Whether a README.md that this command did not write, or that was edited since, is replaced.
-        env: The environment, in place of the one that the agent learned in.
+        env: The environment, where the agent does not remember it; the card names it.
     """
 
     NOTES = "The card, README.md, and the film, replay.mp4, are written into the folder of the agent."
@@ -61,18 +63,17 @@ def run(request: Request) -> int:
     Raises:
         UserError: The agent cannot be used, or a README.md of another origin is in its folder.
     """
-    import hashlib
-
-    from latentplan.agents.files import CARD, FILM, INFO, read_files
+    from latentplan.agents.files import CARD, FILM, INFO
     from latentplan.agents.info import read_info, read_spaces, resolve_checkpoint
 
     folder = resolve_checkpoint(request.checkpoint)
-    info = read_info(folder)
+    before, info = _checksum(folder), read_info(folder)
     config = saved_config(folder, info)
-    chosen = choose_env(config.env, request.env)
+    chosen = choose_env(config.env, request.env, must_match=True)
     path = output_file(folder / CARD, "--checkpoint")
+    film = None if request.episodes is None else output_file(folder / FILM, "--checkpoint")
     if not request.force:
-        _require_own(path, folder / FILM if request.episodes else None)
+        _require_own(path, film)
     try:
         spaces = read_spaces(info)
     except (TypeError, ValueError) as error:
@@ -81,19 +82,27 @@ def run(request: Request) -> int:
     from latentplan.reporting.card import CardData, recorded_returns, render_card, seal_card
 
     returns = recorded_returns(info, config, confidence_interval)
-    film = None
-    if request.episodes is not None:
-        returns = _measure(request, folder, info, chosen, folder / FILM) + returns
-        film = FILM
-    text = render_card(CardData(info, config, spaces, returns, film, request.licence))
-    card = seal_card(text, hashlib.sha256(read_files(folder, (INFO,))[INFO]).hexdigest())
-    part = path.with_name(f".{path.name}.part")
-    part.write_text(card, encoding="utf-8")
-    part.replace(path)
-    print(f"card: {path}" + (f", film: {folder / FILM}" if film else ""))
+    with tempfile.TemporaryDirectory(prefix=".card.", dir=folder) as made:
+        if film is not None:
+            returns = _measure(request, folder, info, chosen, Path(made) / FILM) + returns
+        text = render_card(CardData(info, config, spaces, returns, film and FILM, request.licence))
+        (Path(made) / CARD).write_text(seal_card(text, before), encoding="utf-8")
+        if _checksum(folder) != before:
+            raise UserError(f"the agent in {folder} was replaced while its card was made: call the command again")
+        if film is not None:
+            (Path(made) / FILM).replace(film)
+        (Path(made) / CARD).replace(path)
+    print(f"card: {path}" + (f", film: {film}" if film else ""))
     if not returns:
         print("the agent remembers no returns of its weights; --episodes 10 measures them for the card")
     return 0
+
+
+def _checksum(folder: Path) -> str:
+    """The checksum of the description of an agent, which holds that of its weights."""
+    from latentplan.agents.files import INFO, read_files
+
+    return hashlib.sha256(read_files(folder, (INFO,))[INFO]).hexdigest()
 
 
 def _require_own(path: Path, film: Path | None) -> None:
@@ -134,6 +143,8 @@ def _measure(request: Request, folder: Path, info: dict[str, Any], chosen: EnvCo
 
     assert request.episodes is not None
     device, found = request.use_device(), []
+    given = "".join(f", env.{name} {value}" for name, value in request.env.items())
+    origin = f"for this card, seed {request.seed}, latentplan {__version__}{given}"
     env = open_env(chosen, info["action_dim"])
     try:
         length = getattr(env.unwrapped, "decisions_per_episode", None) or 0
@@ -144,7 +155,6 @@ def _measure(request: Request, folder: Path, info: dict[str, Any], chosen: EnvCo
                 if mode == "planner":
                     write = stack.enter_context(filming(film, env, agent, every=-(-length // FILM_FRAMES) or 1))
                 result = evaluate_agent(agent, env, request.seed, request.episodes, on_step=write)
-            origin = f"for this card, seed {request.seed}, latentplan {__version__}"
             entry = summarize_returns(mode, result["returns"], confidence_interval, origin, is_measured=True)
             print(f"{mode}: mean return {entry.mean:.1f} of {entry.num_episodes} episodes", flush=True)
             found.append(entry)

@@ -254,7 +254,10 @@ def _task(data: CardData) -> list[str]:
 def _returns(data: CardData) -> list[str]:
     parts = ["## Returns\n"]
     if data.returns:
-        rows = [(each.mode, each.num_episodes, f"{each.mean:.1f}", _ends(each), each.origin) for each in data.returns]
+        rows = [
+            (each.mode, each.num_episodes, f"{each.mean:.1f}", _ends(each), _plain(each.origin))
+            for each in data.returns
+        ]
         parts += [
             _table(["mode", "episodes", "mean return", "95 % interval of the mean", "measured"], rows),
             "All are returns of one agent, from one training run.\n",
@@ -351,7 +354,12 @@ def _block(text: str, language: str = "") -> str:
 def _code(value: Any) -> str:
     """A value of a description as inline code, on one line and without characters that would end code or table."""
     text = " ".join(str(value)[:LONGEST_WORD].split())
-    return f"`{text.replace('`', QUOTE).replace('|', '/')}`"
+    return f"`{_plain(text)}`"
+
+
+def _plain(text: str) -> str:
+    """A text without characters that would end code or the cell of a table."""
+    return text.replace("`", QUOTE).replace("|", "/")
 
 
 def _checksum(text: str) -> str:

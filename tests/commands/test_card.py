@@ -156,3 +156,33 @@ def test_agent_with_its_card_travels_over_the_hub(agent, tmp_path, monkeypatch, 
         path.name: path.read_bytes() for path in agent.iterdir()
     }
     assert run_card(pulled) == 0  # a card that travelled is still known
+
+
+def test_card_leaves_nothing_behind_when_the_agent_is_replaced_meanwhile(agent, capsys, monkeypatch):
+    from latentplan.agents.checkpoint import load_model, save_checkpoint
+    from latentplan.reporting import card
+
+    render = card.render_card
+
+    def render_slowly(data):
+        model, config, info = load_model(agent)
+        save_checkpoint(agent, model, config, info | {"env_frames": 9999})
+        return render(data)
+
+    monkeypatch.setattr(card, "render_card", render_slowly)
+    assert run_card(agent) == 2
+    assert "was replaced while its card was made" in capsys.readouterr().err
+    assert {path.name for path in agent.iterdir()} == {"info.json", "weights.safetensors", "manifest.json"}
+
+
+def test_card_refuses_another_environment_than_the_agent_learned_in(agent, assert_refused):
+    import json
+
+    info = json.loads((agent / "info.json").read_text())
+    info["config"]["env"] |= {"suite": "gymnasium", "domain": "gymnasium", "task": "InvertedPendulum-v5"}
+    (agent / "info.json").write_text(json.dumps(info))
+    (agent / "manifest.json").unlink()
+    assert_refused(
+        ["card", "--checkpoint", agent, "--env-id", "Reacher-v5", "--episodes", 1],
+        "Reacher-v5 is another environment than InvertedPendulum-v5",
+    )
