@@ -191,7 +191,7 @@ def _imagination(recording: Recording) -> list[str]:
         parts.append(figure(picture(grid, f"Camera above imagination. {caption}"), caption))
     errors = (
         (recording.picture_error, "picture error (of 255)", "Mean absolute difference of pictures"),
-        (recording.reward_error, "reward error (reward per decision)", "Mean absolute error of the predicted reward"),
+        (recording.reward_error, "reward error (per decision)", "Mean absolute error of the predicted reward"),
     )
     for values, label, name in errors:
         if values.size:

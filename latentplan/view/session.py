@@ -164,9 +164,13 @@ class Session:
         self._goals: Goals | None = None
         self._world: Any = env
         self._episode, self._is_over, self._push_left = 0, True, 0
+        self._decision, self._total = 0, 0.0
+        self._frame: Any = None
+        self._info: dict[str, Any] = {}
         self.change(settings)
-        if hasattr(self.agent, "wait_until_ready"):
-            self.agent.wait_until_ready()
+        wait_until_ready = getattr(self.agent, "wait_until_ready", None)
+        if wait_until_ready is not None:
+            wait_until_ready()
 
     @property
     def is_planning(self) -> bool:
@@ -255,7 +259,8 @@ class Session:
 
     def present_frame(self) -> Frame:
         """The first picture that the agent saw last, uint8 (height, width, 3)."""
-        return self._frame[..., :3]
+        frame: Frame = self._frame[..., :3]
+        return frame
 
     def close(self) -> None:
         """Ends the agent's processes."""

@@ -84,9 +84,10 @@ def listen(address: str, seconds: float) -> list[dict[str, Any]]:
         seconds: Seconds to listen.
     """
     from websockets.sync.client import connect
+    from websockets.typing import Origin
 
     host, moments, end = address.removeprefix("http://").rstrip("/"), [], time.perf_counter() + seconds
-    with connect(f"ws://{host}/live", origin=f"http://{host}") as socket:  # type: ignore[arg-type]
+    with connect(f"ws://{host}/live", origin=Origin(f"http://{host}")) as socket:
         while time.perf_counter() < end:
             message = json.loads(socket.recv(timeout=60.0))
             if "moment" in message:
