@@ -108,7 +108,7 @@ class EpisodeFile:
             spaces |= {name: gymnasium.spaces.Box(-np.inf, np.inf, parts[name].shape[1:]) for name in self._vectors}
             self.space = name_space(path, gymnasium.spaces.Dict(spaces))
             actions = file["actions"]
-            self.bounds = np.stack([actions.attrs[name] for name in ("low", "high", "categories")])
+            self.bounds: np.ndarray | None = np.stack([actions.attrs[name] for name in ("low", "high", "categories")])
             self.num_numbers, self.lengths = int(actions.shape[1]), [int(actions.shape[0])]
             names = json.loads(file["quantities"].attrs["names"]) if "quantities" in file else ()
             self.quantities = tuple(names)
