@@ -104,7 +104,9 @@ class EpisodeFile:
             self._vectors: list[str] = json.loads(file.attrs["vectors"])
             environment = json.loads(file.attrs["environment"])
             parts = file["observations"]
-            spaces = {name: gymnasium.spaces.Box(0, 255, parts[name].shape[1:], np.uint8) for name in self._pictures}
+            spaces: dict[str, gymnasium.Space[Any]] = {
+                name: gymnasium.spaces.Box(0, 255, parts[name].shape[1:], np.uint8) for name in self._pictures
+            }
             spaces |= {name: gymnasium.spaces.Box(-np.inf, np.inf, parts[name].shape[1:]) for name in self._vectors}
             self.space = name_space(path, gymnasium.spaces.Dict(spaces))
             actions = file["actions"]
