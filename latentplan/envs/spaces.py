@@ -403,15 +403,16 @@ def _leaves(space: gymnasium.Space[Any], values: Any) -> Iterator[Any]:
     Raises:
         ValueError: The values do not have the form of the space.
     """
-    if isinstance(space, spaces.Dict | spaces.Tuple):
-        is_dict = isinstance(space, spaces.Dict)
-        places = list(space.spaces) if is_dict else range(len(space.spaces))
-        if not isinstance(values, dict if is_dict else tuple | list) or len(values) != len(space.spaces):
+    if isinstance(space, spaces.Dict):
+        if not isinstance(values, dict) or set(values) != set(space.spaces):
             raise ValueError(f"no values of {_describe(space)}")
-        for place in places:
-            if is_dict and place not in values:
-                raise ValueError(f"no values of {_describe(space)}")
-            yield from _leaves(space[place], values[place])
+        for key, part in space.spaces.items():
+            yield from _leaves(part, values[key])
+    elif isinstance(space, spaces.Tuple):
+        if not isinstance(values, tuple | list) or len(values) != len(space.spaces):
+            raise ValueError(f"no values of {_describe(space)}")
+        for part, value in zip(space.spaces, values, strict=True):
+            yield from _leaves(part, value)
     else:
         yield values
 

@@ -104,11 +104,13 @@ class EpisodeFile:
             self._vectors: list[str] = json.loads(file.attrs["vectors"])
             environment = json.loads(file.attrs["environment"])
             parts = file["observations"]
-            spaces = {name: gymnasium.spaces.Box(0, 255, parts[name].shape[1:], np.uint8) for name in self._pictures}
+            spaces: dict[str, gymnasium.Space[Any]] = {
+                name: gymnasium.spaces.Box(0, 255, parts[name].shape[1:], np.uint8) for name in self._pictures
+            }
             spaces |= {name: gymnasium.spaces.Box(-np.inf, np.inf, parts[name].shape[1:]) for name in self._vectors}
             self.space = name_space(path, gymnasium.spaces.Dict(spaces))
             actions = file["actions"]
-            self.bounds = np.stack([actions.attrs[name] for name in ("low", "high", "categories")])
+            self.bounds: np.ndarray | None = np.stack([actions.attrs[name] for name in ("low", "high", "categories")])
             self.num_numbers, self.lengths = int(actions.shape[1]), [int(actions.shape[0])]
             names = json.loads(file["quantities"].attrs["names"]) if "quantities" in file else ()
             self.quantities = tuple(names)

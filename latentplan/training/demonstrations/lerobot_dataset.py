@@ -58,7 +58,9 @@ class LeRobotDataset:
                 if key not in features:
                     raise UserError(f"{path} has no {what}: a run learns from datasets with a feature {key!r}")
             shapes = {name: _picture_shape(features[key]["shape"]) for name, key in self._pictures.items()}
-            spaces = {name: gymnasium.spaces.Box(0, 255, shape, np.uint8) for name, shape in shapes.items()}
+            spaces: dict[str, gymnasium.Space[Any]] = {
+                name: gymnasium.spaces.Box(0, 255, shape, np.uint8) for name, shape in shapes.items()
+            }
             sizes = {name: tuple(features[key]["shape"]) for name, key in self._vectors.items()}
             spaces |= {name: gymnasium.spaces.Box(-np.inf, np.inf, size) for name, size in sizes.items()}
             self.space = name_space(path, gymnasium.spaces.Dict(spaces))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol
+from typing import Any, Protocol
 
 import gymnasium
 import numpy as np
@@ -66,7 +66,7 @@ class Recording(Protocol):
         """
 
 
-def name_space(path: Path, space: gymnasium.Space) -> gymnasium.spaces.Dict:
+def name_space(path: Path, space: gymnasium.Space[Any]) -> gymnasium.spaces.Dict:
     """An observation space as a Dict; a picture alone gets the name that it has in an environment.
 
     Raises:
