@@ -85,7 +85,7 @@ def run(request: Request) -> int:
     with tempfile.TemporaryDirectory(prefix=".card.", dir=folder) as made:
         if film is not None:
             returns = _measure(request, folder, info, chosen, Path(made) / FILM) + returns
-        text = render_card(CardData(info, config, spaces, returns, film and FILM, request.licence))
+        text = render_card(CardData(info, config, spaces, returns, None if film is None else FILM, request.licence))
         (Path(made) / CARD).write_text(seal_card(text, before), encoding="utf-8")
         if _checksum(folder) != before:
             raise UserError(f"the agent in {folder} was replaced while its card was made: call the command again")
