@@ -72,8 +72,7 @@ def run(request: Request) -> int:
     chosen = choose_env(config.env, request.env, must_match=True)
     path = output_file(folder / CARD, "--checkpoint")
     film = None if request.episodes is None else output_file(folder / FILM, "--checkpoint")
-    if not request.force:
-        _require_own(path, film)
+    earlier = "" if request.force else _read_own(path, folder / FILM, film is not None)
     try:
         spaces = read_spaces(info)
     except (TypeError, ValueError) as error:
@@ -91,6 +90,8 @@ def run(request: Request) -> int:
             raise UserError(f"the agent in {folder} was replaced while its card was made: call the command again")
         if film is not None:
             (Path(made) / FILM).replace(film)
+        elif _names_film(earlier):
+            (folder / FILM).unlink(missing_ok=True)  # the card that it belongs to is replaced
         (Path(made) / CARD).replace(path)
     print(f"card: {path}" + (f", film: {film}" if film else ""))
     if not returns:
@@ -105,15 +106,16 @@ def _checksum(folder: Path) -> str:
     return hashlib.sha256(read_files(folder, (INFO,))[INFO]).hexdigest()
 
 
-def _require_own(path: Path, film: Path | None) -> None:
-    """Refuses to replace a card or a film that a person may want to keep.
+def _read_own(path: Path, film: Path, replaces_film: bool) -> str:
+    """The card that this command wrote before, empty without one; refuses what a person may want to keep.
 
     Args:
         path: Path of the card.
-        film: Path of the film, if one will be written.
+        film: Path of the film.
+        replaces_film: Whether a film will be written.
 
     Raises:
-        UserError: One of them exists, and this command did not write it as it is.
+        UserError: The card or the film exists, and this command did not write it as it is.
     """
     from latentplan.reporting.card import read_seal
 
@@ -126,8 +128,15 @@ def _require_own(path: Path, film: Path | None) -> None:
             raise UserError(f"{path} was not written by this command; {remedy}")
         if not seal.is_intact:
             raise UserError(f"{path} was edited since this command wrote it; {remedy}")
-    if film is not None and film.exists() and f"]({film.name})" not in text:
+    if replaces_film and film.exists() and not _names_film(text):
         raise UserError(f"{film} was not written by this command; {remedy}")
+    return text
+
+
+def _names_film(card: str) -> bool:
+    from latentplan.agents.files import FILM
+
+    return f"]({FILM})" in card
 
 
 def _measure(request: Request, folder: Path, info: dict[str, Any], chosen: EnvConfig, film: Path) -> list[CardReturn]:

@@ -56,6 +56,8 @@ def test_measured_card_has_returns_and_a_film_of_the_first_episode(agent, capsys
         assert re.search(rf"value: {re.escape(mean)}\n +name: mean_reward \({mode}, 2 episodes", card)
     assert "[replay.mp4](replay.mp4)" in card
     assert count_frames(agent / "replay.mp4")[0] == 11
+    assert run_card(agent) == 0  # without returns of its own, the card has no film either
+    assert "replay.mp4" not in (agent / "README.md").read_text() and not (agent / "replay.mp4").exists()
 
 
 def test_card_that_was_written_before_is_replaced_and_an_edited_one_is_kept(agent, capsys):
