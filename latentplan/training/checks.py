@@ -29,6 +29,9 @@ def check_settings(config: Config) -> None:
     for name in config.run.logger:
         if name in EXTRAS:
             require_extra(f"the logger {name}", *EXTRAS[name])
+    if config.collection.keep_episodes is not None:
+        check_folder(config.collection.keep_episodes, "--collection.keep_episodes")
+        require_extra("collection.keep_episodes", "h5py")
     env, learning = config.env, config.learning
     check_env_settings(env)
     if env.suite == DEFAULT_SUITE and env.domain != USER_DOMAIN:
@@ -66,19 +69,23 @@ def check_env_settings(env: EnvConfig) -> None:
         raise UserError(f"--env.pixels has no effect in {env.domain}, which always renders: leave it out")
 
 
-def check_folder(run_dir: str) -> None:
+def check_folder(run_dir: str, flag: str = "--run-dir") -> None:
     """Refuses a folder of a run that cannot be made, without making it.
+
+    Args:
+        run_dir: The folder.
+        flag: The flag that names it, for the error.
 
     Raises:
         UserError: The name is empty, or a file is in the way.
         OSError: The name is too long.
     """
     if run_dir == "":
-        raise UserError("--run-dir must name a folder, got an empty text")
+        raise UserError(f"{flag} must name a folder, got an empty text")
     folder = Path(run_dir).absolute()
     existing = next(path for path in (folder, *folder.parents) if path.exists())
     if not existing.is_dir():
-        raise UserError(f"cannot make the folder {run_dir}: {existing} is a file; choose another --run-dir")
+        raise UserError(f"cannot make the folder {run_dir}: {existing} is a file; choose another {flag}")
 
 
 def parse_curriculum_task(text: str, labels: Mapping[str, float]) -> tuple[tuple[float, Node], ...]:

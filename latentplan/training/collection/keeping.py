@@ -9,6 +9,7 @@ import gymnasium
 import numpy as np
 
 from latentplan.config import EnvConfig, UserError, make_folder
+from latentplan.config.extras import require_extra
 from latentplan.envs.process import read_facts
 from latentplan.envs.spaces import Actions, Interface
 from latentplan.envs.vector import GuardedEnv
@@ -37,6 +38,7 @@ class EpisodeKeeper:
     def __init__(
         self, folder: Path, env: EnvConfig, interface: Interface, labels: tuple[str, ...], num_envs: int
     ) -> None:
+        require_extra("keeping episodes", "h5py")
         make_folder(folder)
         self.folder, self._env, self._interface, self._quantities = folder, env, interface, labels
         self._actions = Actions(interface.action_space)

@@ -27,7 +27,11 @@ def open_recordings(names: Iterable[str]) -> list[Recording]:
 
 
 def _open(path: Path) -> list[Recording]:
-    if not path.exists():
+    try:
+        exists = path.exists()
+    except OSError as error:  # such as a name that is too long
+        raise UserError(f"{FLAG} {str(path)!r} cannot be read: {error.strerror}") from None
+    if not exists:
         raise UserError(f"{FLAG}: there is no {path}")
     if (data := find_minari(path)) is not None:
         return [MinariDataset(path, data)]
