@@ -90,7 +90,7 @@ def listen(host: str, port: int) -> socket.socket:
     try:
         return socket.create_server((host, port), family=socket.AF_INET6 if ":" in host else socket.AF_INET)
     except (OSError, TypeError, ValueError) as error:
-        reason = getattr(error, "strerror", None) or error
+        reason = str(getattr(error, "strerror", None) or error).partition(" (while")[0]  # the address follows
         raise UserError(
             f"--host {shown(host)} --port {port} cannot be used: {reason}; --port 0 takes a free port"
         ) from None
