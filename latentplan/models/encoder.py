@@ -63,11 +63,12 @@ class Encoder(nn.Module):
         side = frame_shape[0] // PATCH // 2 ** (len(channels) - 1)
         self.linear = nn.Linear(channels[-1] * side * side, embedding_dim)
         if vector_dim:
-            self.vectors = Mlp(vector_dim, hidden_dim, embedding_dim)
+            self.vectors = Mlp(vector_dim + 1, hidden_dim, embedding_dim)
 
     def read_vectors(self, vectors: Tensor) -> Tensor:
         """What numbers (..., vector) add to the embedding, float32 (..., embedding)."""
-        return self.vectors(symlog(vectors))
+        # The constant input keeps the magnitude of the numbers, which the norm of the first layer would divide out.
+        return self.vectors(functional.pad(symlog(vectors), (0, 1), value=1.0))
 
     def forward(self, frames: Tensor | Observation) -> Tensor:
         """Embeddings, float32 (rows, embedding), of uint8 frames (rows, height, width, channel)."""
