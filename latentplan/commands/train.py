@@ -60,8 +60,11 @@ def run(request: Request) -> int:
     if request.env_id is not None:
         import_named(request.env_id)
     from latentplan.training.checks import check_settings
+    from latentplan.training.demonstrations.kinds import find_recordings
 
     check_settings(config)
+    if request.resume is None:  # a run that resumes has its recorded episodes in its saves
+        find_recordings(config.replay.demonstrations)
     from latentplan.training import resume, train
 
     if request.resume is None:

@@ -13,8 +13,9 @@ from latentplan.config.extras import require_extra
 from latentplan.envs.process import read_facts
 from latentplan.envs.spaces import Actions, Interface
 from latentplan.envs.vector import GuardedEnv
-from latentplan.training.demonstrations.episode_file import list_episode_files, write_episode
+from latentplan.training.demonstrations.episode_file import write_episode
 from latentplan.training.demonstrations.fitting import read_interface
+from latentplan.training.demonstrations.kinds import SUFFIX, list_episode_files
 from latentplan.training.demonstrations.recording import RecordedEpisode
 
 
@@ -94,7 +95,7 @@ class EpisodeKeeper:
             terminated[-1],
             labels[:, : len(self._quantities)] if self._quantities else None,
         )
-        path = self.folder / f"episode-{lane:03d}-{number:06d}.hdf5"
+        path = self.folder / f"episode-{lane:03d}-{number:06d}{SUFFIX}"
         write_episode(path, episode, self._interface, self._quantities, self._env)
 
 

@@ -18,7 +18,6 @@ from latentplan.envs.spaces import Actions, Interface
 from latentplan.training.demonstrations.recording import RecordedEpisode, name_space
 
 FORMAT, VERSION = "latentplan-episode", 1
-SUFFIX = ".hdf5"
 FRAMES_PER_CHUNK = 16
 USER = "episode files"
 ENVIRONMENT = ("suite", "domain", "task", "objective", "kwargs", "pixels", "action_repeat", "frame_size")
@@ -74,11 +73,6 @@ def write_episode(
         part.replace(path)
     except OSError as error:
         raise UserError(f"the episode {path} cannot be written: {error.strerror}; make room, or keep none") from None
-
-
-def list_episode_files(folder: Path) -> list[Path]:
-    """The episode files of a folder, in the order of their names."""
-    return sorted(folder.glob(f"*{SUFFIX}"))
 
 
 class EpisodeFile:

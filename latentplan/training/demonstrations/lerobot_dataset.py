@@ -18,9 +18,9 @@ import numpy as np
 
 from latentplan.config import UserError
 from latentplan.config.extras import import_extra, require_extra
+from latentplan.training.demonstrations.kinds import INFO
 from latentplan.training.demonstrations.recording import RecordedEpisode, name_space
 
-INFO = "meta/info.json"
 REWARD, ACTION = "next.reward", "action"
 USER = "a LeRobot dataset"
 

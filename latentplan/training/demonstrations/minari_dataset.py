@@ -12,9 +12,9 @@ import numpy as np
 from latentplan.config import UserError
 from latentplan.config.extras import require_extra
 from latentplan.envs.spaces import ONLY_PICTURE, Actions
+from latentplan.training.demonstrations.kinds import METADATA
 from latentplan.training.demonstrations.recording import RecordedEpisode, name_space
 
-METADATA = "metadata.json"
 KEYS = ("observation_space", "action_space", "minari_version")
 
 
@@ -83,12 +83,6 @@ class MinariDataset:
     def _damage(self, error: Exception) -> UserError:
         reason = " ".join(str(error).split())[:200] or type(error).__name__
         return UserError(f"{self.path} cannot be read as a Minari dataset: {reason}")
-
-
-def find_minari(path: Path) -> Path | None:
-    """The folder with the metadata of a Minari dataset, given its folder or a file or folder in it; None for others."""
-    folder = path.parent if path.is_file() and path.name.startswith("main_data.") else path
-    return next((found for found in (folder / "data", folder) if (found / METADATA).is_file()), None)
 
 
 def _flatten(space: Any, values: Any) -> np.ndarray:
