@@ -7,6 +7,7 @@ import pytest
 import torch
 
 from latentplan.agents.checkpoint import read_info
+from latentplan.replay.buffer import Replay
 from latentplan.training import resume, train
 from latentplan.training.callbacks import Collect
 from latentplan.training.collection.collector import Collector
@@ -147,6 +148,10 @@ def test_store_results_keeps_requests_of_a_worker_that_ended_with_an_interrupted
     assert collect.requests["collect"] == {"counter": 3}  # the resumed run asks again
 
 
+def empty_replay():
+    return Replay(10, 1, 4, 1, torch.device("cpu"))
+
+
 class Mortal(RemoteWorker):
     """A worker whose first three processes end while they are prepared."""
 
@@ -166,7 +171,7 @@ class Mortal(RemoteWorker):
 
 def test_replace_worker_starts_another_process_when_the_new_one_ends_too(tiny, tmp_path):
     state, requests = RunState(), {"collect": {"counter": 3}, "evaluate": None, "weights": None}
-    collect = Collect(tiny(tmp_path), None, state, Mortal(), tmp_path, requests, memory={"agent": "random"})
+    collect = Collect(tiny(tmp_path), empty_replay(), state, Mortal(), tmp_path, requests, memory={"agent": "random"})
     with pytest.warns(RuntimeWarning, match="started again"):
         collect.replace_worker(WorkerEnded("ended"))
     assert state.worker_restarts == 3 and collect.worker.asked == ["restore"] * 3 + ["collect"]
@@ -177,7 +182,7 @@ def test_replace_worker_starts_another_process_when_the_new_one_ends_too(tiny, t
 
 def test_replace_worker_counts_from_the_start_of_the_process(tiny, tmp_path):
     state, requests = RunState(worker_restarts=19), {"collect": None, "evaluate": None, "weights": None}
-    collect = Collect(tiny(tmp_path), None, state, Mortal(), tmp_path, requests, memory={"agent": "random"})
+    collect = Collect(tiny(tmp_path), empty_replay(), state, Mortal(), tmp_path, requests, memory={"agent": "random"})
     with pytest.warns(RuntimeWarning, match=r"\(3 of 20 times\)"):
         collect.replace_worker(WorkerEnded("ended"))
     assert state.worker_restarts == 22

@@ -113,7 +113,7 @@ def test_train_refuses_folders_in_use(finished, tiny, dot, tmp_path):
 
 
 def test_train_refuses_a_run_without_budget(tiny, dot, tmp_path):
-    with pytest.raises(UserError, match="give --frames or --minutes"):
+    with pytest.raises(UserError, match="give --frames, --minutes or --updates"):
         train(tiny(tmp_path / "endless", run={"frames": None}), dot)
 
 

@@ -101,7 +101,10 @@ class _ConvertingBackend(Backend):
         return functions
 
     def _weights(self, model: WorldModel) -> rollouts.Weights:
-        weights: rollouts.Weights = self._rollout_weights.of(model, model.trunk_dtype)
+        kind = model.device.type
+        with model.trunk_precision():
+            dtype = torch.get_autocast_dtype(kind) if torch.is_autocast_enabled(kind) else torch.float32
+        weights: rollouts.Weights = self._rollout_weights.of(model, dtype)
         return weights
 
 
