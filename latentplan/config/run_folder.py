@@ -65,6 +65,8 @@ def read_run_config(folder: Path) -> tuple[Config, str | None]:
             f"replay.demonstrations in {path} cannot change in a run that resumes, whose recorded episodes are in its "
             f"saves: give {list(saved.replay.demonstrations)} again, or start a new run"
         )
+    if saved.collection.enabled and not own.collection.enabled:
+        raise UserError(f"collection.enabled in {path} cannot become false in a run that resumes: start a new run")
     changes = [
         f"{section}.{name} from {before!r} to {after!r}"
         for section in SECTIONS

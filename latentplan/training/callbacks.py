@@ -73,7 +73,7 @@ class Collect(lightning.Callback):
         self.memory = memory
         self.is_epoch_over = False
         self.evaluated_weights: dict[str, np.ndarray] = {}
-        self._is_continued = True
+        self._is_continued = requests is not None
         self._earlier_restarts = state.worker_restarts
 
     def on_train_epoch_start(self, trainer: lightning.Trainer, learner: Learner) -> None:  # type: ignore[override]
@@ -97,7 +97,8 @@ class Collect(lightning.Callback):
         """
         state = self.state
         learner.catch_up()
-        is_complete = state.epoch_updates >= updates_per_epoch(self.config.collection)
+        is_spent = learner.updates == self.config.run.updates  # the budget may end within an epoch
+        is_complete = is_spent or state.epoch_updates >= updates_per_epoch(self.config.collection)
         if state.in_epoch and (is_complete or not state.interrupted):
             state.learned_rounds, state.in_epoch, state.epoch_updates = state.rounds, False, 0
             self.is_epoch_over = True

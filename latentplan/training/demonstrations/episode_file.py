@@ -12,8 +12,9 @@ import numpy as np
 
 from latentplan import __version__
 from latentplan.config import EnvConfig, UserError
-from latentplan.config.commit import PART, write_synced
+from latentplan.config.commit import write_synced
 from latentplan.config.extras import import_extra
+from latentplan.config.writing import replaced_whole
 from latentplan.envs.spaces import Actions, Interface
 from latentplan.training.demonstrations.recording import RecordedEpisode, name_space
 
@@ -67,10 +68,9 @@ def write_episode(
         is_last = np.arange(len(episode.rewards)) == len(episode.rewards) - 1
         file.create_dataset("terminations", data=is_last & episode.is_terminal)
         file.create_dataset("truncations", data=is_last & (not episode.is_terminal))
-    part = path.with_name(f"{path.name}{PART}")
     try:
-        write_synced(part, target.getvalue())
-        part.replace(path)
+        with replaced_whole(path) as part:
+            write_synced(part, target.getvalue())
     except OSError as error:
         raise UserError(f"the episode {path} cannot be written: {error.strerror}; make room, or keep none") from None
 
@@ -146,6 +146,6 @@ class _Reading:
 
     def __exit__(self, kind: Any, error: Any, traceback: Any) -> None:
         self._file.close()
-        if isinstance(error, OSError | KeyError | TypeError | ValueError) and not isinstance(error, UserError):
+        if isinstance(error, Exception) and not isinstance(error, UserError):  # damage raises many kinds
             reason = " ".join(str(error).split())[:160]
             raise UserError(f"{self._path} is damaged: {reason}") from None

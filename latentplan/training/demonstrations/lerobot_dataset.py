@@ -67,7 +67,9 @@ class LeRobotDataset:
             self.num_numbers = int(np.prod(features[ACTION]["shape"]))
             self._episodes = self._read_episodes()
             self.lengths = [max(0, int(row["length"]) - 1) for row in self._episodes]
-        except (OSError, KeyError, TypeError, ValueError) as error:
+        except UserError:
+            raise
+        except Exception as error:  # the readers of tables and films raise many kinds for damaged files
             raise self._damage(error) from None
 
     def read(self, index: int) -> RecordedEpisode:
@@ -81,9 +83,12 @@ class LeRobotDataset:
             }
             actions = np.array(rows[ACTION], np.float64).reshape(len(rows[ACTION]), -1)[:-1]
             rewards = np.array(rows[REWARD], np.float64).reshape(-1)[:-1]
-        except (OSError, KeyError, TypeError, ValueError) as error:
+        except UserError:
+            raise
+        except Exception as error:
             raise self._damage(error) from None
-        if {len(values) for values in (frames | vectors).values()} != {int(episode["length"])}:
+        counts = {len(values) for values in (frames | vectors).values()} | {len(rows[ACTION]), len(rows[REWARD])}
+        if counts != {int(episode["length"])}:
             raise UserError(f"{self.path} is damaged: episode {index} must have {episode['length']} rows and pictures")
         return RecordedEpisode(frames | vectors, actions, rewards, is_terminal=False)
 

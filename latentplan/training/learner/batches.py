@@ -47,7 +47,7 @@ class ReplayBatches(IterableDataset[Batch | Tensor]):
         rng = np.random.default_rng(derive_seed(self.config.run.seed, "batches", first))
         takes_rows = isinstance(self.learner, GraphedLearner)
         budget = self.config.run.updates
-        end = first + self.length if budget is None else min(first + self.length, max(done, budget))
+        end = first + self.length if budget is None else min(first + self.length, budget)
         for update in range(first, end):
             rows = self.replay.draw(learning.batch_size, learning.sequence_length, rng)
             if update >= done:

@@ -1,6 +1,10 @@
 """Recordings of each format become rows with the contents of the episodes."""
 
+import json
+
 import numpy as np
+import pyarrow
+import pyarrow.parquet
 import pytest
 from gymnasium import spaces
 
@@ -131,6 +135,20 @@ def test_lerobot_dataset_of_another_form_is_refused(changes, message, tmp_path):
     folder = write_lerobot(tmp_path / "lerobot", video=False, changes=changes)
     with pytest.raises(UserError, match=message):
         open_recordings([str(folder)])
+
+
+@pytest.mark.parametrize("is_short", [True, False])
+def test_lerobot_table_with_other_rows_than_its_film_is_refused(is_short, tmp_path):
+    folder = write_lerobot(tmp_path / "lerobot")
+    info = json.loads((folder / "meta" / "info.json").read_text())
+    del info["features"]["observation.place"]
+    (folder / "meta" / "info.json").write_text(json.dumps(info))
+    path = folder / "data" / "chunk-000" / "file-000.parquet"
+    table = pyarrow.parquet.read_table(path)  # the last row of the last episode comes first
+    pyarrow.parquet.write_table(table[1:] if is_short else pyarrow.concat_tables([table, table[:1]]), path)
+    (recording,) = open_recordings([str(folder)])
+    with pytest.raises(UserError, match="is damaged: episode 1 must have 20 rows and pictures"):
+        recording.read(1)
 
 
 def test_names_of_no_recording_are_refused(tmp_path):

@@ -13,6 +13,7 @@ from latentplan.config.files import dump_config, read_config
 from latentplan.config.run_results import read_evaluations
 from latentplan.replay.disk import count_saved
 from latentplan.training import resume, saving, train
+from latentplan.training.callbacks import Collect
 from latentplan.training.demonstrations.fitting import FittedRecording
 from latentplan.training.demonstrations.opening import open_recordings
 from tests.training.demonstrations.recorded import target, write_minari
@@ -158,6 +159,15 @@ def test_changed_recordings_of_a_run_are_refused(kept, tiny, dot, tmp_path):
         resume(run.run_dir, make_env=dot)
 
 
+def test_collection_cannot_end_in_a_run_that_resumes(kept, tiny, dot, tmp_path):
+    run = train(tiny(tmp_path / "run", replay={"demonstrations": (str(kept[1]),)}, run={"frames": 60}), dot)
+    config = read_config(run.run_dir / "config.yaml")
+    settings = {"collection": replace(config.collection, enabled=False), "run": replace(config.run, frames=None)}
+    dump_config(replace(config, **settings), run.run_dir / "config.yaml")
+    with pytest.raises(UserError, match="collection.enabled in .* cannot become false"):
+        resume(run.run_dir, updates=50, make_env=dot)
+
+
 def test_recording_that_does_not_fit_is_refused_before_a_worker_starts(tiny, dot, tmp_path, monkeypatch):
     monkeypatch.setattr("latentplan.training.run.make_worker", lambda *_: pytest.fail("a worker was started"))
     write_minari(tmp_path / "minari", decisions=3)
@@ -187,3 +197,18 @@ def test_online_run_ends_after_its_updates(tiny, dot, tmp_path):
     run = train(tiny(tmp_path / "run", run={"frames": None, "updates": 8}, replay={"capacity": 90}), dot)
     state = read_state(run.run_dir)
     assert state["learner"]["updates"] == 8 and state["run"]["env_frames"] > 45
+
+
+def test_epoch_that_a_budget_cuts_closes_when_a_signal_arrives_in_it(tiny, dot, tmp_path, monkeypatch):
+    count = Collect.on_train_batch_end
+
+    def interrupt(self, trainer, learner, *rest):
+        count(self, trainer, learner, *rest)
+        if learner.updates == 8:
+            self.state.interrupted = 2
+
+    monkeypatch.setattr(Collect, "on_train_batch_end", interrupt)
+    run = train(tiny(tmp_path / "run", run={"frames": None, "updates": 8}, replay={"capacity": 90}), dot)
+    assert run.exit_code == 130
+    state = read_state(run.run_dir)
+    assert state["learner"]["updates"] == 8 and not state["run"]["in_epoch"]
