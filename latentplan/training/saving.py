@@ -23,7 +23,7 @@ from latentplan.models import WorldModel
 from latentplan.replay.disk import ReplayFiles
 from latentplan.training.callbacks import Collect
 from latentplan.training.collection.episodes import to_tensors
-from latentplan.training.learner.optimization import load_optimizer_state
+from latentplan.training.learner.optimization import load_optimizer_state, return_freed_memory
 from latentplan.training.learner.skips import LONGEST_STREAK, NotFiniteError
 from latentplan.training.signals import Signals
 from latentplan.training.state import RunState, SavedRun, write_state
@@ -100,6 +100,7 @@ class Save(lightning.Callback):
         started = time.monotonic()
         self.save_agent("last", learner.averaged, self.clocks(learner))
         self.save_run(trainer, learner)
+        return_freed_memory()
         self._has_evaluated = False
         pause = max(SAVE_MINUTES, (time.monotonic() - started) / 60.0 / SAVE_SHARE)
         self._next_minutes = self.state.minutes + (pause if SAVE_MINUTES > 0.0 else 0.0)

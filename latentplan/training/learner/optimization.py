@@ -118,3 +118,15 @@ def keep_freed_memory() -> bool:
     """
     mallopt = getattr(ctypes.CDLL(None), "mallopt", None) if os.name == "posix" else None
     return mallopt is not None and all(mallopt(option, size) == 1 for option, size in _KEPT_BYTES.items())
+
+
+def return_freed_memory() -> bool:
+    """Gives the memory that the C library keeps back to the system, once (malloc_trim(3)).
+
+    A save needs more memory for a moment than an update does; kept, that memory would be the run's to its end.
+
+    Returns:
+        Whether there was any such memory; False where the C library has no such call.
+    """
+    trim = getattr(ctypes.CDLL(None), "malloc_trim", None) if os.name == "posix" else None
+    return trim is not None and trim(0) == 1

@@ -44,3 +44,32 @@ def test_keep_freed_memory_serves_large_tensors_from_the_heap(run_python):
     assert mapped_before >= BLOCK, "an allocation of this size is mapped anew and handed back"
     assert mapped == 0, "it comes from the heap"
     assert kept >= BLOCK, "and stays there"
+
+
+RETURN_SCRIPT = """
+import importlib.util, pathlib, torch
+
+spec = importlib.util.spec_from_file_location("optimization", "latentplan/training/learner/optimization.py")
+optimization = importlib.util.module_from_spec(spec)
+spec.loader.exec_module(optimization)
+
+def resident_kib():
+    lines = pathlib.Path("/proc/self/status").read_text().splitlines()
+    return next(int(line.split()[1]) for line in lines if line.startswith("VmRSS"))
+
+assert optimization.keep_freed_memory()
+blocks = [torch.ones(50_000) for _ in range(500)]  # 95 MiB
+last = torch.ones(1_000)  # lies behind the blocks, so that the end of the heap cannot shrink
+held = resident_kib()
+del blocks
+kept = resident_kib()
+assert optimization.return_freed_memory()
+print(held - kept, kept - resident_kib())
+"""
+
+
+@pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="asks glibc")
+def test_freed_memory_stays_until_it_is_returned(run_python):
+    returned_by_itself, returned = map(int, run_python("-c", RETURN_SCRIPT).stdout.split())
+    assert returned_by_itself < 10_000
+    assert returned > 80_000
