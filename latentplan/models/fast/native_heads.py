@@ -176,13 +176,14 @@ class _LambdaReturn(torch.autograd.Function):
         places = [part.data_ptr() for part in (rewards, discounts, values)]
         steps, rows = len(rewards), rewards[0].numel()
         require_kernels(rewards).library.lambda_return(*places, lambda_, returns.data_ptr(), steps, rows)
-        ctx.tensors, ctx.lambda_ = (discounts, values, returns), lambda_
+        ctx.save_for_backward(discounts, values, returns)  # an output in an attribute would be a reference cycle
+        ctx.lambda_ = lambda_
         return returns
 
     @staticmethod
     def backward(ctx: Any, outer: Tensor) -> tuple[Tensor, Tensor, Tensor, None]:
         outer, gradients = outer.contiguous(), [torch.empty_like(outer) for _ in range(3)]
-        before = [part.data_ptr() for part in ctx.tensors]
+        before = [part.data_ptr() for part in ctx.saved_tensors]
         after = [part.data_ptr() for part in (outer, *gradients)]
         require_kernels(outer).library.lambda_return_back(*before, ctx.lambda_, *after, len(outer), outer[0].numel())
         return gradients[0], gradients[1], gradients[2], None

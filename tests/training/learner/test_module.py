@@ -1,5 +1,6 @@
 """The learner: model and behaviour learn at the same time, with the results of learning one after the other."""
 
+import gc
 from pathlib import Path
 
 import pytest
@@ -53,6 +54,22 @@ def test_update_changes_model_then_behaviour_and_refreshes_the_snapshot(batch, t
     assert torch.equal(frozen.dynamics.gates.weight, own.dynamics.gates.weight.to(dtype))
     assert torch.equal(frozen.reward_head.mlp.output.weight, own.reward_head.mlp.output.weight)
     assert frozen.actor is own.actor and not frozen.dynamics.gates.weight.requires_grad
+
+
+def test_an_update_leaves_no_reference_cycle(batch, tiny):
+    """A cycle would keep the tensors of its update until Python looks for cycles among all objects, which is seldom."""
+    learner = make_standalone(tiny)
+    learner.training_step(batch, 0)
+    learner.catch_up()
+    gc.collect()
+    gc.disable()
+    try:
+        for _ in range(3):
+            learner.training_step(batch, 0)
+            learner.catch_up()
+        assert gc.collect() == 0
+    finally:
+        gc.enable()
 
 
 def test_catch_up_raises_the_error_of_the_behaviour_thread(batch, tiny):
