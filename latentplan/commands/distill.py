@@ -9,6 +9,7 @@ from latentplan.commands.flags import overrides
 from latentplan.commands.shell import LearningRequest, check_search, name_folder, saved_config, search_settings
 from latentplan.config import DistillConfig, PlannerConfig
 from latentplan.config.env_id import ENV_FLAGS, EnvChoice
+from latentplan.config.run_folder import require_saves
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -54,6 +55,8 @@ def run(request: Request) -> int:
         saved = saved_config(request.checkpoint, info)
         planner = search_settings(saved, request.planner)
         check_search(planner, saved.model)
+    if request.resume is not None:  # before torch is imported
+        require_saves(request.resume)
     device = request.use_device()
     from latentplan.training import distill, resume_distillation
 

@@ -8,6 +8,7 @@ from typing import Any
 from latentplan.commands.flags import overrides
 from latentplan.commands.shell import LearningRequest, name_folder
 from latentplan.config import GoalsConfig
+from latentplan.config.run_folder import require_saves
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -41,6 +42,8 @@ def run(request: Request) -> int:
     from latentplan.agents.info import read_info
 
     info = {} if request.checkpoint is None else read_info(request.checkpoint)
+    if request.resume is not None:  # before torch is imported
+        require_saves(request.resume)
     device = request.use_device()
     from latentplan.training import learn_goals, resume_goals
 

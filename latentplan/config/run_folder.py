@@ -35,6 +35,15 @@ def run_saves(folder: Path) -> Saves:
     return saves
 
 
+def require_saves(folder: Path) -> None:
+    """Raises UserError if there is no save in the folder of a run, of a distillation or of goals that were learned."""
+    if not Saves(folder / SAVES_FOLDER, "any", 0).exist():
+        raise UserError(
+            f"nothing to resume in {folder}: {folder / SAVES_FOLDER} holds no save; what latentplan 0.2.0 or earlier "
+            "saved is continued by that version"
+        )
+
+
 def read_run_config(folder: Path) -> tuple[Config, str | None]:
     """The settings with which a run resumes, and a warning, or None.
 

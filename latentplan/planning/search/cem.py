@@ -24,7 +24,7 @@ from latentplan.planning.search.space import read_bounds
 
 # Options for which a planner has a value of its own.
 CEM_GRADIENT: dict[str, Any] = {"gradient_steps": 5}
-ICEM: dict[str, Any] = {"noise_beta": 2.0, "white_noise_share": 0.0, "keep_elite_fraction": 0.3, "final": "best"}
+ICEM: dict[str, Any] = {"noise_beta": 2.0, "white_noise_share": 0.0, "keep_elite_fraction": 0.5, "final": "best"}
 MPPI: dict[str, Any] = {
     "num_iterations": 1,
     "smoothing": 1.0,
@@ -193,7 +193,7 @@ def icem_planner(**settings: Any) -> CEMPlanner:
 
     Args:
         **settings: Arguments of `CEMPlanner`; they replace `noise_beta` 2, `white_noise_share` 0, `keep_elite_fraction`
-            0.3 and `final` "best".
+            0.5 and `final` "best".
     """
     return CEMPlanner(**ICEM | settings)
 

@@ -31,7 +31,7 @@ from latentplan.config import USER_DOMAIN, DistillConfig, PlannerConfig, UserErr
 from latentplan.config.commit import Saves
 from latentplan.config.env_id import choose_env, repeat_flag
 from latentplan.config.removed import drop_removed
-from latentplan.config.run_folder import SAVES_FOLDER, lock_folder
+from latentplan.config.run_folder import SAVES_FOLDER, lock_folder, require_saves
 from latentplan.envs import make_env, make_from
 from latentplan.evaluation.episodes import OnStep, Step, episode_seed, iterate_episodes
 from latentplan.evaluation.statistics import confidence_interval
@@ -108,6 +108,7 @@ def resume_distillation(
     Raises:
         UserError: The folder holds no distillation, or the agent that it started from has changed.
     """
+    require_saves(Path(folder))
     saved = _load_distillation(Path(folder))
     if read_info(saved["source"])["sha256"] != saved["sha256"]:
         raise UserError(f"{saved['source']} is not the agent from which the distillation in {folder} started")

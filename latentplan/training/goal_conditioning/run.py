@@ -16,7 +16,7 @@ import torch
 from latentplan.agents.checkpoint import load_model, read_info, resolve_checkpoint, save_checkpoint
 from latentplan.config import USER_DOMAIN, Config, GoalsConfig, UserError, derive_seed, to_dict
 from latentplan.config.commit import Save, Saves
-from latentplan.config.run_folder import RUN_FILE, SAVES_FOLDER, lock_folder, run_saves
+from latentplan.config.run_folder import RUN_FILE, SAVES_FOLDER, lock_folder, require_saves, run_saves
 from latentplan.models import WorldModel
 from latentplan.replay.buffer import Replay
 from latentplan.replay.disk import FORMAT as REPLAY_FORMAT
@@ -72,12 +72,8 @@ def resume_goals(
     Raises:
         UserError: The folder holds nothing to resume, or the agent that the learning started from has changed.
     """
+    require_saves(Path(folder))
     saves = _saves(Path(folder))
-    if not saves.exist():
-        raise UserError(
-            f"nothing to resume in {folder}: {saves.folder} holds no save; what latentplan 0.2.0 or earlier saved is "
-            "continued by that version"
-        )
     with lock_folder(Path(folder)):
         saved = load_values(saves, ("run", "source", "sha256", "settings", "minutes", "learner"))
         if read_info(saved["source"])["sha256"] != saved["sha256"]:

@@ -92,7 +92,7 @@ def test_agent_plans_with_a_preset(method):
     planner = agent.controller.planner
     assert np.isfinite([agent.act(FRAME), agent.act(FRAME)]).all() and agent.last_source == "plan"
     if method == "icem":
-        assert (planner.noise_beta, planner.keep_elite_fraction, planner.final) == (2.0, 0.3, "best")
+        assert (planner.noise_beta, planner.keep_elite_fraction, planner.final) == (2.0, 0.5, "best")
     else:
         assert (planner.temperature, planner.smoothing, planner.adapt_std) == (0.1, 1.0, False)
 
@@ -100,7 +100,7 @@ def test_agent_plans_with_a_preset(method):
 def test_make_planner_takes_the_presets_value_where_an_option_has_its_default():
     options = PlannerConfig(num_samples=64, noise_beta=1.0, init_std=0.3)
     icem = make_planner("icem", options, action_dim=2, discount=0.9)
-    assert (icem.noise_beta, icem.keep_elite_fraction, icem.final) == (1.0, 0.3, "best")
+    assert (icem.noise_beta, icem.keep_elite_fraction, icem.final) == (1.0, 0.5, "best")
     assert (icem.num_samples, icem.init_std, icem.action_dim, icem.discount) == (64, 0.3, 2, 0.9)
     mppi = make_planner("mppi", options, action_dim=2)
     assert (mppi.num_elites, mppi.num_iterations, mppi.noise_beta) == (64, 1, 1.0)
