@@ -183,7 +183,9 @@ class JoinedRanks(Ranks):
             collective(*arguments, **more)
         except RuntimeError as error:
             reason = (str(error).splitlines() or ["no reason given"])[0][:160]
-            raise RankEnded(f"another process of this run has ended, and this one cannot go on: {reason}") from None
+            raise RankEnded(
+                f"another process of this run has ended: --resume continues from the last save ({reason})"
+            ) from None
 
 
 ALONE = Ranks()
@@ -232,7 +234,8 @@ def join_ranks(config: Config) -> Ranks:
     from lightning.fabric.plugins.environments import TorchElasticEnvironment
     from lightning.fabric.strategies import DDPStrategy
 
-    logging.getLogger("lightning.fabric").setLevel(logging.ERROR)
+    for name in ("lightning.fabric", "lightning.pytorch"):
+        logging.getLogger(name).setLevel(logging.ERROR)
     if is_outside:
         os.environ.setdefault("LOCAL_RANK", str(_read_number("RANK") % run.devices))
     fabric = Fabric(

@@ -1,11 +1,13 @@
-"""A program of one rank: makes updates on its share of fixed batches, and prints the losses of every update.
+"""A program of one rank: makes updates on its share of fixed batches, and writes the losses of every update to a file.
 
 The environment variables of torch.distributed say which rank it is; without them one process makes the same updates
-alone. Arguments: plain or fast, and the number of updates.
+alone. Arguments: the number of updates, and the file.
 """
 
 import json
 import sys
+from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import torch
@@ -19,6 +21,7 @@ from tests.training.conftest import TINY
 
 BATCH, LENGTH, LANE_ROWS, LANES = TINY.learning.batch_size, TINY.learning.sequence_length, 60, 2
 LABELS = {"height": 0.5}
+SPOILT = 25  # the update in which a reward is not a number
 
 
 class Standalone(Learner):
@@ -38,10 +41,10 @@ def make_rows(lane):
         frames=rng.integers(0, 256, (LANE_ROWS, 64, 64, 3), dtype=np.uint8),
         deter=rng.normal(size=(LANE_ROWS, TINY.model.deter_dim)).astype(np.float32),
         actions=rng.uniform(-1.0, 1.0, (LANE_ROWS, 1)).astype(np.float32),
-        rewards=rng.uniform(-1.0, 1.0, LANE_ROWS).astype(np.float32),
+        rewards=rng.uniform(0.0, 1.0, LANE_ROWS).astype(np.float32),
         continues=1.0 - is_terminal.astype(np.float32),
         is_first=place % 12 == 0,
-        labels=rng.normal(size=(LANE_ROWS, len(LABELS))).astype(np.float32),
+        labels=rng.uniform(-0.1, 0.1, (LANE_ROWS, len(LABELS))).astype(np.float32),
     )
 
 
@@ -59,27 +62,37 @@ def draw_shares(update):
     return torch.as_tensor(starts[..., None] + np.arange(LENGTH + 1))
 
 
-def main(kind, updates):
-    torch.set_num_threads(1)
-    ranks = join_ranks(place_ranks(TINY))
+def learn(kind, ranks, updates):
+    """The losses of every update, and what the learner holds afterwards; one update is spoilt for the last rank."""
     lanes = [ranks.rank] if ranks.size > 1 else [*range(LANES)]
     replay = make_replay(lanes)
     torch.manual_seed(0)
     model = WorldModel(TINY.model, 1, LABELS)
     model = accelerate(model) if kind == "fast" else model
-    config = type(TINY.learning)(**{**vars(TINY.learning), "turned_share": 0.3, "random_shift": 2})
+    config = replace(TINY.learning, turned_share=0.3, random_shift=2)
     learner = Standalone(model, config, 0.9, replay, seed=0, ranks=ranks)
     history = []
     for update in range(updates):
         shares = draw_shares(update)
         rows = torch.cat([shares[lane] + place * LANE_ROWS for place, lane in enumerate(lanes)])
-        learner.training_step(replay.gather(rows), update)
+        batch = replay.gather(rows)
+        if update == SPOILT and LANES - 1 in lanes:
+            batch.rewards[-1] = torch.nan
+        learner.training_step(batch, update)
         learner.catch_up()
         history.append({name: float(value) for name, value in learner.metrics.items()})
-    weights = [float(value.double().sum()) for value in learner.state_dict().values()]
-    print(json.dumps({"size": ranks.size, "losses": history, "weights": weights}), flush=True)
+    learner.teardown("fit")
+    state = {name: value.double().sum().item() for name, value in learner.state_dict().items()}
+    return {"losses": history, "state": state}
+
+
+def main(updates, path):
+    torch.set_num_threads(1)
+    ranks = join_ranks(place_ranks(TINY))
+    found = {kind: learn(kind, ranks, updates) for kind in ("plain", "fast")}
+    path.write_text(json.dumps(found | {"size": ranks.size}))
     ranks.together(lambda: None)
 
 
 if __name__ == "__main__":
-    main(sys.argv[1], int(sys.argv[2]))
+    main(int(sys.argv[1]), Path(sys.argv[2]))
