@@ -14,6 +14,7 @@ import torch
 
 from latentplan.models import WorldModel
 from latentplan.models.fast import accelerate
+from latentplan.models.fast.native import find_kernels
 from latentplan.replay.buffer import Replay, Rows
 from latentplan.training.learner.module import Learner
 from latentplan.training.ranks import join_ranks, place_ranks
@@ -69,6 +70,7 @@ def learn(kind, ranks, updates):
     torch.manual_seed(0)
     model = WorldModel(TINY.model, 1, LABELS)
     model = accelerate(model) if kind == "fast" else model
+    model.backend.trunk_dtype = torch.float32
     config = replace(TINY.learning, turned_share=0.3, random_shift=2)
     learner = Standalone(model, config, 0.9, replay, seed=0, ranks=ranks)
     history = []
@@ -90,7 +92,9 @@ def main(updates, path):
     torch.set_num_threads(1)
     ranks = join_ranks(place_ranks(TINY))
     found = {kind: learn(kind, ranks, updates) for kind in ("plain", "fast")}
-    path.write_text(json.dumps(found | {"size": ranks.size}))
+    kernels = find_kernels(torch.float32)
+    factors = "torch" if kernels is None else str(kernels.half)
+    path.write_text(json.dumps(found | {"size": ranks.size, "factors": factors}))
     ranks.together(lambda: None)
 
 
