@@ -210,7 +210,7 @@ def _follow(config: Config, folder: Path, make_env: EnvFactory | None, ranks: Ra
             meet_ranks(ranks, folder)
             _run_until_end(config, folder, make_env, signals, ranks, resume=resume)
             ranks.together(lambda: None)
-    except UserError:
+    except (UserError, NotFiniteError):
         raise SystemExit(0) from None
     return Result(folder, 0, {})
 

@@ -1,29 +1,30 @@
 """A program that trains in the dot environment, or resumes, with as many processes as it is told.
 
-Arguments: the folder of the run, the number of processes, the budget of frames, and settings such as `learning.x=3`.
+Arguments: the folder of the run, the number of processes, and the budget of frames.
 """
 
 import os
-import signal
 import sys
 from dataclasses import replace
 from pathlib import Path
 
+from latentplan.commands.shell import refuse
+from latentplan.config import UserError
 from latentplan.training import resume, train
 from tests.training.conftest import TINY
 from tests.training.dot import Dot
 
 
 class SignalledDot(Dot):
-    """A dot of which the step of a number, in the process of a rank, sends a signal; the environment says which."""
+    """A dot that sends a signal to its process; the environment says to which rank, at which step, and which signal."""
 
     steps = 0
 
     def step(self, action):
         SignalledDot.steps += 1
-        rank, number = os.environ["SIGNAL_AT"].split(":")
-        if SignalledDot.steps == int(number) and os.environ.get("LOCAL_RANK", "0") == rank:
-            os.kill(os.getpid(), signal.SIGTERM)
+        rank, step, number = os.environ["SIGNAL_AT"].split(":")
+        if SignalledDot.steps == int(step) and os.environ.get("LOCAL_RANK", "0") == rank:
+            os.kill(os.getpid(), int(number))
         return super().step(action)
 
 
@@ -37,4 +38,7 @@ def main(folder, devices, frames):
 
 
 if __name__ == "__main__":
-    sys.exit(main(Path(sys.argv[1]), int(sys.argv[2]), int(sys.argv[3])).exit_code)
+    try:
+        sys.exit(main(Path(sys.argv[1]), int(sys.argv[2]), int(sys.argv[3])).exit_code)
+    except UserError as error:
+        sys.exit(refuse(str(error)))

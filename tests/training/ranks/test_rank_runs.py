@@ -3,6 +3,7 @@
 import csv
 import os
 import shutil
+import signal
 import subprocess
 import sys
 
@@ -95,10 +96,13 @@ def test_run_of_one_process_resumes_with_two(root, finished, tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("rank", [0, 1])
-def test_signal_to_one_process_stops_both_and_the_resumed_run_equals_one_without(root, pair, tmp_path, rank):
-    code, printed = run_program(root, tmp_path / "run", 2, FRAMES, SIGNAL_AT=f"{rank}:36")
-    assert code == 143 and printed.count("stopped; to resume") == 1
+@pytest.mark.parametrize(("rank", "number"), [(0, signal.SIGTERM), (1, signal.SIGTERM), (1, signal.SIGKILL)])
+def test_signal_to_one_process_ends_both_and_the_resumed_run_equals_one_without(root, pair, tmp_path, rank, number):
+    code, printed = run_program(root, tmp_path / "run", 2, FRAMES, SIGNAL_AT=f"{rank}:36:{int(number)}")
+    if number == signal.SIGTERM:
+        assert code == 143 and printed.count("stopped; to resume") == 1
+    else:
+        assert code in (2, -signal.SIGKILL)  # the latter where Lightning kills the others first
     assert read_state(tmp_path / "run")["run"]["env_frames"] < FRAMES
     assert run_program(root, tmp_path / "run", 2, FRAMES)[0] == 0
     states = [read_state(folder)["learner"]["weights"] for folder in (pair[0], tmp_path / "run")]
