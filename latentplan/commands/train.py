@@ -41,7 +41,16 @@ class Request:
         settings: Settings that were given, by section and name.
     """
 
-    RESUMABLE = ("--frames", "--minutes", "--updates", "--device", "--env-id")
+    RESUMABLE = (
+        "--frames",
+        "--minutes",
+        "--updates",
+        "--device",
+        "--env-id",
+        "--run.devices",
+        "--run.nodes",
+        "--run.strategy",
+    )
     NOTES = "Values shown are the defaults before configs/<domain>.yaml and the preset are laid over them."
 
     settings: dict[str, Any] = overrides(Config, SHORT_FLAGS)

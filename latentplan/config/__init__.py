@@ -16,6 +16,7 @@ from latentplan.config.settings import (
     ModelConfig,
     ReplayConfig,
     RunConfig,
+    Strategy,
     from_dict,
     to_dict,
 )
@@ -41,6 +42,7 @@ __all__ = [
     "ReplayConfig",
     "RunConfig",
     "SearchOptions",
+    "Strategy",
     "UserError",
     "derive_seed",
     "from_dict",

@@ -22,14 +22,17 @@ RenderQuality = Literal["exact", "fast", "fastest"]
 Floor = Literal["suite", "endless"]
 Device = Literal["auto", "cpu", "cuda"]
 Pixels = Literal["observation", "render"]
+Strategy = Literal["ddp"]
 RENDER_QUALITIES = get_args(RenderQuality)
 FLOORS = get_args(Floor)
 DEVICES = get_args(Device)
 PIXELS = get_args(Pixels)
+STRATEGIES = get_args(Strategy)
 LOGGERS = ("tensorboard", "csv", "wandb", "trackio", "mlflow")
 MAX_REPEAT = 10_000  # ten of the longest episodes of dm_control
 MAX_ENVS = 1024
 MAX_CAMERA = 1000
+MAX_RANKS = 1024  # learning processes of a node, and nodes
 USER_DOMAIN = "user"  # `EnvConfig.domain` of runs in an environment that the user wrote
 
 
@@ -177,6 +180,12 @@ class RunConfig:
             divides all cores but one between the halves and leaves one to collection.
         run_dir: Folder of the run; None makes `runs/<domain>-<task>-seed<seed>-<date>`.
         logger: Trackers that get scalars and films: tensorboard, csv, wandb, trackio, mlflow.
+        devices: Learning processes of a node: one for each GPU or, on a CPU, as many as you like. They share each
+            batch, and each collects into a replay of its own. Frames and decisions count those of all together.
+        nodes: Machines that learn together, each with `devices` processes; the folder of the run must be one that all
+            of them see. Each machine starts the same command, with MASTER_ADDR, MASTER_PORT and NODE_RANK set, or by
+            torchrun.
+        strategy: How several processes learn together: `ddp` averages their gradients.
     """
 
     frames: int | None = None
@@ -187,9 +196,13 @@ class RunConfig:
     run_dir: str | None = None
     updates: int | None = None
     logger: tuple[str, ...] = option(("tensorboard",), separator=",")
+    devices: int = 1
+    nodes: int = 1
+    strategy: Strategy = "ddp"
 
     def __post_init__(self) -> None:
-        one_of(self, device=DEVICES)
+        one_of(self, device=DEVICES, strategy=STRATEGIES)
+        within(self, devices=(1, MAX_RANKS), nodes=(1, MAX_RANKS))
         for name in self.logger:
             if name not in LOGGERS:
                 raise ValueError(f"logger must be of {', '.join(LOGGERS)}, got {shown(name)}")
@@ -198,6 +211,11 @@ class RunConfig:
         if self.threads is not None:
             within(self, threads=(1, MAX_THREADS))
 
+    @property
+    def num_ranks(self) -> int:
+        """Learning processes of all nodes."""
+        return self.devices * self.nodes
+
 
 @dataclass(frozen=True)
 class Config:
@@ -205,8 +223,8 @@ class Config:
 
     Raises:
         UserError: Two settings contradict each other: collected episodes shorter than training sequences, a CUDA graph
-            without a replay on the device, agents that see turned frames without learning from turned frames, or no
-            collection without demonstrations.
+            without a replay on the device or with several processes, a batch that the processes cannot share evenly,
+            agents that see turned frames without learning from turned frames, or no collection without demonstrations.
     """
 
     env: EnvConfig = field(default_factory=EnvConfig)
@@ -229,8 +247,25 @@ class Config:
         if self.learning.cuda_graph and not self.replay.on_device:
             why = "a graph reads its sequences from the device; set both, or neither"
             raise UserError(f"learning.cuda_graph needs replay.on_device: {why}")
+        if self.run.num_ranks > 1:
+            self._check_ranks()
         if not self.collection.enabled:
             self._check_offline()
+
+    def _check_ranks(self) -> None:
+        """Refuses settings that several learning processes cannot share."""
+        ranks, learning = self.run.num_ranks, self.learning
+        for name in ("batch_size", "imagination_starts"):
+            if (count := getattr(learning, name)) % ranks:
+                raise UserError(
+                    f"learning.{name} ({count}) must be a multiple of {ranks}, the processes of run.devices "
+                    f"({self.run.devices}) x run.nodes ({self.run.nodes}), which share it evenly"
+                )
+        if learning.cuda_graph:
+            raise UserError(
+                f"learning.cuda_graph records the update of one process, and run.devices ({self.run.devices}) x "
+                f"run.nodes ({self.run.nodes}) are {ranks}: set learning.cuda_graph false"
+            )
 
     def _check_offline(self) -> None:
         """Refuses settings that have no effect, or are missing, in a run that collects nothing."""

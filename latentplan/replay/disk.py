@@ -1,4 +1,8 @@
-"""The replay on disk: frames in append-only logs, and everything else of the rows in one file per save."""
+"""The replay on disk: frames in append-only logs, and everything else of the rows in one file per save.
+
+Where several processes learn together, each has a replay and writes a file and logs of its own; `dealing` gives the
+rows of all of them to another number of processes.
+"""
 
 from __future__ import annotations
 
@@ -18,6 +22,16 @@ FORMAT = 1
 ROWS_PER_BLOCK = 256
 
 
+def rows_file(rank: int) -> str:
+    """Name of the file with the rows of one process: `rows.pt` for process 0, or where there is only one."""
+    return f"rows-{rank}.pt" if rank else ROWS_FILE
+
+
+def log_name(rank: int, lane: int) -> str:
+    """Name of the log with the frames of one lane of a process."""
+    return f"rank{rank}-frames{lane}" if rank else f"frames{lane}"
+
+
 class ReplayFiles:
     """Writes the rows of a replay for a save, and reads them back.
 
@@ -27,11 +41,13 @@ class ReplayFiles:
     Args:
         folder: Folder of all saves.
         replay: The replay.
+        rank: Number of the process that the replay belongs to.
     """
 
-    def __init__(self, folder: Path, replay: Replay) -> None:
-        self.folder, self.replay = folder, replay
-        self._logs = [Log(folder, f"frames{lane}", replay.frames[0].numel()) for lane in range(replay.num_lanes)]
+    def __init__(self, folder: Path, replay: Replay, rank: int = 0) -> None:
+        self.folder, self.replay, self.rank = folder, replay, rank
+        row_bytes = replay.frames[0].numel()
+        self._logs = [Log(folder, log_name(rank, lane), row_bytes) for lane in range(replay.num_lanes)]
 
     def write(self, part: Path) -> dict[str, Extent]:
         """Appends new frames, and writes the other columns into the folder of a save.
@@ -52,7 +68,7 @@ class ReplayFiles:
         episode = torch.from_numpy(replay.episode)[index.cpu()]
         bounds = {name: torch.from_numpy(getattr(replay, name).copy()) for name in ("first", "written")}
         recorded = {"num_recorded": replay.num_recorded} if replay.num_recorded else {}
-        torch.save(columns | bounds | {"episode": episode} | recorded, part / ROWS_FILE)
+        torch.save(columns | bounds | {"episode": episode} | recorded, part / rows_file(self.rank))
         return extents
 
     def read(self, save: Save) -> None:
@@ -62,14 +78,8 @@ class ReplayFiles:
             UserError: The lanes, actions, beliefs or labels of the save have other sizes.
         """
         replay = self.replay
-        saved = read_saved(save.folder / ROWS_FILE, keys=(*COLUMNS, "episode", "first", "written"))
-        columns = ("actions", "deter", "labels")
-        sizes = (len(saved["written"]), *(saved[name].shape[1] for name in columns))
-        own = (replay.num_lanes, *(getattr(replay, name).shape[1] for name in columns))
-        if sizes != own:
-            raise UserError(
-                f"the replay in {save.folder} has (environments, action, deter, labels) {sizes}, this run {own}"
-            )
+        saved = read_rows(save, self.rank)
+        check_sizes(saved, replay, save)
         offset = 0
         for lane, (first, end) in enumerate(zip(saved["first"].tolist(), saved["written"].tolist(), strict=True)):
             held = min(end - first, int(replay.sizes[lane]))
@@ -83,7 +93,8 @@ class ReplayFiles:
             for name in COLUMNS:
                 getattr(replay, name)[index] = saved[name][rows].to(replay.device)
             self._logs[lane].restore(save.logs)
-            self._read_frames(lane, end - held, end)
+            numbers = np.arange(end - held, end)
+            read_frames(replay, replay.places(lane, numbers), self._logs[lane], numbers)
 
     def _blocks(self, lane: int, start: int, end: int) -> Iterator[bytes]:
         replay = self.replay
@@ -91,19 +102,55 @@ class ReplayFiles:
             rows = replay.places(lane, np.arange(first, min(first + ROWS_PER_BLOCK, end)))
             yield replay.frames[torch.as_tensor(rows, device=replay.device)].cpu().numpy().tobytes()
 
-    def _read_frames(self, lane: int, start: int, end: int) -> None:
-        replay, log, found = self.replay, self._logs[lane], 0
-        for first, count, path in log.rows():
-            low, high = max(first, start), min(first + count, end)
-            if low >= high:
-                continue
-            stored = np.memmap(path, np.uint8, "r", shape=(count, *replay.frames.shape[1:]))
-            rows = torch.as_tensor(replay.places(lane, np.arange(low, high)), device=replay.device)
-            frames = torch.from_numpy(np.array(stored[low - first : high - first]))
-            replay.frames[rows] = frames.to(replay.device)
-            found += high - low
-        if found != end - start:
-            raise UserError(f"the logs in {self.folder} are damaged: they must hold {end - start:,} frames")
+
+def read_rows(save: Save, rank: int) -> dict[str, Any]:
+    """The rows that one process saved, but their frames.
+
+    Raises:
+        UserError: The file is damaged.
+    """
+    saved: dict[str, Any] = read_saved(save.folder / rows_file(rank), keys=(*COLUMNS, "episode", "first", "written"))
+    return saved
+
+
+def check_sizes(saved: Mapping[str, Any], replay: Replay, save: Save) -> None:
+    """Refuse saved rows that do not fit a replay.
+
+    Raises:
+        UserError: The lanes, actions, beliefs or labels of the save have other sizes.
+    """
+    columns = ("actions", "deter", "labels")
+    sizes = (len(saved["written"]), *(saved[name].shape[1] for name in columns))
+    own = (replay.num_lanes, *(getattr(replay, name).shape[1] for name in columns))
+    if sizes != own:
+        raise UserError(
+            f"the replay in {save.folder} has (environments, action, deter, labels) {sizes}, this run {own}"
+        )
+
+
+def read_frames(replay: Replay, places: np.ndarray, log: Log, numbers: np.ndarray) -> None:
+    """Reads frames from a log into a replay.
+
+    Args:
+        replay: The replay.
+        places: Rows of the replay for the frames, int64 (n,).
+        log: The log.
+        numbers: Rows of the log with the frames, ascending, int64 (n,).
+
+    Raises:
+        UserError: The log lacks frames.
+    """
+    found = 0
+    for first, count, path in log.rows():
+        low, high = np.searchsorted(numbers, (first, first + count))
+        if low >= high:
+            continue
+        stored = np.memmap(path, np.uint8, "r", shape=(count, *replay.frames.shape[1:]))
+        rows = torch.as_tensor(places[low:high], device=replay.device)
+        replay.frames[rows] = torch.from_numpy(stored[numbers[low:high] - first]).to(replay.device)
+        found += high - low
+    if found != len(numbers):
+        raise UserError(f"the logs in {log.folder} are damaged: they must hold {len(numbers):,} frames")
 
 
 def save_replay(replay: Replay, folder: Path, note: Mapping[str, Any]) -> None:
@@ -125,9 +172,9 @@ class Counts(NamedTuple):
     recorded_rows: int
 
 
-def count_saved(save: Save) -> Counts:
-    """What a saved replay holds, without its frames."""
-    saved = read_saved(save.folder / ROWS_FILE, keys=("first", "written"))
+def count_saved(save: Save, rank: int = 0) -> Counts:
+    """What the saved replay of one process holds, without its frames."""
+    saved = read_saved(save.folder / rows_file(rank), keys=("first", "written"))
     recorded = int(saved.get("num_recorded", 0))  # saves of earlier versions lack it
     rows = (saved["written"] - saved["first"]).tolist()
     lanes = rows[:-1] if recorded else rows

@@ -6,6 +6,7 @@ import csv
 import sys
 import warnings
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -20,6 +21,7 @@ from latentplan.training.collection.collector import Collected
 from latentplan.training.collection.episodes import Stopped
 from latentplan.training.collection.process import RemoteWorker, Worker, WorkerEnded
 from latentplan.training.learner.batches import updates_per_epoch
+from latentplan.training.ranks import ALONE, Ranks
 from latentplan.training.state import RunState
 
 if TYPE_CHECKING:
@@ -41,6 +43,9 @@ class Collect(lightning.Callback):
     resumed run makes the same requests again, from the same state of the collector. A worker whose process ended is
     replaced in the same way.
 
+    Where several ranks learn together, each collects its share of a round in a worker of its own, and rank 0 evaluates.
+    Nobody stores a round or an evaluation before all have it, so that the clocks of all ranks agree.
+
     Args:
         config: Settings of the run.
         replay: Stores the collected rows.
@@ -49,6 +54,7 @@ class Collect(lightning.Callback):
         videos: Folder for the films of evaluations.
         requests: Requests of the save from which the run resumes; None in a new run.
         memory: State of the collector in that save; None in a new run.
+        ranks: The processes that learn together.
 
     Attributes:
         requests: Arguments of the round (`collect`) and clocks of the evaluation (`evaluate`) that the worker was asked
@@ -67,14 +73,17 @@ class Collect(lightning.Callback):
         videos: Path,
         requests: dict[str, Any] | None = None,
         memory: dict[str, Any] | None = None,
+        ranks: Ranks = ALONE,
     ) -> None:
         self.config, self.replay, self.state, self.worker, self.videos = config, replay, state, worker, videos
+        self.ranks = ranks
         self.requests: dict[str, Any] = requests or {"collect": None, "evaluate": None, "weights": None}
         self.memory = memory
         self.is_epoch_over = False
         self.evaluated_weights: dict[str, np.ndarray] = {}
         self._is_continued = requests is not None
-        self._earlier_restarts = state.worker_restarts
+        self._earlier_restarts, self._own_restarts = state.worker_restarts, 0
+        self._other_env_restarts, self._others_have_seen_end = 0, False  # of other ranks
 
     def on_train_epoch_start(self, trainer: lightning.Trainer, learner: Learner) -> None:  # type: ignore[override]
         """Store the results that were requested one epoch ago, and request the next round and evaluation."""
@@ -83,6 +92,7 @@ class Collect(lightning.Callback):
             self._start_epoch(learner)
         except Stopped:
             pass
+        agree_on_signals(self.state, self.ranks)
         if self.state.interrupted:
             trainer.should_stop = True
 
@@ -106,7 +116,7 @@ class Collect(lightning.Callback):
     @property
     def env_restarts(self) -> int:
         """Environments that were made anew after a fault, over the run until its last round that was stored."""
-        return 0 if self.memory is None else int(self.memory["restarts"])
+        return self._other_env_restarts + (0 if self.memory is None else int(self.memory["restarts"]))
 
     def film_path(self, clocks: Mapping[str, Any]) -> Path:
         """Where the film of the evaluation at these clocks lies, if it was filmed; named by frames, or by updates."""
@@ -146,15 +156,20 @@ class Collect(lightning.Callback):
             Stopped: The run was interrupted; requests without an answer stay.
             WorkerEnded: The collection process ended too often.
         """
-        while True:
-            try:
-                return self._store_results()
-            except WorkerEnded as error:
-                self.replace_worker(error)
-            except RuntimeError:  # a signal to the whole process group also ends the environments
-                if self.state.interrupted:
-                    raise Stopped from None
-                raise
+        if self.requests["collect"] is not None:
+            fault = self._store_round()
+            self.requests["collect"] = None
+            if fault is not None:
+                raise fault
+        if self.requests["evaluate"] is not None:
+            returns = self.ranks.lead(self._await_result)
+            clocks, self.evaluated_weights = self.requests["evaluate"], self.requests["weights"]
+            entry = clocks | {mode: float(np.mean(values)) for mode, values in returns.items()}
+            self.state.evaluations.append(entry)
+            # Set only now, so that a resumed run repeats an evaluation that was interrupted.
+            self.state.next_evaluation = self._evaluation_after(entry)
+            self.requests["evaluate"] = None
+        self._notice_end()
 
     def _start_epoch(self, learner: Learner) -> None:
         state = self.state
@@ -211,20 +226,27 @@ class Collect(lightning.Callback):
             return clocks["env_frames"]
         return int(clocks["updates"] * repeat / collection.updates_per_decision)
 
-    def _store_results(self) -> None:
-        if self.requests["collect"] is not None:
-            fault = self._store_round(self.worker.result())
-            self.requests["collect"] = None
-            if fault is not None:
-                raise fault
-        if self.requests["evaluate"] is not None:
-            returns = self.worker.result()
-            clocks, self.evaluated_weights = self.requests["evaluate"], self.requests["weights"]
-            entry = clocks | {mode: float(np.mean(values)) for mode, values in returns.items()}
-            self.state.evaluations.append(entry)
-            # Set only now, so that a resumed run repeats an evaluation that was interrupted.
-            self.state.next_evaluation = self._evaluation_after(entry)
-            self.requests["evaluate"] = None
+    def _await_result(self) -> Any:
+        """The next result of the worker; a worker whose process ended is replaced, and repeats its requests."""
+        while True:
+            try:
+                return self.worker.result()
+            except WorkerEnded as error:
+                self.replace_worker(error)
+            except RuntimeError:  # a signal to the whole process group also ends the environments
+                if self.state.received:
+                    raise Stopped from None
+                raise
+
+    def _notice_end(self) -> None:
+        """Tell the own worker that an episode of another rank ended in a terminal state."""
+        if self._others_have_seen_end and self.memory is not None and not self.memory["has_seen_end"]:
+            self.memory["has_seen_end"] = True
+            try:
+                self.worker.submit("notice_end")
+                self.worker.result()
+            except WorkerEnded as error:
+                self.replace_worker(error)
 
     def replace_worker(self, error: WorkerEnded) -> None:
         """Start a new collection process in place of one that ended, and repeat the requests.
@@ -233,12 +255,12 @@ class Collect(lightning.Callback):
             WorkerEnded: Too many processes have ended since the run was started or resumed.
         """
         state = self.state
-        limit = self._earlier_restarts + WORKER_RESTARTS
-        while isinstance(self.worker, RemoteWorker) and state.worker_restarts < limit:
+        while isinstance(self.worker, RemoteWorker) and self._own_restarts < WORKER_RESTARTS:
             state.worker_restarts += 1
-            count = state.worker_restarts - self._earlier_restarts
+            self._own_restarts += 1
             warnings.warn(
-                f"{error}: it is started again ({count} of {WORKER_RESTARTS} times), and repeats its round",
+                f"{error}: it is started again ({self._own_restarts} of {WORKER_RESTARTS} times), and repeats its "
+                "round",
                 RuntimeWarning,
                 stacklevel=2,
             )
@@ -276,23 +298,46 @@ class Collect(lightning.Callback):
         return -(-(frames - self.state.env_frames) // self.config.env.action_repeat)
 
     def _submit_round(self) -> None:
-        self.worker.submit("collect", self.requests["weights"], *self.requests["collect"].values())
+        arguments = self.requests["collect"]
+        share = -(-arguments["decisions"] // self.ranks.size)
+        self.worker.submit("collect", self.requests["weights"], *(arguments | {"decisions": share}).values())
 
     def _submit_evaluation(self) -> None:
+        if not self.ranks.is_first:
+            return
         settings = self.config.evaluation
         film = self.film_path(self.requests["evaluate"]) if settings.video else None
         self.worker.submit("evaluate", settings.episodes, film, self.requests["weights"])
 
-    def _store_round(self, collected: Collected) -> EnvironmentFault | None:
-        """Stores a round, and returns the fault that ended it early."""
-        for lane, rows in enumerate(collected.rows):
+    def _store_round(self) -> EnvironmentFault | None:
+        """Stores a round once all ranks have it, and returns the fault that ended it early on one of them."""
+        own: list[Collected] = []
+
+        def take() -> tuple[Collected, int]:
+            own.append(self._await_result())
+            facts = {name: (own[0].memory or {}).get(name, 0) for name in ("restarts", "has_seen_end")}
+            return replace(own[0], rows=[], memory=facts), self._own_restarts
+
+        rounds, restarts = zip(*self.ranks.together(take), strict=True)
+        for lane, rows in enumerate(own[0].rows):
             self.replay.add(lane, rows)
-        self.state.env_frames += collected.env_frames
-        self.state.decisions += collected.decisions
-        self.state.rounds += 1
-        self.state.episode_returns.extend(collected.episode_returns)
-        self.memory = collected.memory
-        return collected.fault
+        state, self.memory = self.state, own[0].memory
+        state.env_frames += sum(part.env_frames for part in rounds)
+        state.decisions += sum(part.decisions for part in rounds)
+        state.rounds += 1
+        state.worker_restarts = self._earlier_restarts + sum(restarts)
+        others = [part.memory for rank, part in enumerate(rounds) if rank != self.ranks.rank]
+        self._other_env_restarts = sum(memory["restarts"] for memory in others)
+        self._others_have_seen_end = any(memory["has_seen_end"] for memory in others)
+        for part in rounds:
+            state.episode_returns.extend(part.episode_returns)
+        return next((part.fault for part in rounds if part.fault is not None), None)
+
+
+def agree_on_signals(state: RunState, ranks: Ranks) -> None:
+    """Stops the run on all ranks if one of them has received a signal; every rank must call this at the same time."""
+    if ranks.size > 1:
+        state.interrupted = ranks.largest(state.received)
 
 
 def copy_weights(model: WorldModel) -> dict[str, np.ndarray]:

@@ -21,19 +21,20 @@ class Progress:
 
     Args:
         run: Budget of the run, from which the remaining time is estimated.
+        is_quiet: Whether nothing is shown, because another process of the run shows its progress.
 
     Attributes:
         console: Prints lines that stay.
         episode_return: Mean return of the latest collected episodes, or None.
     """
 
-    def __init__(self, run: RunConfig) -> None:
-        self.run, self.console = run, Console(highlight=False)
+    def __init__(self, run: RunConfig, is_quiet: bool = False) -> None:
+        self.run, self.console = run, Console(highlight=False, quiet=is_quiet)
         self.episode_return: float | None = None
         self._evaluation = ""
         self._last_time, self._last_updates = time.monotonic(), 0
         self._rate = 0.0
-        self._live = self.console.status("starting") if self.console.is_terminal else None
+        self._live = self.console.status("starting") if self.console.is_terminal and not is_quiet else None
 
     def start(self, updates: int) -> None:
         """Start the display of a run that has made `updates` updates before."""

@@ -21,23 +21,25 @@ UPDATE_S = 1e-3  # of the smallest update
 def count_replay_rows(config: Config, num_saved: int = 0) -> int:
     """Rows of the replay for collection: `replay.capacity`, or else enough for everything that the run collects.
 
-    A run that collects nothing has one row for each environment, so that it may collect when it resumes.
+    Of several learning processes, each has a replay for its share. A run that collects nothing has one row for each
+    environment, so that it may collect when it resumes.
 
     Args:
         config: Settings of the run.
-        num_saved: Rows that were saved. Without `replay.capacity` all of them fit.
+        num_saved: Rows that were saved, or the share of them. Without `replay.capacity` all of them fit.
     """
+    ranks = config.run.num_ranks
     if not config.collection.enabled:
         return max(config.env.num_envs, num_saved)
     if config.replay.capacity is not None:
-        return config.replay.capacity
+        return -(-config.replay.capacity // ranks)
     if config.run.frames is None:
-        return max(UNKNOWN_LENGTH_CAPACITY, num_saved)
+        return max(-(-UNKNOWN_LENGTH_CAPACITY // ranks), num_saved)
     # Up to two rounds exceed the budget, and every episode ends with one frame without an action.
     decisions = config.run.frames / config.env.action_repeat
     per_episode = min(config.collection.episode_decisions or 20, 20)
     collected = 2 * config.collection.round_decisions + config.collection.prefill_decisions
-    return max(int((1.0 + 1.0 / per_episode) * decisions) + collected, num_saved)
+    return max(-(-(int((1.0 + 1.0 / per_episode) * decisions) + collected) // ranks), num_saved)
 
 
 def check_run(config: Config) -> None:
@@ -49,6 +51,7 @@ def check_run(config: Config) -> None:
         UserError: The parts of the run do not fit into the free memory, or a decision would take minutes.
     """
     on_device = config.run.device != "cpu" and has_cuda()
+    devices = config.run.devices  # processes that share the main memory
     learning = [
         estimate_model(config.model, LEARNING_COPIES, frame_size=config.env.frame_size),
         _estimate_update(config),
@@ -57,10 +60,10 @@ def check_run(config: Config) -> None:
     search = estimate_search(config.planner, config.model, on_device and not config.collection.overlap)
     replay = [_estimate_replay(config)]
     if not on_device:
-        check_parts([*learning, *collecting, *replay, search], free_memory())
+        check_parts([*learning, *collecting, *replay, search], free_memory() // devices)
         return
     check_parts([*learning, *(replay if config.replay.on_device else ())], LARGEST_DEVICE, "the device")
-    check_parts([*collecting, *(() if config.replay.on_device else replay), search], free_memory())
+    check_parts([*collecting, *(() if config.replay.on_device else replay), search], free_memory() // devices)
 
 
 def count_frame_bytes(config: Config) -> int:
@@ -74,8 +77,9 @@ def _estimate_update(config: Config) -> Part:
     pictures = sum(channels * side * side for channels, side in zip(model.encoder_channels, sides, strict=True))
     pictures += 5 * 64 * model.decoder_channels + count_frame_bytes(config) // 4  # the decoded picture
     beliefs = 6 * model.deter_dim + 8 * model.hidden_dim
-    frames = learning.batch_size * (learning.sequence_length + 1)
-    imagined = learning.imagination_starts * (learning.imagination_horizon + 1)
+    ranks = config.run.num_ranks  # which share the batch
+    frames = learning.batch_size // ranks * (learning.sequence_length + 1)
+    imagined = learning.imagination_starts // ranks * (learning.imagination_horizon + 1)
     num_bytes = frames * (count_frame_bytes(config) + 4 * (pictures + beliefs)) + 4 * imagined * beliefs
     advice = "--learning.batch_size, --learning.sequence_length, --learning.imagination_starts or the horizon there"
     seconds = config.collection.updates_per_decision * UPDATE_S

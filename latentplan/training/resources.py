@@ -10,25 +10,29 @@ from latentplan.config.estimates import count_cores
 COLLECTOR_THREADS = 4  # an upper limit, because runs often share a machine
 
 
-def choose_device(run: RunConfig) -> torch.device:
+def choose_device(run: RunConfig, number: int = 0) -> torch.device:
     """The device on which a run learns; "auto" takes CUDA if there is one.
+
+    Where several processes learn on one machine, each asks for a GPU by its `number`.
 
     Raises:
         UserError: The settings ask for CUDA, but torch finds no CUDA device.
     """
     if run.device == "cuda" and not torch.cuda.is_available():
         raise UserError("device cuda was asked for, but torch finds no CUDA device: use --device cpu")
-    if run.device == "auto":
-        return torch.device("cuda" if torch.cuda.is_available() else "cpu")
-    return torch.device(run.device)
+    is_cuda = run.device == "cuda" or (run.device == "auto" and torch.cuda.is_available())
+    if not is_cuda:
+        return torch.device("cpu")
+    return torch.device("cuda", number) if run.devices > 1 else torch.device("cuda")
 
 
-def choose_threads(overlap: bool) -> int:
+def choose_threads(overlap: bool, processes: int = 1) -> int:
     """CPU threads of each half of an update: of the world model, and of the behaviour, which learn at the same time.
 
-    No two busy threads share a core. With `overlap` one core is left to the collection process.
+    No two busy threads share a core, as far as the cores suffice for as many learning processes. With `overlap` one
+    core is left to each collection process.
     """
-    return max(1, (count_cores() - overlap) // 2)
+    return max(1, (count_cores() // processes - overlap) // 2)
 
 
 def choose_collector_threads(device: torch.device) -> int:

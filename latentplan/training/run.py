@@ -20,37 +20,36 @@ import numpy as np
 import torch
 from lightning.pytorch.utilities.exceptions import SIGTERMException
 
-from latentplan import __version__
 from latentplan.agents.checkpoint import INFO, load_model
 from latentplan.agents.files import is_checkpoint
-from latentplan.config import USER_DOMAIN, Config, Device, EnvironmentFault, UserError, derive_seed
+from latentplan.config import USER_DOMAIN, Config, Device, EnvironmentFault, Strategy, UserError, derive_seed
 from latentplan.config.commit import Save
 from latentplan.config.env_id import as_file_name, repeat_flag
 from latentplan.config.files import dump_config, read_config
 from latentplan.config.origin import present_facts
 from latentplan.config.run_folder import RUN_FILE, SAVES_FOLDER, lock_folder, read_run_config, run_saves
-from latentplan.config.run_results import METRICS_FILE, note_state, read_evaluations, read_facts
-from latentplan.config.writing import write_whole
+from latentplan.config.run_results import METRICS_FILE, note_state, read_facts
 from latentplan.envs import default_task
-from latentplan.evaluation.statistics import confidence_interval
 from latentplan.models import WorldModel
 from latentplan.models.fast import accelerate
 from latentplan.replay.buffer import Replay
+from latentplan.replay.dealing import DealtRows, count_ranks
 from latentplan.replay.disk import Counts, ReplayFiles, count_saved
-from latentplan.reporting.report import ReportData, Returns, render_report
-from latentplan.training.callbacks import Collect, Record, copy_weights
+from latentplan.training.callbacks import Collect, Record, agree_on_signals, copy_weights
 from latentplan.training.checks import check_folder, check_settings
 from latentplan.training.collection.collector import Description, EnvFactory
 from latentplan.training.collection.episodes import Stopped, to_arrays
 from latentplan.training.collection.keeping import refuse_used_folder
 from latentplan.training.collection.process import Worker, WorkerEnded, make_worker
 from latentplan.training.console import Progress
-from latentplan.training.demonstrations.seeding import read_demonstrations, seed_replay
+from latentplan.training.demonstrations.seeding import count_rows, read_demonstrations, seed_replay
 from latentplan.training.estimates import count_replay_rows
+from latentplan.training.facts import agent_facts, describe_change, describe_run, meet_ranks, write_report
 from latentplan.training.learner.batches import ReplayBatches, ReplayData
 from latentplan.training.learner.curriculum import Curriculum
 from latentplan.training.learner.graphed import make_learner
 from latentplan.training.learner.skips import NotFiniteError
+from latentplan.training.ranks import Ranks, join_ranks, place_ranks
 from latentplan.training.resources import choose_device, choose_threads, set_up_torch
 from latentplan.training.saving import Guard, Restore, Stop
 from latentplan.training.saving import Save as SaveRun
@@ -58,7 +57,7 @@ from latentplan.training.signals import Signals, exit_code
 from latentplan.training.state import (
     RunState,
     SavedRun,
-    read_state,
+    read_saved_run,
     refuse_used,
     restore_learner,
     restore_metrics,
@@ -69,7 +68,6 @@ from latentplan.training.trackers import Trackers
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-REPORT_FILE = "report.html"
 DISK_ERRORS = (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EIO)  # of which some do not name a file
 
 
@@ -97,7 +95,8 @@ def train(config: Config, make_env: EnvFactory | None = None) -> Result:
             the suite's task that `config.env` names.
 
     Returns:
-        The folder, exit code and summary of the run.
+        The folder, exit code and summary of the run. Where several processes learn together, each runs the calling
+        program up to here, and only the first one gets a summary.
 
     Raises:
         UserError: The settings, the environment or the machine do not allow the run.
@@ -133,6 +132,9 @@ def resume(
     minutes: float | None = None,
     updates: int | None = None,
     device: Device | None = None,
+    devices: int | None = None,
+    nodes: int | None = None,
+    strategy: Strategy | None = None,
     make_env: EnvFactory | None = None,
 ) -> Result:
     """Continues a run from its last save: weights, optimizers, replay, clocks, random streams and running episodes.
@@ -146,6 +148,10 @@ def resume(
         minutes: New total budget of minutes.
         updates: New total budget of updates.
         device: New device; None keeps the old device.
+        devices: New number of learning processes on each machine; None keeps the old number. Another number deals the
+            rows of all replays anew, and running episodes begin again.
+        nodes: New number of machines; None keeps the old number.
+        strategy: How several processes learn together; None keeps it.
         make_env: Makes the user's environment, as for `train`.
 
     Returns:
@@ -165,20 +171,27 @@ def resume(
     run = config.run
     if frames is not None or minutes is not None or updates is not None:
         run = replace(run, frames=frames, minutes=minutes, updates=updates)
-    if device is not None:
-        run = replace(run, device=device)
+    given = {"device": device, "devices": devices, "nodes": nodes, "strategy": strategy}
+    run = replace(run, **{name: value for name, value in given.items() if value is not None})  # type: ignore[arg-type]
     return _start(replace(config, run=run), folder, make_env, resume=True)
 
 
 def _start(config: Config, folder: Path, make_env: EnvFactory | None, *, resume: bool) -> Result:
     """Runs until the end, an interruption or an error; goes back to the last save after too many skipped steps."""
+    config = place_ranks(config)
     check_settings(config)
+    ranks = join_ranks(config)
+    config, folder = ranks.lead(lambda: (config, folder))
+    if not ranks.is_first:
+        return _follow(config, folder, make_env, ranks, resume=resume)
     with lock_folder(folder), Signals() as signals:
         facts = present_facts(config.run.device != "cpu" and torch.cuda.is_available())
         run_id = read_facts(folder).get("run_id") or uuid.uuid4().hex[:8]
         note_state(folder, "running", run_id=run_id, command=shlex.join(sys.argv), **facts)
         try:
-            result = _run_until_end(config, folder, make_env, signals, resume=resume)
+            meet_ranks(ranks, folder, run_id)
+            result = _run_until_end(config, folder, make_env, signals, ranks, resume=resume)
+            ranks.together(lambda: None)
         except BaseException as error:
             with contextlib.suppress(OSError):  # a full disk may be the reason
                 note_state(folder, "failed", reason=" ".join(str(error).split()) or type(error).__name__)
@@ -187,20 +200,36 @@ def _start(config: Config, folder: Path, make_env: EnvFactory | None, *, resume:
         return result
 
 
+def _follow(config: Config, folder: Path, make_env: EnvFactory | None, ranks: Ranks, *, resume: bool) -> Result:
+    """Runs as a rank above 0, until all ranks end; rank 0 alone reports errors, and its exit code counts.
+
+    Lightning would kill all processes if this one ended with another exit code than 0.
+    """
+    try:
+        with Signals() as signals:
+            meet_ranks(ranks, folder)
+            _run_until_end(config, folder, make_env, signals, ranks, resume=resume)
+            ranks.together(lambda: None)
+    except (UserError, NotFiniteError):
+        raise SystemExit(0) from None
+    return Result(folder, 0, {})
+
+
 def _run_until_end(
-    config: Config, folder: Path, make_env: EnvFactory | None, signals: Signals, *, resume: bool
+    config: Config, folder: Path, make_env: EnvFactory | None, signals: Signals, ranks: Ranks, *, resume: bool
 ) -> Result:
     failed_at = -1
     while True:
         try:
-            return _Run(config, folder, make_env, signals, resume=resume).execute()
+            return _Run(config, folder, make_env, signals, ranks, resume=resume).execute()
         except NotFiniteError as error:
             if error.update <= failed_at:
                 raise  # the same again: another try would end here too
             failed_at, resume = error.update, True
-            warnings.warn(f"{error}: the run goes back to its last save", RuntimeWarning, stacklevel=3)
+            if ranks.is_first:
+                warnings.warn(f"{error}: the run goes back to its last save", RuntimeWarning, stacklevel=3)
         except Stopped:  # while the run was being set up, from which nothing is lost
-            return Result(folder, exit_code(signals.received), {})
+            return Result(folder, exit_code(ranks.largest(signals.received)), {})
         except WorkerEnded as error:
             raise UserError(f"{error}; the run has stopped, and --resume {folder} continues it") from error
         except OSError as error:
@@ -217,21 +246,28 @@ class _Run:
     """A run with its worker, replay, learner, curriculum and display."""
 
     def __init__(
-        self, config: Config, folder: Path, make_env: EnvFactory | None, signals: Signals, *, resume: bool
+        self,
+        config: Config,
+        folder: Path,
+        make_env: EnvFactory | None,
+        signals: Signals,
+        ranks: Ranks,
+        *,
+        resume: bool,
     ) -> None:
-        self.config, self.folder, self.signals = config, folder, signals
+        self.config, self.folder, self.signals, self.ranks = config, folder, signals, ranks
         self.trackers: Trackers | None = None
         self.saves = run_saves(folder)
-        self.saves.remove_leftovers()
-        save = self._find_save() if resume else None
+        save = ranks.lead(self._find_save) if resume else None
         self.demonstrations = [] if resume else read_demonstrations(config, make_env)
-        self.device = choose_device(config.run)
-        self.console = Progress(config.run)
-        set_up_torch(config.run.threads or choose_threads(config.collection.overlap), self.device)
-        self.worker: Worker = make_worker(config, make_env, self.device, lambda: signals.received > 0)
+        self.device = choose_device(config.run, ranks.device)
+        self.console = Progress(config.run, is_quiet=not ranks.is_first)
+        set_up_torch(config.run.threads or choose_threads(config.collection.overlap, config.run.devices), self.device)
+        own = ranks.own_config(config)
+        self.worker: Worker = make_worker(own, make_env, self.device, lambda: signals.received > 0)
         try:
             self.worker.submit("describe")
-            self.description: Description = self.worker.result()
+            self.description: Description = ranks.together(self.worker.result)[ranks.rank]
             self._build(save)
         except BaseException:
             self.worker.close()
@@ -239,22 +275,26 @@ class _Run:
 
     def _find_save(self) -> Save:
         """The newest save that is whole; warns of newer ones that are not."""
+        self.saves.remove_leftovers()
         save, problems = self.saves.newest()
         warn_of_loss(save, problems)
         return save
 
     def _build(self, save: Save | None) -> None:
-        config = self.config
-        saved: SavedRun | None = None if save is None else read_state(save)
+        config, ranks = self.config, self.ranks
+        saved: SavedRun | None = None if save is None else read_saved_run(save, ranks)
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(derive_seed(config.run.seed, "weights"))
             facts = self.description
             model = WorldModel(config.model, facts.action_dim, facts.labels, spaces=facts.spaces).to(self.device)
         accelerate(model)
         replay_device = self.device if config.replay.on_device else torch.device("cpu")
-        saved_rows = Counts(0, 0, sum(each.num_rows for each in self.demonstrations))
+        saved_rows, dealt = Counts(0, 0, count_rows(self.demonstrations, ranks.rank, ranks.size)), None
         if save is not None:
-            saved_rows = count_saved(save)
+            if (before := count_ranks(save)) != ranks.size:
+                dealt = DealtRows(save, ranks.rank, ranks.size)
+                self.console.console.print(describe_change(before, ranks.size), soft_wrap=True)
+            saved_rows = count_saved(save, ranks.rank) if dealt is None else dealt.counts
         self.replay = Replay(
             count_replay_rows(config, saved_rows.num_lanes * saved_rows.lane_rows),
             model.action_dim,
@@ -265,25 +305,28 @@ class _Run:
             model.spaces.frame_shape,
             saved_rows.recorded_rows,
         )
-        self.files = ReplayFiles(self.folder / SAVES_FOLDER, self.replay)
+        self.files = ReplayFiles(self.folder / SAVES_FOLDER, self.replay, ranks.rank)
         self.saved, self.state = saved, RunState() if saved is None else saved.state
         self.signals.receive = self._interrupt
-        self.state.interrupted = self.signals.received
+        self._interrupt(self.signals.received)
         self.curriculum = Curriculum(config, model.labels, self.state)
-        self.learner = make_learner(model, config, self.description.discount, self.replay, self.curriculum)
+        self.learner = make_learner(model, config, self.description.discount, self.replay, self.curriculum, ranks)
         if save is not None and saved is not None:
-            self.files.read(save)
+            self.files.read(save) if dealt is None else dealt.fill(self.replay)
             restore_learner(self.learner, saved.learner, self.folder)
-            restore_metrics(save, self.folder)
+            if ranks.is_first:
+                restore_metrics(save, self.folder)
         else:
-            seed_replay(self.replay, self.demonstrations)
-        has_seen_end = saved is not None and saved.memory is not None and bool(saved.memory["has_seen_end"])
+            seed_replay(self.replay, self.demonstrations, ranks.rank, ranks.size)
+        has_seen_end = saved is not None and saved.has_seen_end
         if has_seen_end or self.replay.has_recorded_end:
             self.worker.submit("notice_end")
             self.worker.result()
 
     def _interrupt(self, number: int) -> None:
-        self.state.interrupted = number
+        self.state.received = number
+        if self.ranks.size == 1:  # several ranks agree later, all at the same time
+            self.state.interrupted = number
 
     def execute(self) -> Result:
         """Learn until the budget is spent or a signal arrives, then evaluate."""
@@ -298,25 +341,25 @@ class _Run:
             self.worker.close()
 
     def _execute(self) -> Result:
-        config, saved, state = self.config, self.saved, self.state
+        config, saved, state, ranks = self.config, self.saved, self.state, self.ranks
         self._print_settings()
         videos = self.folder / "videos"
         videos.mkdir(exist_ok=True)
-        resumed = () if saved is None else (to_arrays(saved.requests), to_arrays(saved.memory))
-        self.collect = collect = Collect(config, self.replay, state, self.worker, videos, *resumed)
+        asked, memory = (None, None) if saved is None else (to_arrays(saved.requests), to_arrays(saved.memory))
+        self.collect = collect = Collect(config, self.replay, state, self.worker, videos, asked, memory, ranks)
         optimizers = [] if saved is None else saved.optimizers
-        facts = self._agent_facts()
-        save = SaveRun(self.folder, config, collect, state, self.saves, self.files, facts, optimizers)
-        stop = Stop(config, state, self.signals)
-        run_id = read_facts(self.folder)["run_id"]
-        self.trackers = Trackers(config.run.logger, self.folder, config, run_id)
-        record = Record(self.folder / METRICS_FILE, state, collect, self.console, self.trackers)
-        callbacks = [collect, self.curriculum, record, Guard(self.folder), save, stop]
-        trainer = self._trainer([Restore(optimizers), *callbacks])
-        copy = self.saves.find(RUN_FILE)
-        if copy is None or read_config(copy) != config:
+        facts = agent_facts(config, self.description)
+        save = SaveRun(self.folder, config, collect, state, self.saves, self.files, facts, optimizers, ranks)
+        stop = Stop(config, state, self.signals, ranks)
+        records = []
+        if ranks.is_first:
+            self.trackers = Trackers(config.run.logger, self.folder, config, read_facts(self.folder)["run_id"])
+            records = [Record(self.folder / METRICS_FILE, state, collect, self.console, self.trackers)]
+        own = [collect, self.curriculum, *records, Guard(self.folder, ranks), save, stop]
+        trainer = self._trainer([Restore(optimizers), *own])
+        if ranks.lead(lambda: (copy := self.saves.find(RUN_FILE)) is None or read_config(copy) != config):
             save.save_run(trainer, self.learner)  # so that a run that ends before its next save can be resumed
-            dump_config(config, self.folder / RUN_FILE)
+            ranks.lead(lambda: dump_config(config, self.folder / RUN_FILE))
         try:
             if is_unfinished := not stop.is_spent(self.learner):
                 self._fit(trainer)
@@ -324,12 +367,15 @@ class _Run:
                 with contextlib.suppress(Stopped):
                     if not state.interrupted:
                         collect.complete()
-                record.write_evaluations()
+                agree_on_signals(state, ranks)
+                for record in records:
+                    record.write_evaluations()
                 save.keep_best(self.learner)
                 save.save(trainer, self.learner)
             with contextlib.suppress(Stopped):
                 if not state.interrupted:
                     return Result(self.folder, 0, self._finish(trainer, save, videos / "final.webm"))
+            agree_on_signals(state, ranks)
         except EnvironmentFault as fault:
             save.save(trainer, self.learner)
             raise EnvironmentFault(f"{fault}; the run is saved in {self.folder}", fault.origin) from None
@@ -353,7 +399,7 @@ class _Run:
         warnings.filterwarnings("ignore", module="lightning")
         return lightning.Trainer(
             accelerator="gpu" if self.device.type == "cuda" else "cpu",
-            devices=1,
+            devices=[self.ranks.device] if self.device.type == "cuda" else 1,  # of several ranks, each has a trainer
             max_epochs=-1,
             callbacks=callbacks,
             logger=False,  # `Record` writes the trackers
@@ -367,13 +413,10 @@ class _Run:
         clocks = save.clocks(self.learner)
         episodes = self.config.evaluation.final_episodes
         self.console.console.print(f"final evaluation: {episodes} episodes each of planner and actor")
-        settings = self.config.evaluation
-        film.unlink(missing_ok=True)  # of a run that was finished before and goes on
-        returns = self._evaluate(self.learner.averaged, film if settings.video else None, record=settings.report)
-        page = self._take_recording() if settings.report else None
+        returns, page = self.ranks.lead(lambda: self._evaluate_last(film))
         summary = {mode: float(np.mean(values)) for mode, values in returns.items()}
         info = clocks | {"final_evaluation": returns}
-        (self.folder / "final.json").write_text(json.dumps(info | summary, indent=1))
+        self.ranks.lead(lambda: (self.folder / "final.json").write_text(json.dumps(info | summary, indent=1)))
         save.save_agent("last", self.learner.averaged, info)
         done = f"{clocks['env_frames']:,} frames" if clocks["env_frames"] else f"{clocks['updates']:,} updates"
         self.console.console.print(
@@ -382,7 +425,7 @@ class _Run:
         )
         best = self.state.best_return
         if summary["planner"] < best:
-            best = self._evaluate_best()
+            best = self.ranks.lead(self._evaluate_best)
         if summary["planner"] >= best:
             save.save_agent("best", self.learner.averaged, info)
         self.state.best_return = max(best, summary["planner"])
@@ -390,10 +433,19 @@ class _Run:
         save.save_run(trainer, self.learner)
         if self.trackers is not None:
             self.trackers.log_film(film, step=clocks["env_frames"] or clocks["updates"])
-        if page is not None:
-            self._write_report(returns, page, film)
+        if page is not None and self.ranks.is_first:
+            report = write_report(self.config, self.folder, self.description.renderer, returns, page, film)
+            if report is not None:
+                self.console.console.print(f"report: {report}", soft_wrap=True)
         self.console.console.print(f"run folder: {self.folder}")
         return summary
+
+    def _evaluate_last(self, film: Path) -> tuple[dict[str, list[float]], dict[str, Any] | None]:
+        """Returns of the last agent, and what is recorded for the report, or None."""
+        settings = self.config.evaluation
+        film.unlink(missing_ok=True)  # of a run that was finished before and goes on
+        returns = self._evaluate(self.learner.averaged, film if settings.video else None, record=settings.report)
+        return returns, self._take_recording() if settings.report else None
 
     def _take_recording(self) -> dict[str, Any] | None:
         """What the worker recorded in the final evaluation; None if its process has ended."""
@@ -404,28 +456,6 @@ class _Run:
         except WorkerEnded as error:
             self.collect.replace_worker(error)
             return None
-
-    def _write_report(self, returns: Mapping[str, list[float]], page: Mapping[str, Any], film: Path) -> None:
-        """Writes the page of the run; an error becomes a warning, because the run itself is complete."""
-        env, deadline = self.config.env, self.config.planner.deadline_ms
-        deadlines = {"deadline of the search": deadline, "period of control": page["period_ms"]}
-        data = ReportData(
-            task=f"{env.domain}-{env.task}",
-            config=self.config,
-            returns=[Returns(mode, values, confidence_interval(values)) for mode, values in returns.items()],
-            film=film if film.exists() else None,
-            recording=page["recording"],
-            decision_ms=page["decision_ms"],
-            deadlines_ms={name: value for name, value in deadlines.items() if value is not None},
-            facts={"run folder": str(self.folder), **read_facts(self.folder), "renderer": self.description.renderer},
-        )
-        try:
-            data = replace(data, evaluations=read_evaluations(self.folder))
-            path = write_whole(self.folder / REPORT_FILE, render_report(data))
-        except Exception as error:
-            warnings.warn(f"no report of the run: {error}", RuntimeWarning, stacklevel=1)
-        else:
-            self.console.console.print(f"report: {path}", soft_wrap=True)
 
     def _evaluate(
         self, model: WorldModel, film: Path | None = None, actor: bool = True, record: bool = False
@@ -438,7 +468,7 @@ class _Run:
                 returns = self.worker.result()
             except WorkerEnded as error:
                 self.collect.replace_worker(error)
-        if self.state.interrupted:
+        if self.state.received:
             raise Stopped
         return returns
 
@@ -463,33 +493,8 @@ class _Run:
         return mean
 
     def _print_settings(self) -> None:
-        config, description, run, env = self.config, self.description, self.config.run, self.config.env
-        parameters = sum(parameter.numel() for parameter in self.learner.model.parameters())
-        budget = [f"{run.frames:,} frames"] if run.frames else []
-        budget += [f"{run.minutes:g} minutes"] if run.minutes else []
-        budget += [f"{run.updates:,} updates"] if run.updates else []
-        renderer = ", ".join(f"{name} {value}" for name, value in description.renderer.items())
-        rows, recorded = int(self.replay.sizes.sum()), self.replay.num_recorded
-        recorded_note = f", {recorded:,} of them recorded" if recorded else ""
-        lines = {
-            "task": f"{env.domain}-{env.task}, action repeat {env.action_repeat}{self.curriculum.note}",
-            **({} if config.env.objective is None else {"objective": config.env.objective}),
-            "device": f"{self.device}, {torch.get_num_threads()} threads",
-            "renderer": f"{renderer}; {description.render_ms:.1f} ms per frame, quality {config.env.render_quality}",
-            "parameters": f"{parameters:,}; discount {description.discount:g}",
-            "replay": f"{self.replay.num_bytes / 2**20:,.0f} MiB for {rows:,} frames{recorded_note}",
-            "budget": " or ".join(budget),
-            "run folder": str(self.folder),
-        }
+        lines = describe_run(
+            self.config, self.folder, self.description, self.replay, self.learner, self.curriculum.note, self.ranks.size
+        )
         for name, line in lines.items():
             self.console.console.print(f"{name:<12}{line}", soft_wrap=True)
-
-    def _agent_facts(self) -> dict[str, Any]:
-        return {
-            "format": 1,
-            "version": __version__,
-            "domain": self.config.env.domain,
-            "task": self.config.env.task,
-            "discount": self.description.discount,
-            "renderer": self.description.renderer,
-        }

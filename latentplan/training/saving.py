@@ -15,18 +15,19 @@ import torch
 
 from latentplan.agents.checkpoint import save_checkpoint
 from latentplan.config import Config
-from latentplan.config.commit import Extent, Saves
+from latentplan.config.commit import PART, Extent, Saves
 from latentplan.config.files import dump_config
 from latentplan.config.run_folder import RUN_FILE
 from latentplan.config.run_results import METRICS_FILE
 from latentplan.models import WorldModel
 from latentplan.replay.disk import ReplayFiles
-from latentplan.training.callbacks import Collect
+from latentplan.training.callbacks import Collect, agree_on_signals
 from latentplan.training.collection.episodes import to_tensors
 from latentplan.training.learner.optimization import load_optimizer_state, return_freed_memory
 from latentplan.training.learner.skips import LONGEST_STREAK, NotFiniteError
+from latentplan.training.ranks import ALONE, Ranks
 from latentplan.training.signals import Signals
-from latentplan.training.state import RunState, SavedRun, write_state
+from latentplan.training.state import RunState, SavedRun, memory_file, write_state
 
 if TYPE_CHECKING:
     from latentplan.training.learner.module import Learner
@@ -40,6 +41,9 @@ KEPT_BATCHES = 10
 class Save(lightning.Callback):
     """Saves the last agent, the best agent, and the state from which a run resumes.
 
+    Where several ranks learn together, all call every method at the same time. A save then holds the replay and the
+    collector of each rank; rank 0 writes everything else, which is the same on all ranks.
+
     Args:
         folder: Folder of the run.
         config: Settings of the run.
@@ -49,6 +53,7 @@ class Save(lightning.Callback):
         files: Writes the replay.
         facts: Facts of the run that are saved with every agent.
         optimizers: States that the optimizers were loaded with; saved again if the run ends before its first update.
+        ranks: The processes that learn together.
     """
 
     def __init__(
@@ -61,7 +66,9 @@ class Save(lightning.Callback):
         files: ReplayFiles,
         facts: dict[str, Any],
         optimizers: list[Any],
+        ranks: Ranks = ALONE,
     ) -> None:
+        self.ranks = ranks
         self.folder, self.config, self.collect, self.state, self.facts = folder, config, collect, state, facts
         self.saves, self.files = saves, files
         self._loaded_optimizers = optimizers
@@ -75,7 +82,9 @@ class Save(lightning.Callback):
 
     def on_train_epoch_end(self, trainer: lightning.Trainer, learner: Learner) -> None:  # type: ignore[override]
         """Save after every evaluation, and some minutes after the last save."""
-        if self.collect.is_epoch_over and (self._has_evaluated or self.state.minutes >= self._next_minutes):
+        if not self.collect.is_epoch_over:
+            return
+        if self._has_evaluated or self.ranks.largest(self.state.minutes >= self._next_minutes):
             self.save(trainer, learner)
 
     def keep_best(self, learner: Learner) -> bool:
@@ -118,6 +127,7 @@ class Save(lightning.Callback):
             to_tensors(self.collect.requests),
             to_tensors(self.collect.memory),
         )
+        shares = self.ranks.together(self._write_share)
 
         def write(part: Path) -> dict[str, Extent]:
             extents = self.files.write(part)
@@ -125,12 +135,33 @@ class Save(lightning.Callback):
             dump_config(self.config, part / RUN_FILE)
             if (self.folder / METRICS_FILE).exists():
                 shutil.copyfile(self.folder / METRICS_FILE, part / METRICS_FILE)
+            for rank, share in enumerate(shares):
+                extents |= share
+                for path in [] if rank == 0 else [*self._share_folder(rank).iterdir()]:
+                    path.rename(part / path.name)
             return extents
 
-        self.saves.commit(write, self.clocks(learner))
+        self.ranks.lead(lambda: self.saves.commit(write, self.clocks(learner)))
+        shutil.rmtree(self._share_folder(self.ranks.rank), ignore_errors=True)
+
+    def _write_share(self) -> dict[str, Extent]:
+        """Writes replay and collector of a rank above 0 beside the saves; returns the committed part of each log."""
+        if self.ranks.is_first:
+            return {}
+        folder = self._share_folder(self.ranks.rank)
+        shutil.rmtree(folder, ignore_errors=True)
+        folder.mkdir(parents=True)
+        torch.save({"memory": to_tensors(self.collect.memory)}, folder / memory_file(self.ranks.rank))
+        return self.files.write(folder)
+
+    def _share_folder(self, rank: int) -> Path:
+        return self.saves.folder / f"rank-{rank}{PART}"
 
     def save_agent(self, name: str, model: WorldModel, info: dict[str, Any]) -> None:
         """Save an agent in `checkpoints/<name>`, with the facts in `info` and the facts of the run."""
+        self.ranks.lead(lambda: self._save_agent(name, model, info))
+
+    def _save_agent(self, name: str, model: WorldModel, info: dict[str, Any]) -> None:
         facts = self.facts | info | {"metrics": self.state.evaluations}
         planner = self.config.planner
         if planner.use_continues is None:
@@ -167,11 +198,15 @@ class Guard(lightning.Callback):
     skipped is kept.
 
     Args:
-        folder: Folder of the run; batches are kept in `skipped/` there, at most 10.
+        folder: Folder of the run; batches are kept in `skipped/` there, at most 10. A rank above 0 keeps its shares of
+            them in a folder below.
+        ranks: The processes that learn together.
     """
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder: Path, ranks: Ranks = ALONE) -> None:
         self.folder = folder / SKIPPED_FOLDER
+        if not ranks.is_first:
+            self.folder /= f"rank-{ranks.rank}"
         self._seen = [0, 0]
 
     def on_train_start(self, trainer: lightning.Trainer, learner: Learner) -> None:  # type: ignore[override]
@@ -211,7 +246,7 @@ class Guard(lightning.Callback):
         path = self.folder / f"{name}-{learner.updates:09d}.pt"
         if path.exists() or len(list(self.folder.glob("*.pt"))) >= KEPT_BATCHES:
             return
-        self.folder.mkdir(exist_ok=True)
+        self.folder.mkdir(parents=True, exist_ok=True)
         torch.save(
             {
                 part: value.cpu()
@@ -234,10 +269,11 @@ class Stop(lightning.Callback):
         config: Settings of the run, with its budget.
         state: Clocks of the run, and whether a signal interrupted it.
         signals: Handles signals, also while Lightning runs.
+        ranks: The processes that learn together, which stop together.
     """
 
-    def __init__(self, config: Config, state: RunState, signals: Signals) -> None:
-        self.run, self.state, self.signals = config.run, state, signals
+    def __init__(self, config: Config, state: RunState, signals: Signals, ranks: Ranks = ALONE) -> None:
+        self.run, self.state, self.signals, self.ranks = config.run, state, signals, ranks
 
     def on_train_start(self, trainer: lightning.Trainer, learner: lightning.LightningModule) -> None:
         """Handle signals in place of Lightning, whose handler would lose the run."""
@@ -245,11 +281,13 @@ class Stop(lightning.Callback):
 
     def on_train_batch_end(self, trainer: lightning.Trainer, *_: Any) -> None:  # type: ignore[override]
         """Stop between two updates when the minutes are spent or a signal has arrived."""
-        if self.state.interrupted or self._is_time_spent():
+        agree_on_signals(self.state, self.ranks)
+        if self._is_time_spent() or self.state.interrupted:
             trainer.should_stop = True
 
     def on_train_epoch_end(self, trainer: lightning.Trainer, learner: Learner) -> None:  # type: ignore[override]
         """Stop after the epoch that learned from the last round."""
+        agree_on_signals(self.state, self.ranks)
         if self.state.interrupted or self.is_spent(learner):
             trainer.should_stop = True
 
@@ -262,4 +300,4 @@ class Stop(lightning.Callback):
         return self._is_time_spent() or (frames is not None and state.env_frames >= frames and has_learned)
 
     def _is_time_spent(self) -> bool:
-        return self.run.minutes is not None and self.state.minutes >= self.run.minutes
+        return self.run.minutes is not None and bool(self.ranks.largest(self.state.minutes >= self.run.minutes))

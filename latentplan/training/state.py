@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 import warnings
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -18,6 +18,8 @@ from latentplan.config.run_folder import RUN_FILE, SAVES_FOLDER
 from latentplan.config.run_results import METRICS_FILE
 from latentplan.config.writing import replaced_whole
 from latentplan.replay.buffer import read_saved
+from latentplan.replay.dealing import count_ranks
+from latentplan.training.ranks import Ranks
 
 if TYPE_CHECKING:
     from latentplan.training.learner.module import Learner
@@ -45,7 +47,9 @@ class RunState:
         episode_returns: Returns of collected episodes that no row of metrics has counted yet.
         curriculum_over: Whether the value head was reset after the curriculum's task.
         worker_restarts: Collection processes that ended and were replaced.
-        interrupted: Number of the signal that asked to stop; 0 without one.
+        interrupted: Number of the signal that asked to stop, on which all processes that learn together have agreed; 0
+            without one.
+        received: Number of the signal that this process has received; 0 without one.
         started: Time from which `minutes` counts on, in seconds of the monotonic clock of this process.
     """
 
@@ -63,6 +67,7 @@ class RunState:
     curriculum_over: bool = False
     worker_restarts: int = 0
     interrupted: int = 0
+    received: int = 0
     started: float = field(default_factory=time.monotonic)
 
     @property
@@ -75,9 +80,9 @@ class RunState:
         self.earlier_minutes, self.started = minutes, time.monotonic()
 
     def to_dict(self) -> dict[str, Any]:
-        """The fields that are saved: all but `started` and `interrupted`, which belong to this process."""
+        """The fields that are saved: all but `started`, `interrupted` and `received`, which belong to this process."""
         values = asdict(self) | {"earlier_minutes": self.minutes}
-        return {name: value for name, value in values.items() if name not in ("interrupted", "started")}
+        return {name: value for name, value in values.items() if name not in ("interrupted", "received", "started")}
 
 
 @dataclass(frozen=True)
@@ -90,6 +95,7 @@ class SavedRun:
         optimizers: One state per optimizer; empty before the first update.
         requests: What the worker was asked for and has not answered; see `Collect`.
         memory: State of the collector after the last round that was stored; None before the first.
+        has_seen_end: Whether a collector has seen an episode end in a terminal state; known for a run that resumes.
     """
 
     state: RunState
@@ -97,12 +103,24 @@ class SavedRun:
     optimizers: list[Any]
     requests: dict[str, Any]
     memory: dict[str, Any] | None
+    has_seen_end: bool = False
 
 
 def write_state(saved: SavedRun, part: Path) -> None:
     """Writes a run's state into the folder of a save."""
     values = {name: getattr(saved, name) for name in ("learner", "optimizers", "requests", "memory")}
     torch.save({"run": saved.state.to_dict(), **values}, part / STATE_FILE)
+
+
+def memory_file(rank: int) -> str:
+    """Name of the file with the collector's state of a rank above 0; that of rank 0 is in `STATE_FILE`."""
+    return f"collector-{rank}.pt"
+
+
+def read_memory(save: Save, rank: int) -> dict[str, Any] | None:
+    """The collector's state that a rank above 0 saved; None before its first round."""
+    memory: dict[str, Any] | None = read_saved(save.folder / memory_file(rank), keys=("memory",))["memory"]
+    return memory
 
 
 def read_state(save: Save) -> SavedRun:
@@ -123,6 +141,19 @@ def read_state(save: Save) -> SavedRun:
         return SavedRun(state, **saved)
     except (TypeError, ValueError) as error:
         raise DamageError(f"{path} is damaged: {str(error)[:160]}") from None
+
+
+def read_saved_run(save: Save, ranks: Ranks) -> SavedRun:
+    """What one rank resumes from: the state, with its own collector's memory; None of another number of ranks.
+
+    Raises:
+        DamageError: The state has other entries, or values outside of their ranges.
+    """
+    saved = read_state(save)
+    memories = [saved.memory, *(read_memory(save, rank) for rank in range(1, count_ranks(save)))]
+    has_seen_end = any(memory is not None and bool(memory["has_seen_end"]) for memory in memories)
+    memory = memories[ranks.rank] if len(memories) == ranks.size else None
+    return replace(saved, memory=memory, has_seen_end=has_seen_end)
 
 
 def save_values(saves: Saves, values: dict[str, Any], note: Mapping[str, Any]) -> None:

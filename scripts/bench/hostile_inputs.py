@@ -116,6 +116,9 @@ FLAGS = {
     "--preset": ("../gpu",),
     "--threads": ("1e9",),
     "--run.threads": ("1e9", "0"),
+    "--run.devices": ("1e9", "0", "-1", "many", "3", LONG),
+    "--run.nodes": ("1e9", "0", "2", "many"),
+    "--run.strategy": ("fsdp", "", LONG),
     "--env-id": (
         "os:system",
         "os.path:InvertedPendulum-v9",

@@ -82,7 +82,8 @@ def test_resume_takes_saved_settings_with_the_given_changes(tmp_path):
         ("--resume nowhere", "nothing to resume in nowhere"),
         (
             "--resume nowhere --seed 3",
-            "--seed cannot be given with --resume; only --frames, --minutes, --updates, --device, --env-id can",
+            "--seed cannot be given with --resume; only --frames, --minutes, --updates, --device, --env-id, "
+            "--run.devices, --run.nodes, --run.strategy can",
         ),
         ("--resume nowhere --preset auto", "--preset cannot be given with --resume"),
     ],

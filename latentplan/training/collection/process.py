@@ -71,6 +71,30 @@ class LocalWorker:
         self._collector.close()
 
 
+class PatientWorker(LocalWorker):
+    """A local worker whose errors `result` raises, as those of another process.
+
+    Processes that learn together agree on what each of them gets from `result`, and all submit before they ask.
+    """
+
+    def submit(self, method: str, *arguments: Any) -> None:
+        """Run a method of the collector, unless an earlier one failed, and keep its result or error for `result`."""
+        if any(isinstance(value, Exception) for value in self._results):
+            self._results.append(Stopped())
+            return
+        try:
+            super().submit(method, *arguments)
+        except Exception as error:
+            self._results.append(error)
+
+    def result(self) -> Any:
+        """The oldest result that was not returned before; raises it if it is an error."""
+        value = super().result()
+        if isinstance(value, Exception):
+            raise value
+        return value
+
+
 class RemoteWorker:
     """Calls methods of a `Collector` in a spawned process, on the CPU; `submit` returns at once.
 
@@ -167,7 +191,8 @@ def make_worker(
     """The worker that `collection.overlap` selects; a local worker acts on the learner's device."""
     if config.collection.overlap:
         return RemoteWorker(config, make_user_env, choose_collector_threads(device), should_stop)
-    return LocalWorker(config, make_user_env, str(device), should_stop)
+    kind = LocalWorker if config.run.num_ranks == 1 else PatientWorker
+    return kind(config, make_user_env, str(device), should_stop)
 
 
 def _serve(

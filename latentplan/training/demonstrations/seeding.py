@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
-from latentplan.config import Config
+from latentplan.config import Config, UserError
 from latentplan.config.suites import DEFAULT_SUITE
 from latentplan.envs.vector import make_guarded_env
 from latentplan.training.demonstrations.fitting import FittedRecording, fit_all, make_target
@@ -46,13 +46,29 @@ def read_demonstrations(config: Config, make_user_env: EnvFactory | None) -> lis
     return fit_all(recordings, target, config.learning.sequence_length)
 
 
-def seed_replay(replay: Replay, recordings: Sequence[FittedRecording]) -> None:
-    """Adds all episodes to the replay's lane of recorded rows, in order.
+def count_rows(recordings: Sequence[FittedRecording], rank: int = 0, size: int = 1) -> int:
+    """Rows of the episodes that one of several learning processes gets: one for each frame.
+
+    Raises:
+        UserError: There are fewer episodes than processes.
+    """
+    lengths = [length for recording in recordings for length in recording.lengths if length > 0]
+    if lengths and len(lengths) < size:
+        raise UserError(
+            f"replay.demonstrations hold {len(lengths)} episodes that are long enough, fewer than the {size} processes "
+            "of run.devices x run.nodes, of which each gets its own"
+        )
+    return sum(length + 1 for length in lengths[rank::size])
+
+
+def seed_replay(replay: Replay, recordings: Sequence[FittedRecording], rank: int = 0, size: int = 1) -> None:
+    """Adds all episodes to the replay's lane of recorded rows, in order; of several processes, each gets every size-th.
 
     Raises:
         UserError: An episode is damaged.
     """
-    for recording in recordings:
-        for index, length in enumerate(recording.lengths):
-            if length > 0:
-                replay.add(replay.num_lanes - 1, recording.read(index))
+    episodes = [
+        (recording, index) for recording in recordings for index, length in enumerate(recording.lengths) if length > 0
+    ]
+    for recording, index in episodes[rank::size]:
+        replay.add(replay.num_lanes - 1, recording.read(index))

@@ -19,6 +19,7 @@ from latentplan.config.commit import Save, Saves
 from latentplan.config.run_folder import RUN_FILE, SAVES_FOLDER, lock_folder, require_saves, run_saves
 from latentplan.models import WorldModel
 from latentplan.replay.buffer import Replay
+from latentplan.replay.dealing import DealtRows, count_ranks
 from latentplan.replay.disk import FORMAT as REPLAY_FORMAT
 from latentplan.replay.disk import ReplayFiles, count_saved, save_replay
 from latentplan.training.collection.collector import Collector
@@ -84,12 +85,13 @@ def resume_goals(
 
 
 def load_replay(save: Save, model: WorldModel) -> Replay:
-    """Loads the whole replay of a save into main memory.
+    """Loads the whole replay of a save into main memory, of all processes that have learned together.
 
     Raises:
         UserError: The replay does not fit the model.
     """
-    counts = count_saved(save)
+    dealt = DealtRows(save, 0, 1) if count_ranks(save) > 1 else None
+    counts = count_saved(save) if dealt is None else dealt.counts
     replay = Replay(
         max(1, counts.num_lanes * counts.lane_rows),
         model.action_dim,
@@ -100,7 +102,10 @@ def load_replay(save: Save, model: WorldModel) -> Replay:
         model.spaces.frame_shape,
         counts.recorded_rows,
     )
-    ReplayFiles(save.folder.parent, replay).read(save)
+    if dealt is None:
+        ReplayFiles(save.folder.parent, replay).read(save)
+    else:
+        dealt.fill(replay)
     return replay
 
 

@@ -44,12 +44,14 @@ class ReplayBatches(IterableDataset[Batch | Tensor]):
             return  # the run was interrupted before the epoch began
         done = self.learner.updates
         first = done - state.epoch_updates
-        rng = np.random.default_rng(derive_seed(self.config.run.seed, "batches", first))
+        ranks = self.learner.ranks
+        seed = ranks.own_config(self.config).run.seed
+        rng = np.random.default_rng(derive_seed(seed, "batches", first))
         takes_rows = isinstance(self.learner, GraphedLearner)
         budget = self.config.run.updates
         end = first + self.length if budget is None else min(first + self.length, budget)
         for update in range(first, end):
-            rows = self.replay.draw(learning.batch_size, learning.sequence_length, rng)
+            rows = self.replay.draw(learning.batch_size // ranks.size, learning.sequence_length, rng)
             if update >= done:
                 yield rows if takes_rows else self.curriculum(self.replay.gather(rows))
 

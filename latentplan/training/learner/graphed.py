@@ -12,6 +12,7 @@ from latentplan.config import LearningConfig, derive_seed
 from latentplan.models import WorldModel
 from latentplan.replay.buffer import Batch, Replay
 from latentplan.training.learner.module import Learner, is_refreshed
+from latentplan.training.ranks import ALONE, Ranks
 
 if TYPE_CHECKING:
     from latentplan.config import Config
@@ -110,7 +111,14 @@ class GraphedLearner(Learner):
         return graph
 
 
-def make_learner(model: WorldModel, config: Config, discount: float, replay: Replay, curriculum: Curriculum) -> Learner:
+def make_learner(
+    model: WorldModel,
+    config: Config,
+    discount: float,
+    replay: Replay,
+    curriculum: Curriculum,
+    ranks: Ranks = ALONE,
+) -> Learner:
     """Makes the learner that the settings select.
 
     With `learning.cuda_graph` a model whose updates can be recorded gets a `GraphedLearner`; any other model gets a
@@ -122,8 +130,9 @@ def make_learner(model: WorldModel, config: Config, discount: float, replay: Rep
         discount: Discount per decision.
         replay: Replay of the run.
         curriculum: Replaces the rewards of replayed sequences.
+        ranks: The processes that share each batch; with several, `Config` refuses `learning.cuda_graph`.
     """
     settings, seed = config.learning, derive_seed(config.run.seed, "learner")
     if settings.cuda_graph and model.backend.can_record(model):
         return GraphedLearner(model, settings, discount, replay, seed, curriculum)
-    return Learner(model, settings, discount, replay, seed)
+    return Learner(model, settings, discount, replay, seed, ranks)

@@ -18,6 +18,7 @@ from latentplan.models.heads import HALF_LOG_2_PI_E, MAX_ACTION_STD, MIN_ACTION_
 from latentplan.replay.buffer import Batch
 from latentplan.training.learner.augmentation import random_shift
 from latentplan.training.learner.registry import BEHAVIOUR_LOSSES, WORLD_MODEL_LOSSES, register, weighted_sum
+from latentplan.training.ranks import ALONE, MODEL, Ranks
 
 
 class Imagination(NamedTuple):
@@ -41,6 +42,23 @@ class Imagination(NamedTuple):
     log_probs: Tensor | None = None
 
 
+class Counted(NamedTuple):
+    """Which frames or transitions of a batch count in a mean, and how many.
+
+    Attributes:
+        mask: 1 for those that count, else 0, (batch, time).
+        total: Their number, a scalar; where several processes share the batch, the mean of their numbers, so that the
+            mean of the processes' means is the mean over the whole batch.
+    """
+
+    mask: Tensor
+    total: Tensor
+
+    def mean(self, values: Tensor) -> Tensor:
+        """Mean of those values that count, a scalar, of values (batch, time) or (batch time,)."""
+        return mean_within(values, self.mask.reshape(values.shape), self.total)
+
+
 class Prediction(NamedTuple):
     """Predictions of the world model over a batch of sequences; every world-model loss is a function of them.
 
@@ -57,7 +75,9 @@ class Prediction(NamedTuple):
         open_loop: Features predicted from actions alone, (batch, reached, feature); see `_predict_open_loop`.
         open_loop_reward_logits: Rewards predicted from `open_loop`, (batch, reached, bin).
         open_loop_divergence: Mean KL of the open-loop priors to the posteriors, in nats, a scalar.
-        is_seen: 1 for frames up to the end of the episode, 0 beyond, (batch, time + 1).
+        seen: Frames up to the end of the episode, (batch, time + 1).
+        within: Transitions of the episode, (batch, time).
+        reached: Those of them that `open_loop` spans, (batch, reached).
     """
 
     model: WorldModel
@@ -72,7 +92,9 @@ class Prediction(NamedTuple):
     open_loop: Tensor
     open_loop_reward_logits: Tensor
     open_loop_divergence: Tensor
-    is_seen: Tensor
+    seen: Counted
+    within: Counted
+    reached: Counted
 
 
 class Replayed(NamedTuple):
@@ -130,24 +152,35 @@ class Learned(NamedTuple):
     parts: dict[str, Tensor]
 
 
-def world_model_loss(model: WorldModel, batch: Batch, config: LearningConfig, generator: torch.Generator) -> Learned:
+def world_model_loss(
+    model: WorldModel, batch: Batch, config: LearningConfig, generator: torch.Generator, ranks: Ranks = ALONE
+) -> Learned:
     """The loss of the world model over a batch of sequences, and its posterior and open-loop states.
 
     Frames beyond a terminal state (see `Batch.within`) have no weight. With `random_shift` the encoder reads shifted
     frames but the decoder reconstructs the unshifted frames, so that the latent need not hold the shift.
+
+    Args:
+        model: The world model.
+        batch: The sequences; those of this process, where several share a batch. The mean of their losses is then the
+            loss over the whole batch.
+        config: Settings of learning.
+        generator: Random stream of shifts and latents.
+        ranks: The processes that share the batch.
     """
     size, frames_per_sequence = batch.frames.shape[:2]
-    moved = random_shift(model.backend, batch.frames, config.random_shift, generator)
+    counts = ranks.mean(batch.within.sum(0), MODEL)  # (time,)
+    moved = random_shift(model.backend, batch.frames, config.random_shift, generator, ranks)
     with model.trunk_precision(cache=False):
         embeddings = model.backend.encode(model, moved.flatten(0, 1)).unflatten(0, (size, frames_per_sequence))
         if model.spaces.vector_dim:
             embeddings = embeddings + model.encoder.read_vectors(model.seen_vectors(batch.labels))
-    noise = torch.randn(
-        size, frames_per_sequence, model.config.latent_dim, generator=generator, device=batch.frames.device
-    )
+    shape = size * ranks.size, frames_per_sequence, model.config.latent_dim
+    noise = ranks.part(torch.randn(shape, generator=generator, device=batch.frames.device))
     states, posterior = model.backend.observe(model, embeddings, batch.actions, batch.deter, noise)
     features = states.features
-    overshooting, open_loop = _predict_open_loop(model, batch, states, posterior, config)
+    overshooting, open_loop = _predict_open_loop(model, batch, states, posterior, config, counts)
+    reached = open_loop.shape[1]
     with model.trunk_precision(cache=False):
         prior = model.dynamics.prior(states.deter)
         errors = model.backend.reconstruction_errors(model, features.flatten(0, 1), batch.frames.flatten(0, 1))
@@ -167,7 +200,9 @@ def world_model_loss(model: WorldModel, batch: Batch, config: LearningConfig, ge
         open_loop=open_loop,
         open_loop_reward_logits=open_loop_logits,
         open_loop_divergence=overshooting,
-        is_seen=torch.cat([torch.ones_like(batch.within[:, :1]), batch.within], 1),
+        seen=Counted(torch.cat([torch.ones_like(batch.within[:, :1]), batch.within], 1), size + counts.sum()),
+        within=Counted(batch.within, counts.sum()),
+        reached=Counted(batch.within[:, :reached], counts[:reached].sum()),
     )
     loss, parts = weighted_sum(WORLD_MODEL_LOSSES, prediction, config)
     return Learned(loss, State(*(part.detach() for part in states)), open_loop.detach(), parts)
@@ -176,15 +211,14 @@ def world_model_loss(model: WorldModel, batch: Batch, config: LearningConfig, ge
 @register(WORLD_MODEL_LOSSES, "reconstruction", "reconstruction_scale")
 def _reconstruction(predicted: Prediction) -> Tensor:
     """Squared error of the decoded picture, summed over the picture."""
-    return mean_within(predicted.reconstruction_errors, predicted.is_seen.flatten())
+    return predicted.seen.mean(predicted.reconstruction_errors)
 
 
 @register(WORLD_MODEL_LOSSES, "reward", "reward_scale")
 def _reward(predicted: Prediction) -> Tensor:
     """Cross-entropy of the reward predicted from the posterior state, in nats."""
     model, batch = predicted.model, predicted.batch
-    errors = model.backend.cross_entropy(model.reward_head, predicted.reward_logits, batch.rewards)
-    return mean_within(errors, batch.within)
+    return predicted.within.mean(model.backend.cross_entropy(model.reward_head, predicted.reward_logits, batch.rewards))
 
 
 @register(WORLD_MODEL_LOSSES, "open_loop_reward", "reward_scale")
@@ -193,28 +227,28 @@ def _open_loop_reward(predicted: Prediction) -> Tensor:
     model, batch, reached = predicted.model, predicted.batch, predicted.open_loop.shape[1]
     rewards = batch.rewards[:, :reached]
     errors = model.backend.cross_entropy(model.reward_head, predicted.open_loop_reward_logits, rewards)
-    return mean_within(errors, batch.within[:, :reached])
+    return predicted.reached.mean(errors)
 
 
 @register(WORLD_MODEL_LOSSES, "continue")
 def _continuation(predicted: Prediction) -> Tensor:
     """Binary cross-entropy of the continuation of the episode, in nats."""
     batch, binary_loss = predicted.batch, torch.nn.functional.binary_cross_entropy_with_logits
-    return mean_within(binary_loss(predicted.continue_logits, batch.continues, reduction="none"), batch.within)
+    return predicted.within.mean(binary_loss(predicted.continue_logits, batch.continues, reduction="none"))
 
 
 @register(WORLD_MODEL_LOSSES, "dynamics", "dynamics_scale")
 def _dynamics(predicted: Prediction) -> Tensor:
     """KL from posterior to prior above the free nats, which moves only the prior (KL balancing, Hafner et al. 2023)."""
     divergence = _free_kl(_detached(predicted.posterior), predicted.prior, predicted.config.free_nats)
-    return mean_within(divergence, predicted.is_seen)
+    return predicted.seen.mean(divergence)
 
 
 @register(WORLD_MODEL_LOSSES, "representation", "representation_scale")
 def _representation(predicted: Prediction) -> Tensor:
     """The same KL, which moves only the posterior (KL balancing, Hafner et al. 2023)."""
     divergence = _free_kl(predicted.posterior, _detached(predicted.prior), predicted.config.free_nats)
-    return mean_within(divergence, predicted.is_seen)
+    return predicted.seen.mean(divergence)
 
 
 @register(WORLD_MODEL_LOSSES, "overshooting", "overshooting_scale")
@@ -230,9 +264,9 @@ def _probe(predicted: Prediction) -> Tensor:
     if not model.labels:
         return batch.rewards.new_zeros(())
     labels = batch.labels[..., : len(model.labels)]
-    errors = mean_within(_probe_errors(model, predicted.features, labels), predicted.is_seen)
+    errors = predicted.seen.mean(_probe_errors(model, predicted.features, labels))
     open_loop_errors = _probe_errors(model, predicted.open_loop, labels[:, 1 : reached + 1])
-    return errors + mean_within(open_loop_errors, batch.within[:, :reached])
+    return errors + predicted.reached.mean(open_loop_errors)
 
 
 @register(WORLD_MODEL_LOSSES, "vectors", "vector_scale", is_recorded=False)
@@ -244,7 +278,7 @@ def _vectors(predicted: Prediction) -> Tensor:
     with model.trunk_precision(cache=False):
         painted = model.backend.apply(model.vector_head, predicted.features)
     errors = (painted - symlog(model.seen_vectors(batch.labels))).square().sum(-1)
-    return mean_within(errors, predicted.is_seen)
+    return predicted.seen.mean(errors)
 
 
 @register(BEHAVIOUR_LOSSES, "actor")
@@ -277,7 +311,12 @@ def _replayed_value(behaviour: Behaviour) -> Tensor:
 
 
 def imagine(
-    model: WorldModel, start: State, horizon: int, generator: torch.Generator, decay: float = 1.0
+    model: WorldModel,
+    start: State,
+    horizon: int,
+    generator: torch.Generator,
+    decay: float = 1.0,
+    ranks: Ranks = ALONE,
 ) -> Imagination:
     """Imagined rollouts of the actor, with the rewards, continuation and entropies that the losses need.
 
@@ -287,8 +326,10 @@ def imagine(
         horizon: Model steps.
         generator: Random stream of the actions and latents.
         decay: Share of a state's gradient that a step passes back to the state before.
+        ranks: The processes that share the rollouts, which draw alike for all of them.
     """
-    draws, log_probs = draw_noise(model, horizon, len(start.deter), generator), None
+    action_noise, latent_noise = draw_noise(model, horizon, len(start.deter) * ranks.size, generator)
+    draws, log_probs = (ranks.part(action_noise, 1), ranks.part(latent_noise, 1)), None
     if isinstance(model.actor, MixedActor):
         features, actions = model.backend.sample(model, start, *draws)
         log_probs, entropies = model.actor.score(features[:-1], actions)
@@ -341,12 +382,12 @@ def imitation_loss(actor: Actor, features: Tensor, mean: Tensor, std: Tensor) ->
 
 
 def _predict_open_loop(
-    model: WorldModel, batch: Batch, states: State, posterior: Gaussian, config: LearningConfig
+    model: WorldModel, batch: Batch, states: State, posterior: Gaussian, config: LearningConfig, counts: Tensor
 ) -> tuple[Tensor, Tensor]:
     """Predicts latents from actions alone, as a planner does, and compares them with the posteriors.
 
     Predictions start from every `overshooting_horizon`-th posterior and apply the true actions, with the mean of the
-    prior as the latent.
+    prior as the latent. `counts` (time,) is how many sequences have not ended before each transition.
 
     Returns:
         Mean KL of the priors to the posteriors of the same frames, a scalar, and the features of the predicted states,
@@ -361,16 +402,20 @@ def _predict_open_loop(
     starts = [part[:, :-1].detach()[:, ::horizon][:, : length // horizon].flatten(0, 1) for part in states]
     deter, prior = model.backend.predict(model, State(*starts), windows(batch.actions))
     seen = Gaussian(*(windows(part[:, 1:].detach()) for part in posterior))
-    divergence = mean_within(_free_kl(seen, prior, config.free_nats), windows(batch.within))
+    reached = counts[: length // horizon * horizon].sum()
+    divergence = mean_within(_free_kl(seen, prior, config.free_nats), windows(batch.within), reached)
     features = State(deter, prior.mean).features
     return divergence, rearrange(
         features, "(batch window) time ... -> batch (window time) ...", batch=len(batch.actions)
     )
 
 
-def mean_within(values: Tensor, within: Tensor) -> Tensor:
-    """Mean of the values where `within` is 1, or 0 if `within` is 0 everywhere; both have the same shape."""
-    return (values * within).sum() / within.sum().clamp_min(1.0)
+def mean_within(values: Tensor, within: Tensor, total: Tensor) -> Tensor:
+    """Mean of the values where `within` is 1, or 0 if `within` is 0 everywhere; both have the same shape.
+
+    `total` is the sum of `within`, or the mean of the sums of several processes that share the values.
+    """
+    return (values * within).sum() / total.clamp_min(1.0)
 
 
 def _probe_errors(model: WorldModel, features: Tensor, labels: Tensor) -> Tensor:

@@ -5,7 +5,8 @@ from __future__ import annotations
 import copy
 from collections.abc import Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from functools import cached_property
+from concurrent.futures import wait as wait_for
+from functools import cached_property, partial
 
 import lightning
 import torch
@@ -32,8 +33,7 @@ from latentplan.training.learner.optimization import (
     update_average,
 )
 from latentplan.training.learner.skips import Skips
-
-MODEL, BEHAVIOUR = 0, 1  # indices of the two halves of an update: their parameters, optimizers and average counts
+from latentplan.training.ranks import ALONE, BEHAVIOUR, MODEL, Ranks  # indices of parameters, optimizers, averages
 
 
 class Learner(lightning.LightningModule):
@@ -46,12 +46,18 @@ class Learner(lightning.LightningModule):
     Agents act, are evaluated and are saved with the weights of `averaged`, a running average over the latest updates:
     under constant learning rates the learned weights themselves keep fluctuating.
 
+    Several processes, the ranks, may share each batch. Each computes the losses of its own sequences and of its share
+    of the imagined rollouts, with the random numbers that one process would draw for them; then one message for each
+    half of the update averages gradients and losses, before the gradient is clipped. All ranks therefore make the same
+    step, that of one process with the whole batch up to rounding, and skip the same steps.
+
     Args:
         model: The world model with actor and value head.
         config: Settings of losses and optimizers.
         discount: Discount per decision.
         replay: Stores the refreshed beliefs after each update.
         seed: Seed of the noise in posterior, prior and actor samples.
+        ranks: The processes that share each batch.
 
     Attributes:
         averaged: A copy of the model with averaged weights.
@@ -65,8 +71,17 @@ class Learner(lightning.LightningModule):
     averaged_updates: Tensor
     skips: Sequence[Skips]
 
-    def __init__(self, model: WorldModel, config: LearningConfig, discount: float, replay: Replay, seed: int) -> None:
+    def __init__(
+        self,
+        model: WorldModel,
+        config: LearningConfig,
+        discount: float,
+        replay: Replay,
+        seed: int,
+        ranks: Ranks = ALONE,
+    ) -> None:
         super().__init__()
+        self.ranks = ranks
         keep_freed_memory()
         self.automatic_optimization = False
         self.model, self.config, self.discount, self.replay, self.seed = model, config, discount, replay, seed
@@ -76,7 +91,7 @@ class Learner(lightning.LightningModule):
         self.register_buffer("averaged_updates", torch.zeros(2))  # of the model, of behaviour
         self.updates = 0
         self.metrics: dict[str, Tensor] = {}
-        shape = config.batch_size, config.sequence_length + 1
+        shape = config.batch_size // ranks.size, config.sequence_length + 1
         halves = nn.ModuleList(Skips(shape).to(model.device) for _ in (MODEL, BEHAVIOUR))
         self.skips = halves  # type: ignore[assignment]
         self._thread = ThreadPoolExecutor(1, thread_name_prefix="behaviour")
@@ -135,7 +150,10 @@ class Learner(lightning.LightningModule):
         if self._waiting is None:
             return None
         waiting, self._waiting = self._waiting, None
-        return self._thread.submit(self._learn_behaviour, *waiting)
+        behaviour = self._thread.submit(self._learn_behaviour, *waiting)
+        if self.ranks.in_turn:
+            wait_for([behaviour])
+        return behaviour
 
     def _finish_behaviour(self, behaviour: Future[dict[str, Tensor]] | None) -> None:
         if behaviour is not None:
@@ -147,15 +165,16 @@ class Learner(lightning.LightningModule):
         Returns:
             The results of the pass, the augmented batch, and which of its sequences were not turned, bool (batch,).
         """
-        batch, is_unturned = quarter_turns(self.model.backend, batch, self.config.turned_share, generator)
-        learned = world_model_loss(self.model, batch, self.config, generator)
-        learned.parts["model_grad_norm"] = self._descend(MODEL, learned.loss, batch.rows)
+        config, ranks = self.config, self.ranks
+        batch, is_unturned = quarter_turns(self.model.backend, batch, config.turned_share, generator, ranks)
+        learned = world_model_loss(self.model, batch, config, generator, ranks)
+        learned.parts["model_grad_norm"] = self._descend(MODEL, learned.loss, learned.parts, batch.rows)
         self._update_average(MODEL)
         return learned._replace(loss=learned.loss.detach()), batch, is_unturned
 
     def _learn_behaviour(self, learned: Learned, batch: Batch, generator: torch.Generator) -> dict[str, Tensor]:
         loss, parts = self._behaviour_loss(learned, batch, generator)
-        parts["behaviour_grad_norm"] = self._descend(BEHAVIOUR, loss, batch.rows)
+        parts["behaviour_grad_norm"] = self._descend(BEHAVIOUR, loss, parts, batch.rows)
         self._update_average(BEHAVIOUR)
         target, values = self.target_value.parameters(), self.model.value_head.parameters()
         self.model.backend.move_towards([*target], [*values], self.config.target_rate)
@@ -173,12 +192,13 @@ class Learner(lightning.LightningModule):
     def _behaviour_loss(
         self, learned: Learned, batch: Batch, generator: torch.Generator
     ) -> tuple[Tensor, dict[str, Tensor]]:
-        config, states = self.config, learned.states
-        flat = State(states.deter.flatten(0, 1), states.stoch.flatten(0, 1))
+        config, states, ranks = self.config, learned.states, self.ranks
+        flat = State(*(ranks.gather(part.flatten(0, 1), BEHAVIOUR) for part in states))
         continues = torch.cat([torch.ones_like(batch.continues[:, :1]), batch.within * batch.continues], 1).flatten()
+        continues = ranks.gather(continues, BEHAVIOUR)
         order = torch.rand(len(flat.deter), generator=generator, device=self.device).masked_fill(continues == 0.0, 2.0)
         first = torch.arange(min(config.imagination_starts, len(order)), device=self.device)
-        chosen = order.argsort()[first % continues.sum().long()]  # terminal states start no rollout
+        chosen = ranks.part(order.argsort()[first % continues.sum().long()])  # terminal states start no rollout
         with self.model.trunk_precision(cache=False):
             imagined = imagine(
                 self.snapshot.model,
@@ -186,6 +206,7 @@ class Learner(lightning.LightningModule):
                 config.imagination_horizon,
                 generator,
                 config.gradient_decay,
+                ranks,
             )
             values = self._target_values(imagined.following)
             baselines = None
@@ -194,7 +215,7 @@ class Learner(lightning.LightningModule):
         discounts = self.discount * imagined.continues
         returns = self.model.backend.lambda_return(imagined.rewards, discounts, values, config.lambda_)
         reach = torch.cat([torch.ones_like(discounts[:1]), discounts[:-1]]).cumprod(0).detach()
-        scale = return_scale(self.return_range, returns.detach())
+        scale = return_scale(self.return_range, ranks.gather(returns.detach(), BEHAVIOUR, 1))
         with self.model.trunk_precision(cache=False):
             replayed = self._replayed(learned, batch)
         behaviour = Behaviour(self.model, config, imagined, returns, reach, scale, replayed, baselines)
@@ -225,12 +246,17 @@ class Learner(lightning.LightningModule):
         within = batch.within.T
         reached = torch.cat([within, within[-1:] * batch.continues.T[-1:]])[1 : len(predicted) + 1]
         weights = torch.cat([within, reached])
-        return Replayed(seen, targets, weights / weights.mean())
+        return Replayed(seen, targets, weights / self.ranks.mean(weights.mean(), BEHAVIOUR))
 
-    def _descend(self, half: int, loss: Tensor, rows: Tensor) -> Tensor:
-        norm = descend_if_finite(self._optimizers()[half], loss, self.config.max_grad_norm)
+    def _descend(self, half: int, loss: Tensor, parts: dict[str, Tensor], rows: Tensor) -> Tensor:
+        """Makes one step of a half, after all ranks have averaged the gradient, the loss and its parts."""
+        average = None if self.ranks.size == 1 else partial(self._average, half, parts)
+        norm = descend_if_finite(self._optimizers()[half], loss, self.config.max_grad_norm, average)
         self.skips[half].record(norm, rows)
         return norm
+
+    def _average(self, half: int, parts: dict[str, Tensor], tensors: list[Tensor]) -> None:
+        self.ranks.average([*tensors, *parts.values()], half)
 
 
 def is_refreshed(batch: Batch, chosen: Tensor) -> Tensor:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import ctypes
 import os
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import torch
@@ -37,27 +37,49 @@ def descend(optimizer: torch.optim.Optimizer, loss: Tensor, max_norm: float, upd
     return norm
 
 
-def descend_if_finite(optimizer: torch.optim.Optimizer, loss: Tensor, max_norm: float) -> Tensor:
+def descend_if_finite(
+    optimizer: torch.optim.Optimizer,
+    loss: Tensor,
+    max_norm: float,
+    average: Callable[[list[Tensor]], None] | None = None,
+) -> Tensor:
     """Makes one step of a fused optimizer without reading values back.
 
     A loss or a gradient that is not finite changes nothing.
+
+    Args:
+        optimizer: The optimizer.
+        loss: The loss, a scalar.
+        max_norm: Gradient norm at which the gradient is clipped.
+        average: Averages tensors over several processes, in place; it gets the loss and then the gradients. None leaves
+            them as they are.
 
     Returns:
         The norm of the gradient before clipping, NaN for a loss that is not finite; the step was made if and only if
         the norm is finite.
     """
-    norm = clipped_gradient(optimizer, loss, max_norm)
+    norm = clipped_gradient(optimizer, loss, max_norm, average)
     norm = torch.where(torch.isfinite(loss.detach()), norm, torch.nan)
     optimizer.found_inf = (~torch.isfinite(norm)).float()  # type: ignore[attr-defined]  # 1 skips the step
     optimizer.step()
     return norm
 
 
-def clipped_gradient(optimizer: torch.optim.Optimizer, loss: Tensor, max_norm: float) -> Tensor:
-    """Gives the parameters of an optimizer the gradient of a loss, clipped; returns its norm before clipping."""
+def clipped_gradient(
+    optimizer: torch.optim.Optimizer,
+    loss: Tensor,
+    max_norm: float,
+    average: Callable[[list[Tensor]], None] | None = None,
+) -> Tensor:
+    """Gives the parameters of an optimizer the gradient of a loss, clipped; returns its norm before clipping.
+
+    The arguments are those of `descend_if_finite`.
+    """
     optimizer.zero_grad(set_to_none=True)
     loss.backward()
     parameters = [parameter for group in optimizer.param_groups for parameter in group["params"]]
+    if average is not None:
+        average([loss.detach(), *(parameter.grad for parameter in parameters if parameter.grad is not None)])
     return torch.nn.utils.clip_grad_norm_(parameters, max_norm)
 
 

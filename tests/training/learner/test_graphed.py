@@ -163,7 +163,7 @@ def test_graphed_update_reads_no_value_back(watched):
 def test_graphed_update_test_detects_a_read(watched, monkeypatch, part):
     if part == "descent":
 
-        def read(learner, half, loss, rows):
+        def read(learner, half, loss, parts, rows):
             return descend(learner._optimizers()[half], loss, learner.config.max_grad_norm, learner.updates)
 
         monkeypatch.setattr(Graphed, "_descend", read)
