@@ -18,7 +18,8 @@ from latentplan.models.encoder import Observation
 from latentplan.models.heads import MixedActor
 from latentplan.models.symmetry import TurnedModel, first_turn, flat, folded, mean_over_turns, per_turn, turned
 from latentplan.objectives.expression import Expression
-from latentplan.objectives.objective import build_goals, read_goal_image
+from latentplan.objectives.goal_image import read_goal_image
+from latentplan.objectives.objective import build_goals
 from latentplan.planning import Planner
 from latentplan.planning.objectives import Constraint, Term
 

@@ -7,6 +7,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from safetensors import SafetensorError, deserialize
+
 from latentplan.agents.files import INFO, WEIGHTS, is_checkpoint, read_files
 from latentplan.config import UserError
 from latentplan.config.checks import cut, nearest, shown
@@ -84,6 +86,10 @@ def read_contents(folder: Path) -> tuple[dict[str, Any], bytes]:
     info = _parse(folder, contents[INFO])
     if hashlib.sha256(contents[WEIGHTS]).hexdigest() != info["sha256"]:
         raise UserError(f"{folder / WEIGHTS} is damaged: its checksum differs from the checksum in {INFO}")
+    try:
+        deserialize(contents[WEIGHTS])
+    except SafetensorError as error:
+        raise UserError(f"{folder / WEIGHTS} holds no weights: {error}") from None
     return info, contents[WEIGHTS]
 
 

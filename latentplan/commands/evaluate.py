@@ -139,7 +139,7 @@ def run(request: Request) -> int:
     config = saved_config(request.checkpoint, info)
     chosen = choose_env(config.env, request.env)
     planner = search_settings(config, request.planner)
-    if request.planner:
+    if request.mode in planning_modes():
         check_search(planner, config.model)
     read_durations(request.latency or MEASURED)
     check_expressions(request.objective, request.constraint, chosen.domain)
@@ -202,13 +202,19 @@ def check_expressions(objective: str | None, constraint: str | None, domain: str
     """Refuses an objective or a constraint that is no expression, before torch is imported.
 
     Raises:
-        UserError: A text is no expression over the domain's quantities.
+        UserError: A text is no expression over the domain's quantities, or a goal image cannot be read.
     """
     from latentplan.config.quantities import scales
+    from latentplan.objectives.expression import GoalImage
     from latentplan.objectives.parser import parse_constraints, parse_schedule
 
     if objective is not None:
-        parse_schedule(objective, scales(domain))
+        for phase in parse_schedule(objective, scales(domain)):
+            for _, term in phase.objective.terms:
+                if isinstance(term, GoalImage):
+                    from latentplan.objectives.goal_image import read_goal_image
+
+                    read_goal_image(term.path)
     if constraint is not None:
         parse_constraints(constraint, scales(domain))
 

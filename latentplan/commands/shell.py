@@ -17,7 +17,7 @@ from typing import Any
 from latentplan.config import MAX_THREADS, Config, Device, ModelConfig, PlannerConfig, UserError, from_dict, to_dict
 from latentplan.config.checks import EnvironmentFault, cut, shown, within
 from latentplan.config.env_id import as_file_name
-from latentplan.config.estimates import check_parts, estimate_search
+from latentplan.config.estimates import check_parts, estimate_model, estimate_search
 from latentplan.config.extras import describe_missing, extra_of
 from latentplan.config.files import build_config, has_cuda
 from latentplan.config.parsing import option, raise_unknown
@@ -140,11 +140,11 @@ def check_search(planner: PlannerConfig, model: ModelConfig) -> None:
         model: Sizes of the model.
 
     Raises:
-        UserError: The search does not fit into the free memory, or a decision would take minutes.
+        UserError: The search or the model does not fit into the free memory, or a decision would take minutes.
     """
     from latentplan.replay.memory import free_memory
 
-    check_parts([estimate_search(planner, model, has_cuda())], free_memory())
+    check_parts([estimate_search(planner, model, has_cuda()), estimate_model(model)], free_memory())
 
 
 @dataclass(frozen=True, kw_only=True)

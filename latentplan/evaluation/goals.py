@@ -26,7 +26,7 @@ from latentplan.objectives.expression import (
     evaluate,
     shortfall,
 )
-from latentplan.objectives.objective import read_goal_image
+from latentplan.objectives.goal_image import read_goal_image
 from latentplan.objectives.parser import parse_constraints, parse_schedule
 
 if TYPE_CHECKING:

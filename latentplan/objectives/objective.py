@@ -9,17 +9,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from functools import cache, partial
-from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
 from einops import rearrange, reduce, repeat
-from numpy.typing import NDArray
 from torch import Tensor
 
 from latentplan.config import EnvConfig, UserError
-from latentplan.config.extras import import_extra
 from latentplan.config.quantities import scales
 from latentplan.objectives.box import BoxView, box_of, planning_degree
 from latentplan.objectives.expression import (
@@ -50,7 +46,6 @@ from latentplan.planning.search.registry import Planner
 CONSTRAINT_DISTANCE = 0.1  # distance that a plan keeps from the limit of a constraint, in margins
 GUIDE_WEIGHT = 0.25  # of the guide: 1 would add the reward rate of the terminal value at every step of the plan
 GOAL_DISTANCE = 1.0  # root mean square distance of latents that counts as one margin
-GOAL_IMAGE_SIZE = 64  # pixels, as camera frames
 
 
 def build_goals(
@@ -152,29 +147,6 @@ def require_labels(nodes: Sequence[Node], labels: Sequence[str]) -> None:
         if name not in labels:
             known = f"it predicts {', '.join(labels)}" if labels else "it was trained without named quantities"
             raise UserError(f"this agent cannot plan for {name!r}: {known}")
-
-
-def read_goal_image(path: str, size: int = GOAL_IMAGE_SIZE) -> NDArray[np.uint8]:
-    """The image in a file, resized to a camera frame, RGB uint8 (size, size, 3).
-
-    Raises:
-        UserError: The file is missing, is not an image, or is not square.
-    """
-    cv2 = import_extra("cv2", "a goal image")
-    try:
-        if not Path(path).is_file():
-            reason = "is a folder" if Path(path).is_dir() else "does not exist"
-            raise UserError(f"goal image {path!r} {reason}; give a square image such as a frame of the camera")
-        image = cv2.imread(path, cv2.IMREAD_COLOR)
-    except (OSError, cv2.error) as error:  # a file name or an image that is too large
-        raise UserError(f"goal image {path!r} cannot be read: {' '.join(str(error).split())}") from None
-    if image is None:
-        raise UserError(f"goal image {path!r} is not an image that can be read; give a .png")
-    if image.shape[0] != image.shape[1]:
-        raise UserError(f"goal image {path!r} must be square, got {image.shape[1]} x {image.shape[0]} pixels")
-    shrinks = image.shape[0] > size
-    resized = cv2.resize(image, (size, size), interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR)
-    return np.asarray(cv2.cvtColor(resized, cv2.COLOR_BGR2RGB), np.uint8)
 
 
 def predicted_quantities(rollout: Rollout) -> Lookup:

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping
 from pathlib import Path
 
-from latentplan.config import USER_DOMAIN, Config, EnvConfig, PlannerConfig, UserError
+from latentplan.config import USER_DOMAIN, Config, EnvConfig, PlannerConfig, RunConfig, UserError
 from latentplan.config.checks import shown
 from latentplan.config.env_id import is_by_id
 from latentplan.config.extras import EXTRAS, require_extra
@@ -24,6 +25,7 @@ def check_settings(config: Config) -> None:
         UserError: A task, a planner or an expression does not exist, or the machine cannot serve the run.
     """
     check_run(config)
+    check_machines(config.run)
     if config.run.run_dir is not None:
         check_folder(config.run.run_dir)
     for name in config.run.logger:
@@ -47,6 +49,22 @@ def check_settings(config: Config) -> None:
 
         if config.planner.method not in PLANNERS:
             raise_unknown("planner", config.planner.method, PLANNERS)
+
+
+def check_machines(run: RunConfig) -> None:
+    """Refuses several machines that do not know of each other.
+
+    Raises:
+        UserError: The environment of the process does not say where the other machines are.
+    """
+    is_known = "SLURM_JOB_ID" in os.environ or any(
+        names <= set(os.environ) for names in ({"RANK", "WORLD_SIZE"}, {"MASTER_ADDR", "NODE_RANK"})
+    )
+    if run.nodes > 1 and not is_known:
+        raise UserError(
+            f"run.nodes {run.nodes} needs MASTER_ADDR, MASTER_PORT and NODE_RANK in the environment of each machine, "
+            "or torchrun, which sets them"
+        )
 
 
 def check_env_settings(env: EnvConfig) -> None:

@@ -215,7 +215,7 @@ def join_ranks(config: Config) -> Ranks:
         config: Settings, with the numbers of `place_ranks`.
 
     Raises:
-        UserError: The machine has fewer GPUs, or does not know of the other machines.
+        UserError: The machine has fewer GPUs, or the processes do not find each other.
     """
     run = config.run
     if run.num_ranks == 1:
@@ -224,12 +224,6 @@ def join_ranks(config: Config) -> Ranks:
     if device.type == "cuda" and (found := torch.cuda.device_count()) < run.devices:
         raise UserError(f"run.devices ({run.devices}) must not exceed the GPUs of this machine, {found}")
     is_outside = all(name in os.environ for name in OUTSIDE)
-    is_known = is_outside or "SLURM_JOB_ID" in os.environ or {"MASTER_ADDR", "NODE_RANK"} <= set(os.environ)
-    if run.nodes > 1 and not is_known:
-        raise UserError(
-            f"run.nodes {run.nodes} needs MASTER_ADDR, MASTER_PORT and NODE_RANK in the environment of each machine, "
-            "or torchrun, which sets them"
-        )
     from lightning.fabric import Fabric
     from lightning.fabric.plugins.environments import TorchElasticEnvironment
     from lightning.fabric.strategies import DDPStrategy

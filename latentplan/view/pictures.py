@@ -8,7 +8,7 @@ from pathlib import Path
 
 from latentplan.config import UserError
 from latentplan.config.checks import shown
-from latentplan.objectives.objective import read_goal_image
+from latentplan.objectives.goal_image import read_goal_image
 
 LARGEST_BYTES = 2_000_000
 LARGEST_SIDE = 2048  # pixels; a picture of few bytes may be of very many

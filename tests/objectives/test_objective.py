@@ -9,11 +9,11 @@ from torch import Tensor
 
 from latentplan.config import EnvConfig, UserError
 from latentplan.objectives.box import planning_degree
+from latentplan.objectives.goal_image import read_goal_image
 from latentplan.objectives.objective import (
     build_constraint,
     build_goals,
     build_objective,
-    read_goal_image,
     require_labels,
 )
 from latentplan.objectives.parser import parse_constraints, parse_objective

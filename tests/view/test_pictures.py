@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from latentplan.config import UserError
-from latentplan.objectives.objective import read_goal_image
+from latentplan.objectives.goal_image import read_goal_image
 from latentplan.reporting.page import encode_png
 from latentplan.view.pictures import LARGEST_BYTES, LARGEST_SIDE, MOST_PICTURES, GoalPictures
 

@@ -11,8 +11,9 @@ import sys
 import pytest
 
 from latentplan.config import Config, LearningConfig, ReplayConfig, RunConfig, UserError
+from latentplan.training.checks import check_machines
 from latentplan.training.learner.registry import BEHAVIOUR_LOSSES, WORLD_MODEL_LOSSES
-from latentplan.training.ranks import join_ranks, place_ranks
+from latentplan.training.ranks import place_ranks
 from tests.training.ranks.joined import LANES, SPOILT
 
 UPDATES = 50
@@ -110,7 +111,7 @@ def test_several_machines_need_an_address(monkeypatch):
     for name in ("MASTER_ADDR", "NODE_RANK", "SLURM_JOB_ID", "RANK", "WORLD_SIZE"):
         monkeypatch.delenv(name, raising=False)
     with pytest.raises(UserError, match=r"run\.nodes 2 needs MASTER_ADDR, MASTER_PORT and NODE_RANK"):
-        join_ranks(Config(run=RunConfig(nodes=2, device="cpu")))
+        check_machines(RunConfig(nodes=2, device="cpu"))
 
 
 def test_processes_of_torchrun_decide_the_numbers(monkeypatch):
