@@ -138,14 +138,14 @@ def test_store_results_keeps_requests_of_a_worker_that_ended_with_an_interrupted
         def result(self):
             raise RuntimeError("collection failed")
 
-    state, requests = RunState(), {"collect": {"counter": 3}, "evaluate": None, "weights": None}
+    state, requests = RunState(), {"collect": {"decisions": 9, "counter": 3}, "evaluate": None, "weights": None}
     collect = Collect(tiny(tmp_path), None, state, EndedWorker(), tmp_path, requests)
     with pytest.raises(RuntimeError, match="collection failed"):
         collect.store_results()
-    state.interrupted = 15
+    state.received = 15
     with pytest.raises(Stopped):
         collect.store_results()
-    assert collect.requests["collect"] == {"counter": 3}  # the resumed run asks again
+    assert collect.requests["collect"]["counter"] == 3  # the resumed run asks again
 
 
 def empty_replay():
@@ -170,7 +170,7 @@ class Mortal(RemoteWorker):
 
 
 def test_replace_worker_starts_another_process_when_the_new_one_ends_too(tiny, tmp_path):
-    state, requests = RunState(), {"collect": {"counter": 3}, "evaluate": None, "weights": None}
+    state, requests = RunState(), {"collect": {"decisions": 9, "counter": 3}, "evaluate": None, "weights": None}
     collect = Collect(tiny(tmp_path), empty_replay(), state, Mortal(), tmp_path, requests, memory={"agent": "random"})
     with pytest.warns(RuntimeWarning, match="started again"):
         collect.replace_worker(WorkerEnded("ended"))
