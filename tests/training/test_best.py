@@ -175,9 +175,10 @@ def test_replace_worker_starts_another_process_when_the_new_one_ends_too(tiny, t
     with pytest.warns(RuntimeWarning, match="started again"):
         collect.replace_worker(WorkerEnded("ended"))
     assert state.worker_restarts == 3 and collect.worker.asked == ["restore"] * 3 + ["collect"]
-    state.worker_restarts = 20
-    with pytest.raises(WorkerEnded, match="too often"):
-        collect.replace_worker(WorkerEnded("too often"))
+    collect.worker.starts = -100  # from now on every process ends
+    with pytest.warns(RuntimeWarning, match="20 of 20"), pytest.raises(WorkerEnded, match="unexpectedly"):
+        collect.replace_worker(WorkerEnded("ended"))
+    assert state.worker_restarts == 20
 
 
 def test_replace_worker_counts_from_the_start_of_the_process(tiny, tmp_path):
