@@ -87,6 +87,9 @@ class Ranks:
         """The largest number of all ranks."""
         return number
 
+    def leave(self) -> None:
+        """Wait for all ranks, and close the connections to them."""
+
     def own_config(self, config: Config) -> Config:
         """The settings of this rank's collection: rank r > 0 has random streams and kept episodes of its own."""
         return config
@@ -162,6 +165,11 @@ class JoinedRanks(Ranks):
         found = torch.tensor(int(number))
         self._call(torch.distributed.all_reduce, found, torch.distributed.ReduceOp.MAX, group=self._world)
         return int(found)
+
+    def leave(self) -> None:
+        """Wait for all ranks, and close the connections; left open, they may end a process with SIGABRT at its exit."""
+        self.together(lambda: None)
+        torch.distributed.destroy_process_group()
 
     def own_config(self, config: Config) -> Config:
         """The settings of this rank's collection."""

@@ -191,7 +191,7 @@ def _start(config: Config, folder: Path, make_env: EnvFactory | None, *, resume:
         try:
             meet_ranks(ranks, folder, run_id)
             result = _run_until_end(config, folder, make_env, signals, ranks, resume=resume)
-            ranks.together(lambda: None)
+            ranks.leave()
         except BaseException as error:
             with contextlib.suppress(OSError):  # a full disk may be the reason
                 note_state(folder, "failed", reason=" ".join(str(error).split()) or type(error).__name__)
@@ -209,7 +209,7 @@ def _follow(config: Config, folder: Path, make_env: EnvFactory | None, ranks: Ra
         with Signals() as signals:
             meet_ranks(ranks, folder)
             _run_until_end(config, folder, make_env, signals, ranks, resume=resume)
-            ranks.together(lambda: None)
+            ranks.leave()
     except (UserError, NotFiniteError):
         raise SystemExit(0) from None
     return Result(folder, 0, {})
