@@ -57,14 +57,17 @@ def check_machines(run: RunConfig) -> None:
     Raises:
         UserError: The environment of the process does not say where the other machines are.
     """
-    is_known = "SLURM_JOB_ID" in os.environ or any(
-        names <= set(os.environ) for names in ({"RANK", "WORLD_SIZE"}, {"MASTER_ADDR", "NODE_RANK"})
-    )
+    is_known = is_started_outside() or "SLURM_JOB_ID" in os.environ or {"MASTER_ADDR", "NODE_RANK"} <= set(os.environ)
     if run.nodes > 1 and not is_known:
         raise UserError(
             f"run.nodes {run.nodes} needs MASTER_ADDR, MASTER_PORT and NODE_RANK in the environment of each machine, "
             "or torchrun, which sets them"
         )
+
+
+def is_started_outside() -> bool:
+    """Whether torchrun or another launcher has started this process as one of several."""
+    return {"RANK", "WORLD_SIZE"} <= set(os.environ)
 
 
 def check_env_settings(env: EnvConfig) -> None:

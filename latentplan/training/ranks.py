@@ -20,12 +20,12 @@ import torch
 from torch import Tensor
 
 from latentplan.config import Config, UserError, derive_seed
+from latentplan.training.checks import is_started_outside
 from latentplan.training.collection.episodes import Stopped
 from latentplan.training.resources import choose_device
 
 MODEL, BEHAVIOUR = 0, 1  # the two halves of an update
 LONGEST_WAIT = timedelta(days=1)  # for a rank that evaluates, or collects a long round
-OUTSIDE = ("RANK", "WORLD_SIZE")  # set by torchrun for each process that it starts
 
 Value = TypeVar("Value")
 
@@ -87,8 +87,8 @@ class Ranks:
         """The largest number of all ranks."""
         return number
 
-    def leave(self) -> None:
-        """Wait for all ranks, and close the connections to them."""
+    def close(self) -> None:
+        """Close the connections to the other ranks."""
 
     def own_config(self, config: Config) -> Config:
         """The settings of this rank's collection: rank r > 0 has random streams and kept episodes of its own."""
@@ -166,9 +166,8 @@ class JoinedRanks(Ranks):
         self._call(torch.distributed.all_reduce, found, torch.distributed.ReduceOp.MAX, group=self._world)
         return int(found)
 
-    def leave(self) -> None:
-        """Wait for all ranks, and close the connections; left open, they may end a process with SIGABRT at its exit."""
-        self.together(lambda: None)
+    def close(self) -> None:
+        """Close the connections; left open, they may end a process with SIGABRT at its exit."""
         torch.distributed.destroy_process_group()
 
     def own_config(self, config: Config) -> Config:
@@ -205,7 +204,7 @@ def place_ranks(config: Config) -> Config:
     Raises:
         UserError: The settings name other numbers, or the processes cannot share the settings.
     """
-    if not all(name in os.environ for name in OUTSIDE):
+    if not is_started_outside():
         return config
     size, run = _read_number("WORLD_SIZE"), config.run
     devices = _read_number("LOCAL_WORLD_SIZE") if "LOCAL_WORLD_SIZE" in os.environ else size
@@ -231,7 +230,7 @@ def join_ranks(config: Config) -> Ranks:
     device = choose_device(run)
     if device.type == "cuda" and (found := torch.cuda.device_count()) < run.devices:
         raise UserError(f"run.devices ({run.devices}) must not exceed the GPUs of this machine, {found}")
-    is_outside = all(name in os.environ for name in OUTSIDE)
+    is_outside = is_started_outside()
     from lightning.fabric import Fabric
     from lightning.fabric.plugins.environments import TorchElasticEnvironment
     from lightning.fabric.strategies import DDPStrategy

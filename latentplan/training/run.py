@@ -177,13 +177,17 @@ def resume(
 
 
 def _start(config: Config, folder: Path, make_env: EnvFactory | None, *, resume: bool) -> Result:
-    """Runs until the end, an interruption or an error; goes back to the last save after too many skipped steps."""
+    """Runs with all ranks until the end, an interruption or an error."""
     config = place_ranks(config)
     check_settings(config)
-    ranks = join_ranks(config)
-    config, folder = ranks.lead(lambda: (config, folder))
-    if not ranks.is_first:
-        return _follow(config, folder, make_env, ranks, resume=resume)
+    with contextlib.closing(join_ranks(config)) as ranks:
+        config, folder = ranks.lead(lambda: (config, folder))
+        take_part = _lead if ranks.is_first else _follow
+        return take_part(config, folder, make_env, ranks, resume=resume)
+
+
+def _lead(config: Config, folder: Path, make_env: EnvFactory | None, ranks: Ranks, *, resume: bool) -> Result:
+    """Runs as rank 0, which keeps the folder."""
     with lock_folder(folder), Signals() as signals:
         facts = present_facts(config.run.device != "cpu" and torch.cuda.is_available())
         run_id = read_facts(folder).get("run_id") or uuid.uuid4().hex[:8]
@@ -191,7 +195,7 @@ def _start(config: Config, folder: Path, make_env: EnvFactory | None, *, resume:
         try:
             meet_ranks(ranks, folder, run_id)
             result = _run_until_end(config, folder, make_env, signals, ranks, resume=resume)
-            ranks.leave()
+            ranks.together(lambda: None)
         except BaseException as error:
             with contextlib.suppress(OSError):  # a full disk may be the reason
                 note_state(folder, "failed", reason=" ".join(str(error).split()) or type(error).__name__)
@@ -209,7 +213,7 @@ def _follow(config: Config, folder: Path, make_env: EnvFactory | None, ranks: Ra
         with Signals() as signals:
             meet_ranks(ranks, folder)
             _run_until_end(config, folder, make_env, signals, ranks, resume=resume)
-            ranks.leave()
+            ranks.together(lambda: None)
     except (UserError, NotFiniteError):
         raise SystemExit(0) from None
     return Result(folder, 0, {})

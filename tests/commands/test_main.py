@@ -1,5 +1,7 @@
 """The command `latentplan`: its table of commands, help, versions, printed settings and completion."""
 
+import hashlib
+import json
 import re
 import shutil
 import subprocess
@@ -9,6 +11,7 @@ import pytest
 import yaml
 
 from latentplan import __version__
+from latentplan.agents.files import write_files
 from latentplan.commands.flags import GENERAL_FLAGS
 from latentplan.commands.main import COMMANDS, SHELLS, main
 from latentplan.config import DistillConfig
@@ -99,6 +102,33 @@ def test_agents_and_their_settings_are_refused_before_torch_is_imported(run_pyth
     lines = result.stdout.splitlines()
     assert len(lines) == len(words) == result.stderr.count("\n")
     assert all(line.startswith("2 []") for line in lines), result.stdout
+
+
+def test_what_is_missing_or_impossible_is_refused_before_torch_is_imported(run_python, checkpoint, tmp_path):
+    """The checks of these need NumPy, OpenCV or the free memory, but no torch."""
+    weights = (checkpoint / "weights.safetensors").read_bytes()[:1000]
+    info = json.loads((checkpoint / "info.json").read_text())
+    huge = json.loads(json.dumps(info))
+    huge["config"].setdefault("planner", {})["num_samples"] = 10**12
+    cut = info | {"sha256": hashlib.sha256(weights).hexdigest()}
+    whole = (checkpoint / "weights.safetensors").read_bytes()
+    for name, about, content in (("huge", huge, whole), ("cut", cut, weights)):
+        (tmp_path / name).mkdir()
+        write_files(tmp_path / name, {"info.json": json.dumps(about).encode(), "weights.safetensors": content})
+    words = [["eval", "--checkpoint", str(tmp_path / name)] for name in ("huge", "cut")]
+    words += [["eval", "--checkpoint", str(checkpoint), "--objective", f"goal:{tmp_path / 'missing.png'}"]]
+    words += [[command, "--resume", str(tmp_path)] for command in ("distill", "goals")]
+    words += [["train", "--domain", "walker", "--frames", "100", "--run.nodes", "2"]]
+    code = (
+        "import sys\nfrom latentplan.commands.main import main\n"
+        f"for words in {words!r}:\n"
+        "    code = main(words)\n"
+        "    print(code, 'torch' in sys.modules, words)\n"
+    )
+    result = run_python("-c", code)
+    lines = result.stdout.splitlines()
+    assert len(lines) == len(words) == result.stderr.count("\n")
+    assert all(line.startswith("2 False") for line in lines), result.stdout + result.stderr
 
 
 @pytest.mark.parametrize("script", ["train", "eval", "distill", "goals"])

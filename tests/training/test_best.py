@@ -145,7 +145,7 @@ def test_store_results_keeps_requests_of_a_worker_that_ended_with_an_interrupted
     state.received = 15
     with pytest.raises(Stopped):
         collect.store_results()
-    assert collect.requests["collect"]["counter"] == 3  # the resumed run asks again
+    assert collect.requests["collect"] == {"decisions": 9, "counter": 3}  # the resumed run asks again
 
 
 def empty_replay():

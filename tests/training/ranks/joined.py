@@ -96,6 +96,7 @@ def main(updates, path):
     factors = "torch" if kernels is None else str(kernels.half)
     path.write_text(json.dumps(found | {"size": ranks.size, "factors": factors}))
     ranks.together(lambda: None)
+    ranks.close()
 
 
 if __name__ == "__main__":
