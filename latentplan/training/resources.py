@@ -1,11 +1,18 @@
-"""Resources of a run: device and threads."""
+"""Resources of a run: device and threads, and the trainer that uses them."""
 
 from __future__ import annotations
+
+import logging
+import warnings
+from typing import TYPE_CHECKING
 
 import torch
 
 from latentplan.config import RunConfig, UserError
 from latentplan.config.estimates import count_cores
+
+if TYPE_CHECKING:
+    import lightning
 
 COLLECTOR_THREADS = 4  # an upper limit, because runs often share a machine
 
@@ -45,3 +52,22 @@ def set_up_torch(threads: int, device: torch.device) -> None:
     torch.set_num_threads(threads)
     if device.type == "cuda":
         torch.set_float32_matmul_precision("high")  # TF32, which has three more bits than bfloat16
+
+
+def make_trainer(device: torch.device, callbacks: list[lightning.Callback]) -> lightning.Trainer:
+    """Lightning's trainer of this process on one device; of several processes that learn together, each has its own."""
+    import lightning  # takes seconds, and collection processes do without
+
+    logging.getLogger("lightning.pytorch").setLevel(logging.ERROR)
+    warnings.filterwarnings("ignore", module="lightning")
+    return lightning.Trainer(
+        accelerator="gpu" if device.type == "cuda" else "cpu",
+        devices=[device.index or 0] if device.type == "cuda" else 1,
+        max_epochs=-1,
+        callbacks=callbacks,
+        logger=False,  # a callback writes the trackers
+        enable_checkpointing=False,
+        enable_progress_bar=False,
+        enable_model_summary=False,
+        log_every_n_steps=10**9,
+    )

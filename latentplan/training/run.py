@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import errno
 import json
-import logging
 import shlex
 import sys
 import uuid
@@ -50,7 +49,7 @@ from latentplan.training.learner.curriculum import Curriculum
 from latentplan.training.learner.graphed import make_learner
 from latentplan.training.learner.skips import NotFiniteError
 from latentplan.training.ranks import Ranks, join_ranks, place_ranks
-from latentplan.training.resources import choose_device, choose_threads, set_up_torch
+from latentplan.training.resources import choose_device, choose_threads, make_trainer, set_up_torch
 from latentplan.training.saving import Guard, Restore, Stop
 from latentplan.training.saving import Save as SaveRun
 from latentplan.training.signals import Signals, exit_code
@@ -360,7 +359,7 @@ class _Run:
             self.trackers = Trackers(config.run.logger, self.folder, config, read_facts(self.folder)["run_id"])
             records = [Record(self.folder / METRICS_FILE, state, collect, self.console, self.trackers)]
         own = [collect, self.curriculum, *records, Guard(self.folder, ranks), save, stop]
-        trainer = self._trainer([Restore(optimizers), *own])
+        trainer = make_trainer(self.device, [Restore(optimizers), *own])
         if ranks.lead(lambda: (copy := self.saves.find(RUN_FILE)) is None or read_config(copy) != config):
             save.save_run(trainer, self.learner)  # so that a run that ends before its next save can be resumed
             ranks.lead(lambda: dump_config(config, self.folder / RUN_FILE))
@@ -397,21 +396,6 @@ class _Run:
                 trainer.fit(self.learner, datamodule=ReplayData(batches))
         finally:
             self.console.stop()
-
-    def _trainer(self, callbacks: list[lightning.Callback]) -> lightning.Trainer:
-        logging.getLogger("lightning.pytorch").setLevel(logging.ERROR)
-        warnings.filterwarnings("ignore", module="lightning")
-        return lightning.Trainer(
-            accelerator="gpu" if self.device.type == "cuda" else "cpu",
-            devices=[self.ranks.device] if self.device.type == "cuda" else 1,  # of several ranks, each has a trainer
-            max_epochs=-1,
-            callbacks=callbacks,
-            logger=False,  # `Record` writes the trackers
-            enable_checkpointing=False,
-            enable_progress_bar=False,
-            enable_model_summary=False,
-            log_every_n_steps=10**9,
-        )
 
     def _finish(self, trainer: lightning.Trainer, save: SaveRun, film: Path) -> dict[str, float]:
         clocks = save.clocks(self.learner)
