@@ -54,14 +54,14 @@ class LearningConfig:
 
     batch_size: int = 16
     sequence_length: int = 16
-    random_shift: int = 0
+    random_shift: int = 4
     turned_share: float = 0.0
     model_learning_rate: float = 1e-3
     behaviour_learning_rate: float = 3e-4
     max_grad_norm: float = 100.0
     reconstruction_scale: float = 4.0
     dynamics_scale: float = 1.0
-    representation_scale: float = 0.1
+    representation_scale: float = 0.5
     free_nats: float = 1.0
     overshooting_scale: float = 0.1
     overshooting_horizon: int = 8
@@ -69,11 +69,11 @@ class LearningConfig:
     vector_scale: float = 1.0
     imagination_horizon: int = 15
     imagination_starts: int = 128
-    gradient_decay: float = 1.0
+    gradient_decay: float = 0.9
     lambda_: float = 0.95
     discount: float | None = None
     replay_value_scale: float = 0.3
-    entropy_scale: float = 1e-3
+    entropy_scale: float = 3e-3
     target_rate: float = 0.02
     average_rate: float = 0.01
     curriculum_task: str | None = None
@@ -112,8 +112,9 @@ class CollectionConfig:
             that the model also learns about states away from the reward.
         goal_share: Share of all rounds in which the planner pursues a goal; `behaviour` divides the other rounds.
         goals_after: Simulator frames collected before the first round with a goal.
-        episode_decisions: Decisions after which a collected episode is cut; None plays to its end. Evaluations are
-            never cut.
+        episode_decisions: Decisions after which a short episode is cut, which shows one more start; None cuts none.
+            Evaluations are never cut.
+        short_share: Share of the decisions that are collected in short episodes, in [0, 1].
         prefill_decisions: Random decisions before learning starts.
         round_decisions: Decisions of a round; a round is collected, then learned from.
         updates_per_decision: Updates per collected decision (the replay ratio, in updates).
@@ -134,7 +135,8 @@ class CollectionConfig:
     goals: tuple[str, ...] = ()
     goal_share: float = 0.0
     goals_after: int = 0
-    episode_decisions: int | None = None
+    episode_decisions: int | None = 50
+    short_share: float = 0.5
     prefill_decisions: int = 1000
     round_decisions: int = 250
     updates_per_decision: float = 0.5
@@ -153,7 +155,7 @@ class CollectionConfig:
         if self.goals and self.goal_share == 0.0:
             raise ValueError("goals need a goal_share above 0: the share of rounds in which they are pursued")
         at_least(self, max_restarts=0)
-        within(self, step_timeout_s=(0.01, 86_400.0))
+        within(self, step_timeout_s=(0.01, 86_400.0), short_share=(0.0, 1.0))
         above_zero(self, "updates_per_decision", "episode_decisions")
 
 

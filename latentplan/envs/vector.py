@@ -13,7 +13,6 @@ from typing import TYPE_CHECKING, Any
 import gymnasium
 import numpy as np
 from gymnasium.vector import AutoresetMode, VectorEnv
-from gymnasium.wrappers import TimeLimit
 
 from latentplan.config import CollectionConfig, EnvConfig, derive_seed
 from latentplan.config.checks import EnvironmentFault
@@ -31,7 +30,6 @@ def make_vector_env(
     num_envs: int,
     seed: int | None,
     make_env: Callable[[], gymnasium.Env[Any, Any]] | None = None,
-    episode_decisions: int | None = None,
     restarts: Restarts | None = None,
     isolate: bool = False,
     step_timeout_s: float = CollectionConfig.step_timeout_s,
@@ -49,7 +47,6 @@ def make_vector_env(
         seed: The seed of each environment is derived from this seed and the environment's index; None draws seeds from
             the system.
         make_env: A user's factory, called in each process instead of the suite's; it must be picklable.
-        episode_decisions: Decisions after which an episode is truncated; None leaves the length to the task.
         restarts: Counts the restarts of environments that fail; None allows none.
         isolate: Whether a single environment runs in a process of its own too, so that its crash or hang is survived.
         step_timeout_s: Seconds that a reset or a step of an environment in a process of its own may take.
@@ -64,7 +61,7 @@ def make_vector_env(
     """
     lanes: list[Lane] = []
     for index in range(num_envs):
-        factory = EnvMaker(config, _derive_env_seed(seed, index), make_env, episode_decisions)
+        factory = EnvMaker(config, _derive_env_seed(seed, index), make_env)
         lanes.append(ProcessLane(factory, step_timeout_s) if isolate or num_envs > 1 else LocalLane(factory))
     return GuardedVectorEnv(lanes, restarts or Restarts(0))
 
@@ -333,14 +330,12 @@ class EnvMaker:
         config: Settings of the environment.
         seed: Seed of the first reset.
         factory: The user's factory, or None.
-        episode_decisions: Decisions after which an episode is truncated; None leaves the length to the task.
         modules: Modules to import first.
     """
 
     config: EnvConfig
     seed: int | None
     factory: Callable[[], gymnasium.Env[Any, Any]] | None = None
-    episode_decisions: int | None = None
     modules: tuple[str, ...] = field(init=False)
 
     def __post_init__(self) -> None:
@@ -352,8 +347,7 @@ class EnvMaker:
             importlib.import_module(module)
         build = make_env if self.factory is None else make_from(self.factory)
         env: gymnasium.Env[np.ndarray, np.ndarray] = build(self.config, self.seed)
-        env = _WithoutInfo(env) if self.factory is not None or is_by_id(self.config) else env
-        return env if self.episode_decisions is None else TimeLimit(env, self.episode_decisions)
+        return _WithoutInfo(env) if self.factory is not None or is_by_id(self.config) else env
 
 
 class _WithoutInfo(gymnasium.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarray]):

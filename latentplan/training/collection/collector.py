@@ -54,7 +54,8 @@ class Collected:
         rows: Rows of each environment in the order of time, one entry per lane of the replay.
         env_frames: Simulator control steps taken in this round.
         decisions: Actions chosen in this round, over all environments.
-        episode_returns: Returns of the episodes that ended in this round.
+        episode_returns: Returns of the episodes that ended in this round, without those that were cut short unless all
+            are.
         memory: State of the collector after this round, from which `Collector.restore` continues.
         fault: The fault after which no restart was left, and which ended the round early; None in a whole round.
     """
@@ -152,14 +153,15 @@ class Collector:
     def _make_episodes(self, guards: dict[str, Any]) -> Episodes:
         """The environments that collect, and the keeper of their episodes."""
         config = self.config
-        num_envs, seed, cut = config.env.num_envs, config.run.seed, config.collection.episode_decisions
-        envs = make_vector_env(config.env, num_envs, seed, self._make_user_env, cut, self.restarts, **guards)
+        num_envs, seed = config.env.num_envs, config.run.seed
+        short = config.collection.episode_decisions, config.collection.short_share
+        envs = make_vector_env(config.env, num_envs, seed, self._make_user_env, self.restarts, **guards)
         if config.collection.keep_episodes is None:
-            return Episodes(envs, seed)
+            return Episodes(envs, seed, None, *short)
         try:
             facts, folder = self._eval_env.facts, Path(config.collection.keep_episodes)
             keeper = EpisodeKeeper(folder, config.env, read_interface(facts), tuple(facts["labels"] or ()), num_envs)
-            return Episodes(envs, seed, keeper)
+            return Episodes(envs, seed, keeper, *short)
         except BaseException:
             envs.close(timeout=CLOSING_SECONDS)
             raise
@@ -404,7 +406,9 @@ class Collector:
         log.append(frames, deter, actions, rewards, ~terminated, first, labels, np.asarray(info["env_frames"]), failed)
         for lane in np.flatnonzero(self._has_ended & ~failed):
             last_frame, last_labels = self._frames[lane].copy(), self._labels[lane].copy()  # a restart overwrites both
-            log.finish(int(lane), last_frame, last_labels, float(self._returns[lane]))
+            log.finish(int(lane), last_frame, last_labels)
+            if not self._episodes.was_cut[lane] or self.config.collection.short_share == 1.0:
+                log.returns.append(float(self._returns[lane]))
 
 
 def _choose_discount(decisions: int | None) -> float:
@@ -443,9 +447,8 @@ class _Log:
             entries.append(tuple(part[lane] for part in row))
         self.env_frames += int(env_frames.sum())
 
-    def finish(self, lane: int, frame: np.ndarray, labels: np.ndarray, total_return: float) -> None:
+    def finish(self, lane: int, frame: np.ndarray, labels: np.ndarray) -> None:
         self._lanes[lane].append((frame, self._no_deter[lane], self._no_action, 0.0, 1.0, False, labels))
-        self.returns.append(total_return)
 
     def rows(self) -> list[Rows]:
         return [_stack(entries) for entries in self._lanes]

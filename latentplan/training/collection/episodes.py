@@ -29,12 +29,23 @@ class Episodes:
         envs: The environments.
         seed: Seed of the run.
         keeper: Keeps the episodes that end in `step`; None keeps none. An episode that a fault cut is not kept.
+        cut: Decisions after which a short episode is truncated; None makes none short.
+        short_share: Share of each environment's decisions that belong to short episodes, in [0, 1].
     """
 
     def __init__(
-        self, envs: VectorEnv[np.ndarray, np.ndarray, Any], seed: int, keeper: EpisodeKeeper | None = None
+        self,
+        envs: VectorEnv[np.ndarray, np.ndarray, Any],
+        seed: int,
+        keeper: EpisodeKeeper | None = None,
+        cut: int | None = None,
+        short_share: float = 0.0,
     ) -> None:
         self.envs, self.seed, self.keeper = envs, seed, keeper
+        self._cut, self._short_share = cut, 0.0 if cut is None else short_share
+        self.was_cut = np.zeros(envs.num_envs, dtype=bool)  # by the latest step
+        self._is_short = np.zeros(envs.num_envs, dtype=bool)
+        self._played = np.zeros((envs.num_envs, 2), dtype=np.int64)  # decisions of whole and of short episodes
         self._begun = [0] * envs.num_envs  # episodes so far, of each environment
         self._actions: list[list[np.ndarray]] = [[] for _ in range(envs.num_envs)]
         self._is_started = False
@@ -52,18 +63,24 @@ class Episodes:
         for lane in np.flatnonzero(where):
             self._begun[lane] += 1
             self._actions[lane].clear()
+            whole, short = self._played[lane]
+            self._is_short[lane] = short < self._short_share * (whole + short) or self._short_share == 1.0
         return self._reset(where)
 
     def step(self, actions: np.ndarray) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
         """The result of one step of all environments with actions (env, action)."""
         for record, action in zip(self._actions, actions, strict=True):
             record.append(np.array(action))
-        result = self._step(actions)
+        frames, rewards, terminated, truncated, info = self._step(actions)
+        self._played[np.arange(len(self._played)), self._is_short.astype(int)] += 1
+        if self._cut is not None:
+            is_long = np.array([len(record) >= self._cut for record in self._actions])
+            self.was_cut = self._is_short & is_long & ~(terminated | truncated)
+            truncated = truncated | self.was_cut
         if self.keeper is not None:
-            _, _, terminated, truncated, info = result
             for lane in np.flatnonzero((terminated | truncated) & ~info["failed"]).tolist():
                 self.keeper.write(lane, self._begun[lane])
-        return result
+        return frames, rewards, terminated, truncated, info
 
     def memory(self, frames: np.ndarray, has_ended: np.ndarray) -> list[dict[str, Any]]:
         """The record of each environment's running episode, for `replay`.
@@ -76,10 +93,14 @@ class Episodes:
         return [
             {
                 "begun": begun,
+                "is_short": is_short,
+                "played": played.copy(),
                 "actions": np.stack(record) if record and not over else np.zeros((0, *size), np.float32),
                 "frame": zlib.crc32(frame.tobytes()),
             }
-            for begun, record, frame, over in zip(self._begun, self._actions, frames, has_ended, strict=True)
+            for begun, is_short, played, record, frame, over in zip(
+                self._begun, self._is_short.tolist(), self._played, self._actions, frames, has_ended, strict=True
+            )
         ]
 
     def replay(self, records: list[dict[str, Any]]) -> tuple[np.ndarray, Any, np.ndarray]:
@@ -93,6 +114,8 @@ class Episodes:
             environment has repeated its episode, bool (env,).
         """
         self._begun = [record["begun"] for record in records]
+        self._is_short = np.array([record["is_short"] for record in records])
+        self._played = np.stack([record["played"].numpy() for record in records])
         actions = [record["actions"].numpy() for record in records]
         lengths = np.array([len(taken) for taken in actions])
         is_same = np.ones(len(records), dtype=bool)
