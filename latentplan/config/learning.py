@@ -112,8 +112,8 @@ class CollectionConfig:
             that the model also learns about states away from the reward.
         goal_share: Share of all rounds in which the planner pursues a goal; `behaviour` divides the other rounds.
         goals_after: Simulator frames collected before the first round with a goal.
-        episode_decisions: Decisions after which a short episode is cut, which shows one more start; None cuts none.
-            Evaluations are never cut.
+        episode_decisions: Decisions after which a short episode is cut; null takes 50, or `learning.sequence_length` if
+            that is more. Short episodes show more starts. Evaluations are never cut.
         short_share: Share of the decisions that are collected in short episodes, in [0, 1].
         prefill_decisions: Random decisions before learning starts.
         round_decisions: Decisions of a round; a round is collected, then learned from.
@@ -135,7 +135,7 @@ class CollectionConfig:
     goals: tuple[str, ...] = ()
     goal_share: float = 0.0
     goals_after: int = 0
-    episode_decisions: int | None = 50
+    episode_decisions: int | None = None
     short_share: float = 0.5
     prefill_decisions: int = 1000
     round_decisions: int = 250

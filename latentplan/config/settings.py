@@ -238,7 +238,7 @@ class Config:
 
     def __post_init__(self) -> None:
         cut, length = self.collection.episode_decisions, self.learning.sequence_length
-        if cut is not None and self.collection.short_share > 0.0 and cut < length:
+        if cut is not None and cut < length:
             raise UserError(f"collection.episode_decisions ({cut}) must be at least {length}, learning.sequence_length")
         if self.model.turns > 1 and self.learning.turned_share == 0.0:
             raise UserError(

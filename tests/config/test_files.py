@@ -2,6 +2,7 @@
 
 import ast
 import dataclasses
+from dataclasses import replace
 
 import pytest
 import yaml
@@ -20,15 +21,7 @@ from latentplan.config.files import (
 from latentplan.config.suites import DEFAULT_SUITE, SUITES, Suite, check_task
 
 CONFIG_FILES = sorted(path.stem for path in config_folder().glob("*.yaml"))
-TASKS = {
-    "walker": ("walk", 2),
-    "cartpole": ("swingup", 8),
-    "reacher": ("easy", 4),
-    "cheetah": ("run", 4),
-    "finger": ("spin", 2),
-    "ball_in_cup": ("catch", 4),
-    "pendulum": ("swingup", 4),
-}
+SPECIALISED_FILES = sorted(path.stem for path in (config_folder() / "specialised").glob("*.yaml"))
 
 
 @pytest.fixture
@@ -43,10 +36,20 @@ def write_yaml(tmp_path):
     return write
 
 
-@pytest.mark.parametrize(("domain", "task", "action_repeat"), [(domain, *rest) for domain, rest in TASKS.items()])
-def test_compose_takes_usual_task_and_action_repeat_of_a_domain(domain, task, action_repeat):
-    env = compose({}, {"env": {"domain": domain}}, "cpu").env
-    assert (env.domain, env.task, env.action_repeat) == (domain, task, action_repeat)
+@pytest.mark.parametrize("domain", SUITES[DEFAULT_SUITE].tasks)
+def test_every_task_has_the_same_settings_but_for_the_camera_of_its_body(domain):
+    composed = compose({}, {"env": {"domain": domain}}, "cpu")
+    usual = compose({}, {}, "cpu")
+    body = replace(usual.env, domain=domain, camera=composed.env.camera)
+    assert composed == replace(usual, env=body)
+
+
+@pytest.mark.parametrize("stem", SPECIALISED_FILES)
+def test_compose_lays_a_specialised_file_over_the_defaults(stem):
+    layer = read_layer(config_folder() / "specialised" / f"{stem}.yaml")
+    sections = to_dict(compose(layer, {"env": {"domain": stem}}, "cpu"))
+    for section, fields in layer.items():
+        assert {name: sections[section][name] for name in fields} == fields
 
 
 def test_compose_takes_defaults_when_domain_has_no_file():

@@ -41,6 +41,7 @@ from latentplan.training.demonstrations.fitting import read_interface
 
 TRIES = 2  # of the environment before a run starts
 FILMED_FRAMES = 250
+SHORT_DECISIONS = 50  # of a short episode
 CLOSING_SECONDS = 5.0
 
 EnvFactory = Callable[[], gymnasium.Env[Any, Any]]
@@ -154,7 +155,8 @@ class Collector:
         """The environments that collect, and the keeper of their episodes."""
         config = self.config
         num_envs, seed = config.env.num_envs, config.run.seed
-        short = config.collection.episode_decisions, config.collection.short_share
+        cut = config.collection.episode_decisions or max(SHORT_DECISIONS, config.learning.sequence_length)
+        short = cut, config.collection.short_share
         envs = make_vector_env(config.env, num_envs, seed, self._make_user_env, self.restarts, **guards)
         if config.collection.keep_episodes is None:
             return Episodes(envs, seed, None, *short)

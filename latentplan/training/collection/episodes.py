@@ -29,7 +29,7 @@ class Episodes:
         envs: The environments.
         seed: Seed of the run.
         keeper: Keeps the episodes that end in `step`; None keeps none. An episode that a fault cut is not kept.
-        cut: Decisions after which a short episode is truncated; None makes none short.
+        cut: Decisions after which a short episode is truncated.
         short_share: Share of each environment's decisions that belong to short episodes, in [0, 1].
     """
 
@@ -38,11 +38,11 @@ class Episodes:
         envs: VectorEnv[np.ndarray, np.ndarray, Any],
         seed: int,
         keeper: EpisodeKeeper | None = None,
-        cut: int | None = None,
+        cut: int = 0,
         short_share: float = 0.0,
     ) -> None:
         self.envs, self.seed, self.keeper = envs, seed, keeper
-        self._cut, self._short_share = cut, 0.0 if cut is None else short_share
+        self._cut, self._short_share = cut, short_share
         self.was_cut = np.zeros(envs.num_envs, dtype=bool)  # by the latest step
         self._is_short = np.zeros(envs.num_envs, dtype=bool)
         self._played = np.zeros((envs.num_envs, 2), dtype=np.int64)  # decisions of whole and of short episodes
@@ -73,10 +73,9 @@ class Episodes:
             record.append(np.array(action))
         frames, rewards, terminated, truncated, info = self._step(actions)
         self._played[np.arange(len(self._played)), self._is_short.astype(int)] += 1
-        if self._cut is not None:
-            is_long = np.array([len(record) >= self._cut for record in self._actions])
-            self.was_cut = self._is_short & is_long & ~(terminated | truncated)
-            truncated = truncated | self.was_cut
+        is_long = np.array([len(record) >= self._cut for record in self._actions])
+        self.was_cut = self._is_short & is_long & ~(terminated | truncated)
+        truncated = truncated | self.was_cut
         if self.keeper is not None:
             for lane in np.flatnonzero((terminated | truncated) & ~info["failed"]).tolist():
                 self.keeper.write(lane, self._begun[lane])
@@ -114,8 +113,8 @@ class Episodes:
             environment has repeated its episode, bool (env,).
         """
         self._begun = [record["begun"] for record in records]
-        self._is_short = np.array([record["is_short"] for record in records])
-        self._played = np.stack([record["played"].numpy() for record in records])
+        self._is_short = np.array([record.get("is_short", False) for record in records])  # earlier saves have none
+        self._played = np.array([record["played"].tolist() if "played" in record else (0, 0) for record in records])
         actions = [record["actions"].numpy() for record in records]
         lengths = np.array([len(taken) for taken in actions])
         is_same = np.ones(len(records), dtype=bool)

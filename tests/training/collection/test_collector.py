@@ -78,13 +78,35 @@ def test_collector_marks_terminal_states_but_not_time_limits(make_collector, dot
 
 
 def test_collector_restarts_shortened_episodes_without_marking_terminal_states(make_collector):
-    collector = make_collector(collection={"episode_decisions": 8})
+    collector = make_collector(collection={"episode_decisions": 8, "short_share": 1.0})
     first, second = (collector.collect(None, "random", count, counter) for counter, count in enumerate((20, 10)))
     (rows,), (later,) = first.rows, second.rows
     assert np.flatnonzero(rows.is_first).tolist() == [0, 9, 18]
     assert np.flatnonzero(later.is_first).tolist() == [5]  # the third episode continues in the second round
     assert (rows.continues == 1.0).all() and (len(first.episode_returns), len(second.episode_returns)) == (2, 1)
     assert first.episode_returns == pytest.approx([rows.rewards[:8].sum(), rows.rewards[9:17].sum()], rel=1e-5)
+
+
+@pytest.mark.parametrize(("share", "num_short"), [(0.0, 0), (0.25, 7), (0.5, 14)])
+def test_collector_cuts_episodes_for_a_share_of_the_decisions(make_collector, share, num_short):
+    collector = make_collector(collection={"episode_decisions": 8, "short_share": share})
+    rounds = [collector.collect(None, "random", 48, counter) for counter in range(5)]
+    starts = np.flatnonzero(np.concatenate([collected.rows[0].is_first for collected in rounds]))
+    lengths = np.diff(starts) - 1  # decisions of the episodes that ended; whole ones have 20
+    assert set(lengths) == {8, 20} if share else {20}
+    short = lengths == 8
+    assert short.sum() == num_short and lengths[short].sum() / lengths.sum() == pytest.approx(share, abs=0.06)
+    num_returns = sum(len(collected.episode_returns) for collected in rounds)
+    assert num_returns - (~short).sum() in (0, 1)  # the last one may be whole and just over
+
+
+def test_restored_collector_cuts_the_same_episodes(make_collector):
+    changes = {"collection": {"episode_decisions": 8, "short_share": 0.5}}
+    whole, other = make_collector(**changes), make_collector(**changes)
+    first = whole.collect(None, "random", 45, 0)
+    other.restore(first.memory)
+    rows, expected = (collector.collect(None, "random", 60, 1).rows[0] for collector in (other, whole))
+    assert np.array_equal(rows.is_first, expected.is_first) and np.array_equal(rows.frames, expected.frames)
 
 
 def test_evaluate_warns_when_the_film_cannot_be_written(make_collector, tmp_path):
@@ -95,7 +117,8 @@ def test_evaluate_warns_when_the_film_cannot_be_written(make_collector, tmp_path
 
 def test_evaluate_plays_whole_episodes_when_collection_shortens_them(make_collector, tiny):
     weights = make_weights(tiny(""))
-    cut, whole = make_collector(collection={"episode_decisions": 8}), make_collector()
+    cut = make_collector(collection={"episode_decisions": 8, "short_share": 1.0})
+    whole = make_collector()
     assert cut.evaluate(2, weights=weights) == whole.evaluate(2, weights=weights)
 
 
@@ -198,7 +221,8 @@ def test_evaluate_neither_explores_nor_disturbs_collection(make_collector, tiny)
 
 
 def test_collector_stores_the_labels_of_an_episodes_last_frame(make_cart):
-    alone, followed = (make_cart(episode_decisions=5).collect(None, "random", n, 0).rows[0] for n in (5, 10))
+    settings = {"episode_decisions": 5, "short_share": 1.0}
+    alone, followed = (make_cart(**settings).collect(None, "random", n, 0).rows[0] for n in (5, 10))
     assert followed.is_first[6] and np.array_equal(followed.labels[:6], alone.labels)
     assert not np.array_equal(followed.labels[5], followed.labels[6])
 
