@@ -52,6 +52,8 @@ class SearchOptions:
         noise_beta: Exponent of coloured sampling noise, in [0, 100]; 0 is white, larger is smoother over the horizon.
         white_noise_share: Share of the samples whose noise is white although `noise_beta` is above 0, in [0, 1]. Where
             both kinds exist, the smooth ones explore further than `init_std`, and the white ones less far.
+        overshoot: How far candidates and mean of the search may leave the bounds, in action ranges, in [0, 10]; their
+            actions are then at the bounds. Helps where the best actions lie on the bounds.
         keep_elite_fraction: Share of the elites that stay candidates in the next iteration and plan, in [0, 1].
         temperature: Elites are weighted by exp(return / (temperature * spread)) as in MPPI, where the spread is the
             standard deviation of their returns; null weights all elites alike.
@@ -86,6 +88,7 @@ class SearchOptions:
     final: str = "better"
     noise_beta: float = 2.0
     white_noise_share: float = 0.5
+    overshoot: float = 0.0
     keep_elite_fraction: float = 0.5
     temperature: float | None = None
     adapt_std: bool = True
@@ -102,7 +105,7 @@ class SearchOptions:
         check_whole(self, 0, "num_policy_samples", "gradient_steps")
         above_zero(self, "smoothing", "temperature", "gradient_step_size", "deadline_ms")
         within(self, smoothing=(0.0, 1.0), keep_elite_fraction=(0.0, 1.0), white_noise_share=(0.0, 1.0))
-        within(self, noise_beta=(0.0, STEEPEST_NOISE), min_std=(0.0, WIDEST_STD))
+        within(self, noise_beta=(0.0, STEEPEST_NOISE), min_std=(0.0, WIDEST_STD), overshoot=(0.0, 10.0))
         if isinstance(self.init_std, Real):  # a planner checks a std per action dimension, which it alone accepts
             within(self, init_std=(0.0, WIDEST_STD))
         if self.constraint_penalty is not None and not 0.0 <= self.constraint_penalty < math.inf:

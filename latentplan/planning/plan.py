@@ -86,7 +86,8 @@ class Plan:
             gradient steps it is the mean return of the last elites, which may be higher than the return of their mean.
             NaN where no candidate had a finite return.
         info: Diagnostics by name, see above.
-        elites: Kept elites, (batch, kept, horizon, action), if the planner keeps some.
+        elites: Kept elites, (batch, kept, horizon, action), if the planner keeps some; with the option `overshoot` they
+            may lie outside of the bounds.
         is_warm: Whether the next search may start from this plan, (batch,) bool on the CPU.
         elapsed: Number of actions executed since this plan was made, (batch,) on the CPU; the next search shifts the
             plan by this number.

@@ -90,7 +90,7 @@ def test_rows_have_the_promised_keys_for_every_planner_and_budget(result):
         (problem, planner + width, budget)
         for problem in ("lq", "navigation")
         for planner in PLANNERS
-        for width in ("", "-wide")
+        for width in ("", "-tuned")
         for budget in budgets
     )
 

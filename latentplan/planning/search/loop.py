@@ -149,7 +149,7 @@ class Search:
             info["probabilities"] = progress.probabilities
         kept = None
         if progress.elites is not None and options.num_kept:
-            kept = space.decode(progress.elites.actions[:, : options.num_kept])
+            kept = space.carry(progress.elites.actions[:, : options.num_kept])
         ones = torch.ones(self.batch, dtype=torch.long)
         var = space.decode_var(progress.var)
         return Plan(actions, mean, var, expected, info, kept, ones.bool(), ones, candidates=tuple(iterations))
@@ -393,7 +393,7 @@ class Search:
             previous,
             rest=self.rest,
             tail=self.options.tail,
-            fit=self.bounds.fit,
+            fit=self.space.fit_carried,
             policy_tail=lambda actions, is_tail: self.scorer.continue_by_policy(
                 self.state, actions, is_tail, self.bounds
             ),

@@ -107,6 +107,7 @@ def make_space(
         horizon,
         spline=options.action_spline,
         num_knots=options.knots(horizon),
+        overshoot=options.overshoot,
         max_change=max_change,
         last_action=last_action,
     )

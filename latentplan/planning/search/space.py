@@ -1,8 +1,9 @@
 """The space that a search samples, and how a point of this space becomes a sequence of actions.
 
 Without a spline a point is a sequence of actions. With `action_spline` a point is the knots of a spline over the plan.
-Either way the actions keep the bounds and the rate limit, and discrete dimensions take one of their values, so models,
-constraints and controllers only see actions that can be executed.
+With `overshoot` a point may leave the bounds, and its actions are then at the bounds. Either way the actions keep the
+bounds and the rate limit, and discrete dimensions take one of their values, so models, constraints and controllers only
+see actions that can be executed.
 """
 
 from __future__ import annotations
@@ -88,6 +89,13 @@ class Bounds:
         low, high = (bound[:, step if bound.shape[1] > 1 else 0] for bound in (self.low, self.high))
         return low, high
 
+    def widened(self, overshoot: float) -> Bounds:
+        """Returns bounds that lie further out by `overshoot` times the range; discrete dimensions keep theirs."""
+        margin = overshoot * (self.high - self.low)
+        if self.choices is not None:
+            margin = margin.index_fill(-1, self.choices.dims, 0.0)
+        return Bounds(self.low - margin, self.high + margin, self.choices)
+
     def select(self, steps: Tensor) -> Bounds:
         """Returns the bounds of the steps (chosen,) int."""
         low, high = (bound if bound.shape[1] == 1 else bound[:, steps] for bound in (self.low, self.high))
@@ -102,12 +110,14 @@ class Space:
         horizon: Number of actions of a plan.
         spline: `zero`, `linear` or `cubic`; None searches over the actions themselves.
         num_knots: Number of knots of a spline.
+        overshoot: How far a point may leave the bounds, in ranges of the action.
         max_change: Largest change of an action from one step to the next, (action,); None without a rate limit.
         last_action: The action executed last, NaN where unknown, (batch, action); used with `max_change` only.
 
     Attributes:
         length: Number of steps of a point: of actions, or of knots.
         point_bounds: Bounds of a point.
+        is_bounded: Whether the bounds of a point are those of the actions.
     """
 
     def __init__(
@@ -117,12 +127,14 @@ class Space:
         *,
         spline: str | None = None,
         num_knots: int = 0,
+        overshoot: float = 0.0,
         max_change: Tensor | None = None,
         last_action: Tensor | None = None,
     ) -> None:
         self.bounds, self.horizon, self.choices = bounds, horizon, bounds.choices
         self.max_change, self.last_action = max_change, last_action
-        self.length, self.point_bounds = horizon, bounds
+        self.length, self.is_bounded = horizon, overshoot == 0.0
+        self.point_bounds = bounds if self.is_bounded else bounds.widened(overshoot)
         self._steps: Tensor | None = None
         self._matrix: Tensor | None = None
         if spline is None:
@@ -130,32 +142,43 @@ class Space:
         self.length = num_knots
         maps = _spline_maps(spline, horizon, num_knots, bounds.low.dtype, bounds.low.device)
         self._matrix, self._inverse, self._hold, self._steps = maps
-        self.point_bounds = bounds.select(self._steps)
+        self.point_bounds = self.point_bounds.select(self._steps)
 
     @property
     def is_plain(self) -> bool:
         """Whether a point within the bounds is a sequence of actions that can be executed."""
-        return self._matrix is None and self.choices is None and self.max_change is None
+        return self._matrix is None and self.choices is None and self.max_change is None and self.is_bounded
 
     def clean(self, points: Tensor, *, in_place: bool = False) -> Tensor:
-        """Returns points that satisfy all limits of actions; those of knots satisfy their bounds only.
+        """Returns points within their bounds; points that are actions also keep the rate limit.
 
         Args:
             points: (batch, length, action) or (batch, sample, length, action).
             in_place: Whether the given tensor may be changed.
         """
         points = self.point_bounds.fit(points, in_place=in_place)
-        return self._limit_changes(points) if self._matrix is None else points
+        return self._limit_changes(points) if self._matrix is None and self.is_bounded else points
 
     def decode(self, points: Tensor) -> Tensor:
         """Returns the actions (..., horizon, action) of clean points (..., length, action)."""
         if self._matrix is None:
-            return points
+            return points if self.is_bounded else self._limit_changes(self.bounds.fit(points))
         actions = contract("hk,...ka->...ha", self._matrix, points)
         if self.choices is not None:
             held = contract("hk,...ka->...ha", self._hold, points)
             actions = self.choices.join(actions, self.choices.snap(held))
         return self._limit_changes(self.bounds.fit(actions))
+
+    def carry(self, points: Tensor) -> Tensor:
+        """Returns the sequences (..., horizon, action) of clean points that a plan keeps for the next search.
+
+        They are actions; without a spline, points outside of the bounds stay there.
+        """
+        return points if self._matrix is None else self.decode(points)
+
+    def fit_carried(self, sequences: Tensor) -> Tensor:
+        """Returns kept sequences as `carry` would return them in this space."""
+        return (self.point_bounds if self._matrix is None else self.bounds).fit(sequences)
 
     def decode_var(self, var: Tensor) -> Tensor:
         """Returns the variance of the actions, (batch, horizon, action), from that of a point."""

@@ -3,13 +3,15 @@
 All sequences that a decision evaluates count: those of the iterations, the mean and the best one that `final` compares,
 and those of the gradient ascent. `num_samples` is what the budget leaves for each iteration.
 
-A planner `NAME-wide` starts with a larger standard deviation than its default, a quarter of the range of the actions;
-which one is chosen for each problem, as the settings of other libraries are.
+A planner `NAME-tuned` starts with a larger standard deviation than its default, a quarter of the range of the actions,
+may have smoother noise, and may search outside of the bounds: `CHOICES`, of which one is chosen for each problem, as the
+settings of other libraries are.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from itertools import product
 from typing import Any
 
 import torch
@@ -18,19 +20,24 @@ from bench.controllers.serve import Entry, serve
 from bench.controllers.task import GRADIENT_COST, Act, Task
 from latentplan.planning import PLANNERS, ModelPredictiveController, make_planner
 
-WIDTHS = tuple({"width": width} for width in (1.0, 1.5, 2.0))  # standard deviations, in halves of the action range
+CHOICES: tuple[dict[str, float], ...] = tuple(
+    {"width": width, "overshoot": overshoot, "noise_beta": beta}  # a width is a std in halves of the action range
+    for width, overshoot, beta in product((1.0, 1.5), (0.0, 3.0), (2.0, 3.0))
+)
 
 
 def controller(name: str) -> Callable[[Task, Sequence[int]], Act]:
-    """A function that makes the controller of a registered planner, with its defaults but for a `width` of `WIDTHS`."""
+    """A function that makes the controller of a registered planner, with its defaults but for a choice of `CHOICES`."""
 
     def make(task: Task, seeds: Sequence[int]) -> Act:
         problem = task.problem
         bounds: dict[str, Any] = {"action_low": problem.action_low, "action_high": problem.action_high}
         size: dict[str, Any] = {"action_dim": problem.action_dim, "horizon": problem.horizon}
         budget: dict[str, Any] = budget_options(make_planner(name, **size), task)
-        start = {"init_std": task.settings["width"] * task.scale[1]} if "width" in task.settings else {}
-        planner = make_planner(name, **size, **bounds, **budget, **start)
+        chosen: dict[str, Any] = dict(task.settings)
+        if "width" in chosen:
+            chosen["init_std"] = chosen.pop("width") * task.scale[1]
+        planner = make_planner(name, **size, **bounds, **budget, **chosen)
         streams = [torch.Generator().manual_seed(seed) for seed in seeds]
         return ModelPredictiveController(planner, task.model(), generator=streams).act
 
@@ -53,5 +60,5 @@ def budget_options(planner: Any, task: Task) -> dict[str, int]:
 
 if __name__ == "__main__":
     default = {name: Entry(controller(name), is_batched=True) for name in PLANNERS}
-    wide = {f"{name}-wide": Entry(controller(name), is_batched=True, choices=WIDTHS) for name in PLANNERS}
-    serve(default | wide)
+    tuned = {f"{name}-tuned": Entry(controller(name), is_batched=True, choices=CHOICES) for name in PLANNERS}
+    serve(default | tuned)

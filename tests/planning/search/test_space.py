@@ -174,6 +174,54 @@ def test_search_over_knots_starts_warm_and_keeps_elites(make_planner, seeded):
     assert state.abs().max() < 0.3 and controller.plan.elites.shape[2] == 6
 
 
+OVERSHOOTING = [
+    {"overshoot": 1.0},
+    {"overshoot": 1.0, "final": "best", "keep_elite_fraction": 1.0},
+    {"overshoot": 1.0, "tail": "policy", "num_policy_samples": 2},
+    {"overshoot": 1.0, "action_spline": "cubic", "num_knots": 3},
+    {"overshoot": 1.0, "action_choices": {1: (-1.0, 0.0, 1.0)}},
+    {"overshoot": 1.0, "gradient_steps": 2},
+]
+
+
+@pytest.mark.parametrize("options", OVERSHOOTING)
+def test_overshooting_search_imagines_and_executes_actions_within_the_bounds(make_planner, seeded, options):
+    seen = []
+
+    def reward(state, action):
+        seen.append(action.detach())
+        return action[:, 0] - (action[:, 1] - 0.5).square()
+
+    model = FunctionModel(lambda state, action: state + action, reward)
+    model.policy = lambda state, generator: torch.full((len(state), 2), 9.0)
+    controller = ModelPredictiveController(make_planner(**options), model, generator=seeded())
+    for _ in range(3):
+        action = controller.act(torch.zeros(2, 2))
+        plan = controller.plan
+        for within in (action, plan.actions, plan.mean, *seen):
+            assert within.abs().max() <= 1.0
+
+
+def test_overshooting_mean_reaches_the_bound_where_the_best_actions_lie(recorder, make_planner, seeded):
+    plans = [
+        make_planner(overshoot=overshoot, num_samples=128, num_iterations=6).plan(
+            recorder, torch.zeros(1, 2), generator=seeded()
+        )
+        for overshoot in (0.0, 1.0)
+    ]
+    inside, outside = (plan.mean for plan in plans)  # a mean of actions below the bound lies below it
+    assert inside.max() < 1.0 and (outside == 1.0).all()
+
+
+def test_overshooting_keeps_elites_outside_of_the_bounds_for_the_next_search(recorder, make_planner, seeded):
+    planner = make_planner(overshoot=0.5, init_std=1.0, num_samples=64, keep_elite_fraction=1.0)
+    first = planner.plan(recorder, torch.zeros(1, 2), generator=seeded())
+    assert 1.0 < first.elites.max() <= 2.0 and first.elites.min() >= -2.0
+    inside = make_planner(num_samples=64, keep_elite_fraction=1.0).plan(recorder, torch.zeros(1, 2), first)
+    assert inside.elites.abs().max() <= 1.0
+    assert torch.cat(recorder.seen).abs().max() <= 1.0
+
+
 @pytest.mark.parametrize(
     ("options", "message"),
     [
@@ -204,7 +252,16 @@ def greedy():
         rate_limit(0.3, per_second=9.0, step_seconds=0.1),
     ],
 )
-@pytest.mark.parametrize("options", [{}, {"final": "better"}, {"gradient_steps": 3}, {"action_spline": "linear"}])
+@pytest.mark.parametrize(
+    "options",
+    [
+        {},
+        {"final": "better"},
+        {"gradient_steps": 3},
+        {"action_spline": "linear"},
+        {"overshoot": 2.0, "num_samples": 64},
+    ],
+)
 def test_rate_limit_holds_from_the_last_action_on(make_planner, seeded, limit, options):
     controller = ModelPredictiveController(
         make_planner(**options), greedy(), constraints=[limit], generator=seeded(), replan_every=2
