@@ -164,14 +164,12 @@ class Replay:
         self.first[lane] = max(self.first[lane], self.written[lane] - self.sizes[lane])
 
     def describe(self, places: np.ndarray, episodes: Any, rewards: np.ndarray, continues: np.ndarray) -> None:
-        """Notes in main memory what drawing asks of some rows: numbers of their episodes, rewards and ends, each (n,)."""
+        """Notes in main memory what drawing asks of rows (n,): number of the episode, reward, 0 at a terminal state."""
         self.episode[places] = episodes
         self.gains[places] = rewards
         self.is_end[places] = continues == 0.0
 
-    def draw(
-        self, batch_size: int, sequence_length: int, rng: np.random.Generator, balance: float = 0.0
-    ) -> Tensor:
+    def draw(self, batch_size: int, sequence_length: int, rng: np.random.Generator, balance: float = 0.0) -> Tensor:
         """Rows of drawn sequences, (batch, time + 1).
 
         A sequence lies within one episode, or continues in the next episode after a terminal state. Without the second
@@ -268,8 +266,8 @@ class Replay:
 def choose_balanced(sums: np.ndarray, count: int, balance: float, rng: np.random.Generator) -> np.ndarray:
     """Chooses some of many sequences, those of rare reward more often.
 
-    The range of the rewards is divided into equal bins. A bin of n sequences is chosen with a probability proportional to
-    n ** (1 - balance), and then one of its sequences.
+    The range of the rewards is divided into equal bins. A bin of n sequences is chosen with a probability proportional
+    to n ** (1 - balance), and then one of its sequences.
 
     Args:
         sums: Reward of each sequence, (n,).
