@@ -19,7 +19,7 @@ from latentplan.config.parsing import Setting, list_settings, raise_unknown, rea
 from latentplan.config.reading import read_yaml
 from latentplan.config.removed import drop_removed
 from latentplan.config.settings import Config
-from latentplan.config.suites import DEFAULT_SUITE, SUITES, find_suite
+from latentplan.config.suites import DEFAULT_SUITE, SUITES, check_task, find_suite
 from latentplan.config.writing import write_whole
 
 Layer = dict[str, dict[str, Any]]
@@ -39,16 +39,17 @@ def compose(config_file: Layer, flags: Layer, preset: str = "auto") -> Config:
     default = read_layer(config_folder() / "default.yaml")
     chosen = _overlay(default, config_file, flags)
     domain = chosen["env"]["domain"]
-    domains = tuple(find_suite(chosen["env"].get("suite", DEFAULT_SUITE)).tasks)
+    suite = chosen["env"].get("suite", DEFAULT_SUITE)
+    domains = tuple(find_suite(suite).tasks)
     if domain not in domains:
         raise_unknown("domain", domain, domains)
     domain_layer = _read_optional(domain)
-    task = chosen["env"].get("task") or domain_layer.get("env", {}).get("task")
+    task = chosen["env"].get("task") or check_task(suite, domain)[0]
     if preset == "auto":
         preset = "gpu" if chosen.get("run", {}).get("device") != "cpu" and has_cuda() else "cpu"
     preset_layer = read_layer(config_folder() / f"{preset}.yaml")
     layers = (default, domain_layer, _read_optional(f"{domain}-{task}"), preset_layer, config_file, flags)
-    return build_config(_overlay(*layers))
+    return build_config(_overlay(*layers, {"env": {"task": task}}))
 
 
 def build_config(layer: Layer) -> Config:

@@ -40,7 +40,8 @@ def write_yaml(tmp_path):
 def test_every_task_has_the_same_settings_but_for_the_camera_of_its_body(domain):
     composed = compose({}, {"env": {"domain": domain}}, "cpu")
     usual = compose({}, {}, "cpu")
-    body = replace(usual.env, domain=domain, camera=composed.env.camera)
+    task = check_task(DEFAULT_SUITE, domain)[0]
+    body = replace(usual.env, domain=domain, task=task, camera=composed.env.camera)
     assert composed == replace(usual, env=body)
 
 
@@ -54,7 +55,7 @@ def test_compose_lays_a_specialised_file_over_the_defaults(stem):
 
 def test_compose_takes_defaults_when_domain_has_no_file():
     composed = compose({}, {"env": {"domain": "fish"}}, "cpu")
-    assert composed.env == EnvConfig(domain="fish")
+    assert composed.env == EnvConfig(domain="fish", task=check_task(DEFAULT_SUITE, "fish")[0])
     for section in ("model", "planner", "learning", "collection", "replay", "evaluation"):
         assert getattr(Config(), section) == getattr(composed, section)
 

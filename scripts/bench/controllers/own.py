@@ -4,8 +4,8 @@ All sequences that a decision evaluates count: those of the iterations, the mean
 and those of the gradient ascent. `num_samples` is what the budget leaves for each iteration.
 
 A planner `NAME-tuned` starts with a larger standard deviation than its default, a quarter of the range of the actions,
-may have smoother noise, and may search outside of the bounds: one of `CHOICES` is taken for each problem, as the settings
-of other libraries are.
+may search outside of the bounds, and may start every search cold: one of `CHOICES` is taken for each problem, as the
+settings of other libraries are.
 """
 
 from __future__ import annotations
@@ -20,9 +20,9 @@ from bench.controllers.serve import Entry, serve
 from bench.controllers.task import GRADIENT_COST, Act, Task
 from latentplan.planning import PLANNERS, ModelPredictiveController, make_planner
 
-CHOICES: tuple[dict[str, float], ...] = tuple(
-    {"width": width, "overshoot": overshoot, "noise_beta": beta}  # a width is a std in halves of the action range
-    for width, overshoot, beta in product((1.0, 1.5), (0.0, 3.0), (2.0, 3.0))
+CHOICES: tuple[dict[str, Any], ...] = tuple(
+    {"width": width, "overshoot": overshoot, "warm_start": is_warm}  # a width is a std in halves of the action range
+    for width, overshoot, is_warm in product((1.0, 1.5), (0.0, 3.0), (True, False))
 )
 
 
