@@ -7,6 +7,7 @@ import importlib
 import os
 import signal
 import socket
+import sys
 import threading
 from collections import deque
 from collections.abc import Callable, Iterator
@@ -44,7 +45,7 @@ def join_cluster(address: str | None, workers: int = 0) -> Any:
             _probe(str(address))
         os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
         more: dict[str, Any] = {"include_dashboard": False} if address is None else {}
-        with _own_sigterm():
+        with _own_sigterm(), _own_modules():
             try:
                 ray.init(address="local" if address is None else address, logging_level="ERROR", **more)
             except (ConnectionError, RuntimeError, ValueError) as error:
@@ -115,7 +116,7 @@ class RayWorker:
         """The oldest result that was not returned before; waits until it is there.
 
         Raises:
-            UserError: The method raised this error.
+            UserError: The method raised this error, or a module is missing where the actor runs.
             Stopped: The run stops.
             WorkerEnded: The actor ended, or its machine did.
             RuntimeError: The method failed with another error.
@@ -128,6 +129,12 @@ class RayWorker:
         except exceptions.RayError as error:
             if self._should_stop():
                 raise Stopped from None
+            if "creation task" in str(error):
+                reason = [line for line in str(error).splitlines() if line.strip()][-1].strip()
+                raise UserError(
+                    f"a Ray actor cannot start: {reason}; this package and the module of the environment must be "
+                    "installed on every machine of the cluster"
+                ) from None
             raise WorkerEnded(f"the Ray actor ended unexpectedly ({type(error).__name__})") from None
 
     @property
@@ -167,3 +174,17 @@ def _own_sigterm() -> Iterator[None]:
     finally:
         if threading.current_thread() is threading.main_thread():
             signal.signal(signal.SIGTERM, handler)
+
+
+@contextlib.contextmanager
+def _own_modules() -> Iterator[None]:
+    """Lets processes that start meanwhile find the modules of this process, as `multiprocessing` does."""
+    before = os.environ.get("PYTHONPATH")
+    os.environ["PYTHONPATH"] = os.pathsep.join(os.path.abspath(folder) for folder in sys.path)
+    try:
+        yield
+    finally:
+        if before is None:
+            del os.environ["PYTHONPATH"]
+        else:
+            os.environ["PYTHONPATH"] = before
