@@ -20,7 +20,9 @@ import numpy as np
 from gymnasium.vector.utils import CloudpickleWrapper
 
 from latentplan.config import Config, UserError
+from latentplan.config.checks import shown
 from latentplan.config.env_id import imported_modules
+from latentplan.config.estimates import count_cores
 from latentplan.config.extras import import_extra
 from latentplan.training.collection.collector import CLOSING_SECONDS, EnvFactory
 from latentplan.training.collection.episodes import Stopped
@@ -39,12 +41,14 @@ def join_cluster(address: str | None, workers: int = 0) -> Any:
     Raises:
         UserError: Ray is not installed, nobody answers at the address, or the cluster has fewer cores than workers.
     """
-    ray = import_extra("ray", "collection.backend ray")
+    ray = import_extra("ray", "a Ray cluster")
     if not ray.is_initialized():
         if address not in (None, "auto"):
             _probe(str(address))
         os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
-        more: dict[str, Any] = {"include_dashboard": False} if address is None else {}
+        more: dict[str, Any] = {}
+        if address is None:
+            more = {"include_dashboard": False, "num_cpus": max(workers, count_cores())}
         with _own_sigterm(), _own_modules():
             try:
                 ray.init(address="local" if address is None else address, logging_level="ERROR", **more)
@@ -53,7 +57,7 @@ def join_cluster(address: str | None, workers: int = 0) -> Any:
                 raise UserError(f"cannot join the Ray cluster {address or 'of this machine'}: {reason}") from None
     cores = int(ray.cluster_resources().get("CPU", 0))
     if address is not None and cores < workers:
-        raise UserError(f"collection.workers ({workers}) must not exceed the cores of the Ray cluster, {cores}")
+        raise UserError(f"the Ray cluster has {cores} cores, too few for {workers} workers or runs side by side")
     return ray
 
 
@@ -158,7 +162,7 @@ def _probe(address: str) -> None:
     """Refuses an address at which nobody answers, because Ray itself would wait for minutes."""
     host, _, port = address.rpartition(":")
     if not host or not port.isdecimal():
-        raise UserError(f"run.ray_address must be HOST:PORT, got {address!r}")
+        raise UserError(f"the address of a Ray cluster must be HOST:PORT, got {shown(address)}")
     try:
         socket.create_connection((host, int(port)), timeout=PROBE_SECONDS).close()
     except (OSError, OverflowError) as error:

@@ -38,7 +38,7 @@ def test_train_without_ray_says_what_to_install(monkeypatch, capsys):
 @needs_ray
 @pytest.mark.parametrize("address", ["nowhere", "127.0.0.1:port"])
 def test_join_cluster_refuses_an_address_that_is_none(tiny, dot, address):
-    with pytest.raises(UserError, match="run.ray_address must be HOST:PORT, got"):
+    with pytest.raises(UserError, match="must be HOST:PORT, got"):
         make(tiny, dot, run={"ray_address": address})
 
 
