@@ -78,7 +78,6 @@ def run(request: Request) -> int:
             raise UserError(f"--{key} is a setting that {request.space} varies: leave out the flag")
     if request.jobs >= count_cores() and "threads" not in given.get("run", {}):
         given["run"] = {**given.get("run", {}), "threads": 1}
-    require_extra("latentplan sweep", "ray", "optuna")
     from latentplan.training.sweep.trials import Sweep, best_of, run_sweep
 
     file = read_layer(request.config) if request.config else {}
@@ -97,6 +96,7 @@ def run(request: Request) -> int:
         check_settings(config := sweep.resolve(values))
     if config.run.frames is None:
         raise UserError("a sweep needs --frames, the budget of a trial")
+    require_extra("latentplan sweep", "ray", "optuna")
     trials, number = run_sweep(sweep)
     print()
     _print_table(trials, list(space))

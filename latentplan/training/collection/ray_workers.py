@@ -31,12 +31,13 @@ from latentplan.training.collection.process import Answer, Server, WorkerEnded, 
 PROBE_SECONDS = 5.0  # for the address of a cluster to answer
 
 
-def join_cluster(address: str | None, workers: int = 0) -> Any:
+def join_cluster(address: str | None, workers: int = 0, log_to_driver: bool = True) -> Any:
     """The module `ray`, connected to a cluster.
 
     Args:
         address: HOST:PORT of the cluster, or `auto` for one that runs on this machine; None starts Ray here.
         workers: Workers that the cluster must have cores for.
+        log_to_driver: Whether this process prints what the workers print.
 
     Raises:
         UserError: Ray is not installed, nobody answers at the address, or the cluster has fewer cores than workers.
@@ -46,9 +47,9 @@ def join_cluster(address: str | None, workers: int = 0) -> Any:
         if address not in (None, "auto"):
             _probe(str(address))
         os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
-        more: dict[str, Any] = {}
+        more: dict[str, Any] = {"log_to_driver": log_to_driver}
         if address is None:
-            more = {"include_dashboard": False, "num_cpus": max(workers, count_cores())}
+            more |= {"include_dashboard": False, "num_cpus": max(workers, count_cores())}
         with _own_sigterm(), _own_modules():
             try:
                 ray.init(address="local" if address is None else address, logging_level="ERROR", **more)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import ctypes
 import json
+import logging
 import os
 import signal
 import subprocess
@@ -101,14 +102,19 @@ def run_sweep(sweep: Sweep) -> tuple[list[Trial], int]:
     Raises:
         UserError: Ray is not installed or not reached, or the folder holds a sweep with other settings.
     """
+    os.environ |= {
+        "TUNE_DISABLE_SIGINT_HANDLER": "1",
+        "TUNE_DISABLE_AUTO_CALLBACK_LOGGERS": "1",
+        "RAY_AIR_NEW_OUTPUT": "0",
+    }
     try:
         tune = import_extra("ray.tune", PART)
     except ImportError as error:  # of Ray without its part `tune`
         raise MissingExtra(f"{PART} needs ray[tune]; run: pip install 'latentplan[ray]'") from error
     _note(sweep)
-    join_cluster(sweep.address, sweep.jobs)
-    os.environ["TUNE_DISABLE_SIGINT_HANDLER"] = "1"
-    os.environ.setdefault("TUNE_DISABLE_AUTO_CALLBACK_LOGGERS", "1")
+    join_cluster(sweep.address, sweep.jobs, log_to_driver=False)
+    logging.getLogger("ray.tune").setLevel(logging.CRITICAL)  # `Lines` says what happens
+    import_extra("optuna", PART).logging.set_verbosity(logging.ERROR)
     signal.signal(signal.SIGUSR1, signal.SIG_IGN)  # until Tune takes it as the request to stop
     with Signals(lambda _: os.kill(os.getpid(), signal.SIGUSR1)) as signals:
         results = _make_tuner(tune, sweep).fit()
@@ -169,7 +175,7 @@ def _make_tuner(tune: Any, sweep: Sweep) -> Any:
             name=TUNE_FOLDER,
             storage_path=str(sweep.folder.absolute()),
             failure_config=tune.FailureConfig(max_failures=RETRIES),
-            callbacks=[_make_lines()],
+            callbacks=[_make_lines(sweep.folder)],
             verbose=0,
         ),
     )
@@ -185,14 +191,19 @@ def _draw(tune: Any, values: Range | tuple[Any, ...]) -> Any:
     return (tune.loguniform if values.is_log else tune.uniform)(values.low, values.high)
 
 
-def _make_lines() -> Any:
-    """Prints a line for every evaluation of a trial."""
+def _make_lines(folder: Path) -> Any:
+    """Prints a line for every evaluation of a trial, and for every trial that failed."""
 
     class Lines(import_extra("ray.tune", PART).Callback):  # type: ignore[misc]
         def on_trial_result(self, iteration: int, trials: list[Any], trial: Any, result: Any, **_: Any) -> None:
             frames, planner = result["env_frames"], result["planner"]
-            number = trial.experiment_tag.partition("_")[0]
-            print(f"trial {number:>3}  {frames:>9,} frames  planner {planner:6.1f}", flush=True)
+            self.say(trial, f"{frames:>9,} frames  planner {planner:6.1f}")
+
+        def on_trial_error(self, iteration: int, trials: list[Any], trial: Any, **_: Any) -> None:
+            self.say(trial, "failed: " + _last_line(folder / trial.trial_id / LOG))
+
+        def say(self, trial: Any, text: str) -> None:
+            print(f"trial {trial.experiment_tag.partition('_')[0]:>3}  {text}", flush=True)
 
     return Lines()
 
@@ -300,5 +311,5 @@ def _evaluations(folder: Path) -> list[Evaluation]:
 
 
 def _last_line(log: Path) -> str:
-    lines = log.read_text(errors="replace").splitlines()
+    lines = log.read_text(errors="replace").splitlines() if log.exists() else []
     return next((cut(line.strip()) for line in reversed(lines) if line.strip()), "no message")
