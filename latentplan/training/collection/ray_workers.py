@@ -35,7 +35,7 @@ def join_cluster(address: str | None, workers: int = 0, log_to_driver: bool = Tr
     """The module `ray`, connected to a cluster.
 
     Args:
-        address: HOST:PORT of the cluster, or `auto` for one that runs on this machine; None starts Ray here.
+        address: Address of the cluster as HOST:PORT; None starts Ray on this machine alone.
         workers: Workers that the cluster must have cores for.
         log_to_driver: Whether this process prints what the workers print.
 
@@ -44,15 +44,15 @@ def join_cluster(address: str | None, workers: int = 0, log_to_driver: bool = Tr
     """
     ray = import_extra("ray", "a Ray cluster")
     if not ray.is_initialized():
-        if address not in (None, "auto"):
-            _probe(str(address))
+        if address is not None:
+            _probe(address)
         os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
         more: dict[str, Any] = {"log_to_driver": log_to_driver}
         if address is None:
             more |= {"include_dashboard": False, "num_cpus": max(workers, count_cores())}
-        with _own_sigterm(), _own_modules():
+        with _own_sigterm(), _environment():
             try:
-                ray.init(address="local" if address is None else address, logging_level="ERROR", **more)
+                ray.init(address=address or "local", logging_level="ERROR", **more)
             except (ConnectionError, RuntimeError, ValueError) as error:
                 reason = (str(error).splitlines() or [type(error).__name__])[0]
                 raise UserError(f"cannot join the Ray cluster {address or 'of this machine'}: {reason}") from None
@@ -182,14 +182,21 @@ def _own_sigterm() -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def _own_modules() -> Iterator[None]:
-    """Lets processes that start meanwhile find the modules of this process, as `multiprocessing` does."""
-    before = os.environ.get("PYTHONPATH")
-    os.environ["PYTHONPATH"] = os.pathsep.join(os.path.abspath(folder) for folder in sys.path)
+def _environment() -> Iterator[None]:
+    """Variables of a cluster that starts meanwhile.
+
+    Its workers find the modules of this process, as those of `multiprocessing` do, and what they have started may save
+    itself when they end.
+    """
+    modules = os.pathsep.join(os.path.abspath(folder) for folder in sys.path)
+    given = {"PYTHONPATH": modules, "RAY_kill_child_processes_on_worker_exit": "false"}
+    before = {name: os.environ.get(name) for name in given}
+    os.environ.update(given)
     try:
         yield
     finally:
-        if before is None:
-            del os.environ["PYTHONPATH"]
-        else:
-            os.environ["PYTHONPATH"] = before
+        for name, value in before.items():
+            if value is None:
+                del os.environ[name]
+            else:
+                os.environ[name] = value

@@ -155,8 +155,8 @@ def _make_tuner(tune: Any, sweep: Sweep) -> Any:
     frames = int(config.run.frames or 0)
     search = import_extra("ray.tune.search.optuna", PART).OptunaSearch(seed=config.run.seed)
     scheduler = import_extra("ray.tune.schedulers", PART).ASHAScheduler(
-        time_attr="env_frames",
-        max_t=2 * frames,  # a trial ends by itself
+        time_attr="spent",
+        max_t=frames,
         grace_period=max(1, int(LEAST_SHARE * frames)),
         reduction_factor=REDUCTION,
     )
@@ -217,7 +217,9 @@ def run_trial(values: dict[str, Any], sweep: Sweep) -> None:
     folder, settings = sweep.folder / name, sweep.folder / SETTINGS_FOLDER / f"{name}.yaml"
     for path in (folder, settings.parent):
         make_folder(path)
-    dump_config(sweep.resolve(as_layer(values)), settings)
+    config = sweep.resolve(as_layer(values))
+    budget = int(config.run.frames or 0)
+    dump_config(config, settings)
     write_whole(folder / TRIAL_FILE, json.dumps([number, values]) + "\n")
     reported = len(_evaluations(folder)) - 1  # a trial that goes on repeats its latest report
     with _training(sweep, folder, settings) as process:
@@ -225,7 +227,8 @@ def run_trial(values: dict[str, Any], sweep: Sweep) -> None:
             code = process.poll() if process is not None else 0
             found = _evaluations(folder)
             for each in found[max(0, reported) :]:
-                tune.report({"planner": each.planner, "env_frames": each.env_frames})
+                spent = min(each.env_frames, budget - 1)  # a trial with its whole budget ends by itself
+                tune.report({"planner": each.planner, "env_frames": each.env_frames, "spent": spent})
             reported = len(found)
             if code is not None:
                 break

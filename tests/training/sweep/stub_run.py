@@ -33,6 +33,8 @@ def main(words):
     while frames < FRAMES:
         time.sleep(0.1)
         if stopped:
+            with (folder / "processes.txt").open("a") as file:
+                file.write("saved\n")
             return 143
         frames += STEP
         lines.append(f"{frames},1,0.1,{horizon * frames},1")

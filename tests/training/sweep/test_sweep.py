@@ -55,11 +55,13 @@ def test_sweep_that_was_stopped_goes_on_and_names_the_best_settings(tmp_path):
     assert begun.items() <= after.items() and len(after) == TRIALS  # the trials are those of before, and more
     assert sorted(number for number, _ in after.values()) == list(range(1, TRIALS + 1))
     calls = {name: (out / name / "processes.txt").read_text().split() for name in after}
-    assert all(words[0] == "--config" and set(words[1:]) <= {"--resume"} for words in calls.values())
+    assert all(words[0] == "--config" and set(words[1:]) <= {"--resume", "saved"} for words in calls.values())
+    assert any(words.count("--resume") for words in calls.values())
     finished = {name: values for name, (_, values) in after.items() if (out / name / "final.json").exists()}
     best = max(values["planner.horizon"] for values in finished.values())
     assert yaml.safe_load((out / "best.yaml").read_text())["planner"]["horizon"] == best
-    assert len(finished) < TRIALS  # some were stopped early
+    early = calls.keys() - finished.keys()
+    assert early and all(calls[name][-1] == "saved" for name in early)  # some were stopped, and saved themselves
     table = [line.split() for line in text.splitlines() if line.split()[1:2] in (["finished"], ["stopped"])]
     assert len(table) == TRIALS
 
