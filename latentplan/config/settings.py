@@ -190,8 +190,8 @@ class RunConfig:
             of them see. Each machine starts the same command, with MASTER_ADDR, MASTER_PORT and NODE_RANK set, or by
             torchrun.
         strategy: How several processes learn together: `ddp` averages their gradients.
-        ray_address: Address of the Ray cluster of `collection.backend ray`, as HOST:PORT; the learner runs on one of its
-            machines. None starts Ray on this machine alone.
+        ray_address: Address of the Ray cluster of `collection.backend ray`, as HOST:PORT; the learner runs on one of
+            its machines. None starts Ray on this machine alone.
     """
 
     frames: int | None = None

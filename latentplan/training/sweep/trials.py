@@ -11,6 +11,7 @@ import signal
 import subprocess
 import sys
 import time
+import warnings
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -112,12 +113,15 @@ def run_sweep(sweep: Sweep) -> tuple[list[Trial], int]:
     except ImportError as error:  # of Ray without its part `tune`
         raise MissingExtra(f"{PART} needs ray[tune]; run: pip install 'latentplan[ray]'") from error
     _note(sweep)
-    join_cluster(sweep.address, sweep.jobs, log_to_driver=False)
+    ray = join_cluster(sweep.address, sweep.jobs, log_to_driver=False)
     logging.getLogger("ray.tune").setLevel(logging.CRITICAL)  # `Lines` says what happens
     import_extra("optuna", PART).logging.set_verbosity(logging.ERROR)
+    warnings.filterwarnings("ignore", module="optuna")
     signal.signal(signal.SIGUSR1, signal.SIG_IGN)  # until Tune takes it as the request to stop
     with Signals(lambda _: os.kill(os.getpid(), signal.SIGUSR1)) as signals:
         results = _make_tuner(tune, sweep).fit()
+    ray.shutdown()
+    _await_saves(sweep.folder)
     if any(result.error for result in results) and not signals.received:
         print(
             "trials that failed: "
@@ -125,6 +129,13 @@ def run_sweep(sweep: Sweep) -> tuple[list[Trial], int]:
             + "; the same command tries them again"
         )
     return list_trials(sweep.folder), signals.received
+
+
+def _await_saves(folder: Path) -> None:
+    """Waits for runs that were stopped and still save themselves."""
+    deadline = time.monotonic() + SAVING_S
+    while time.monotonic() < deadline and any(is_locked(path.parent) for path in folder.glob(f"*/{TRIAL_FILE}")):
+        time.sleep(POLL_S)
 
 
 def list_trials(folder: Path) -> list[Trial]:

@@ -5,6 +5,7 @@ import os
 import random
 import signal
 import socket
+import sys
 
 import pytest
 import torch
@@ -132,3 +133,29 @@ def test_run_whose_actors_are_killed_loses_nothing_but_their_episodes(tiny, dot,
     assert 2 <= state["memory"]["restarts"] == sum(state["memory"]["ended"]) <= len(killed)
     assert state["memory"]["restarts"] == state["run"]["worker_restarts"]
     assert read_rows(run.run_dir)[-1]["env_restarts"] or read_rows(run.run_dir)[-2]["env_restarts"]
+
+
+@needs_ray
+@pytest.mark.slow
+def test_crew_goes_on_elsewhere_when_a_machine_of_the_cluster_ends(tiny, dot, monkeypatch):
+    from ray.cluster_utils import Cluster
+
+    handler = signal.getsignal(signal.SIGTERM)
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join(os.path.abspath(folder) for folder in sys.path))
+    machines = Cluster(initialize_head=True, head_node_args={"num_cpus": 1})
+    try:
+        lost = machines.add_node(num_cpus=1)
+        with pytest.raises(UserError, match="the Ray cluster has 2 cores, too few for 3 workers"):
+            make(tiny, dot, workers=3, run={"ray_address": machines.address})
+        crew = make(tiny, dot, run={"ray_address": machines.address})
+        collect(crew, 0)
+        machines.remove_node(lost, allow_graceful=False)
+        machines.add_node(num_cpus=1)
+        with pytest.warns(RuntimeWarning, match="worker 1: .*its episode is cut short"):
+            second = collect(crew, 1)
+        assert second.decisions == 30 and second.memory["ended"] == [0, 1]
+        crew.close()
+    finally:
+        ray.shutdown()
+        machines.shutdown()
+        signal.signal(signal.SIGTERM, handler)
