@@ -24,6 +24,8 @@ from latentplan.training.resources import choose_collector_threads
 
 WORKER_RESTARTS = 20  # collection processes that may end between two starts of a run before the run does
 
+UNANSWERED = ("restore", "notice_end")  # requests whose answers nobody waits for
+
 
 class Crew:
     """Divides the requests of a run among workers, and joins their answers in the order of the workers' numbers.
@@ -209,16 +211,27 @@ class Crew:
             for number in sorted(heads[future] for future in done):
                 if self.members[number].waiting[0][0] == "collect":
                     return number
-                self._take(number)
+                self._keep(number, *self._take(number))
 
     def _answer(self, number: int, wanted: str) -> Any:
-        """The answer of one worker to its oldest request of a method; nobody waits for answers to the others."""
+        """The answer of one worker to its oldest request of a method."""
+        kept = self.members[number].kept
+        for place, (method, answer) in enumerate(kept):
+            if method == wanted:
+                del kept[place]
+                return answer
         while True:
             method, answer = self._take(number)
             if method == wanted:
                 return answer
-            if method == "collect":
-                self._early.append((number, answer))
+            self._keep(number, method, answer)
+
+    def _keep(self, number: int, method: str, answer: Any) -> None:
+        """Keeps an answer that somebody asks for later; nobody asks for those to `restore` and `notice_end`."""
+        if method == "collect":
+            self._early.append((number, answer))
+        elif method not in UNANSWERED:
+            self.members[number].kept.append((method, answer))
 
     def _take(self, number: int) -> tuple[str, Any]:
         """The oldest request of one worker, and its answer."""
@@ -254,7 +267,7 @@ class Crew:
             RuntimeWarning,
             stacklevel=2,
         )
-        waiting = [request for request in member.waiting if request[0] not in ("restore", "notice_end")]
+        waiting = [request for request in member.waiting if request[0] not in UNANSWERED]
         member.worker.restart()
         member.waiting.clear()
         if self._has_seen_end:
@@ -270,6 +283,7 @@ class _Member:
 
     Attributes:
         waiting: Requests without an answer, in order.
+        kept: Answers that arrived before somebody asked for them, each with its method.
         memory: State of its collector after its latest share; None before the first.
         stored: State of its collector after its latest share that a round has counted.
         ended: Workers of this number that ended and took their episodes with them.
@@ -279,6 +293,7 @@ class _Member:
     def __init__(self, worker: RemoteWorker | RayWorker) -> None:
         self.worker = worker
         self.waiting: deque[tuple[str, tuple[Any, ...]]] = deque()
+        self.kept: list[tuple[str, Any]] = []
         self.memory: dict[str, Any] | None = None
         self.stored: dict[str, Any] | None = None
         self.ended = self.shares = 0

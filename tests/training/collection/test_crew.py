@@ -198,6 +198,14 @@ def test_run_whose_workers_are_killed_learns_the_same_weights(whole, tiny, dot, 
     assert {row.get("worker_restarts") for row in read_rows(run.run_dir)} >= {"1"}
 
 
+@pytest.mark.slow
+def test_asynchronous_run_says_that_its_results_depend_on_the_speed_of_workers(tiny, dot, tmp_path, capsys):
+    settings = {"overlap": True, "workers": 2, "asynchronous": True}
+    run = train(tiny(tmp_path / "run", collection=settings), dot)
+    assert "workers     2 on this machine, asynchronous: the results depend on their speed" in capsys.readouterr().out
+    assert run.exit_code == 0 and read_state(run.run_dir)["run"]["env_frames"] >= 90
+
+
 @pytest.mark.parametrize(
     ("collection", "run", "message"),
     [
