@@ -20,7 +20,7 @@ EXTRAS = PROJECT["project"]["optional-dependencies"]
 LISTED = [
     Requirement(text)
     for text in PROJECT["project"]["dependencies"]
-    + [text for extra in ("train", "bench", "hub", "view", "browser", "dev") for text in EXTRAS[extra]]
+    + [text for extra in ("train", "bench", "hub", "view", "browser", "ray", "dev") for text in EXTRAS[extra]]
 ]
 REQUIREMENTS = [requirement for requirement in LISTED if requirement.name != "latentplan"]
 

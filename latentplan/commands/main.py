@@ -40,6 +40,7 @@ COMMANDS = {
     "view": Command("latentplan.commands.view", "show an agent at work in the browser, and change its goal meanwhile"),
     "distill": Command("latentplan.commands.distill", "teach a trained agent's actor to act as its planner does"),
     "goals": Command("latentplan.commands.goals", "teach a trained agent to pursue goals that are named later"),
+    "sweep": Command("latentplan.commands.sweep", "search for better settings with many short runs (Ray Tune)"),
     "runs": Command("latentplan.commands.runs", "list training runs: task, frames, minutes, returns and state"),
     "watch": Command("latentplan.commands.watch", "show the progress of a training run until it ends"),
     "compare": Command("latentplan.commands.compare", "compare training runs: curves, settings that differ, films"),

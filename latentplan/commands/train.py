@@ -25,6 +25,7 @@ SHORT_FLAGS = {
     "run.seed": "--seed",
     "run.run_dir": "--run-dir",
     "run.logger": "--logger",
+    "run.ray_address": "--run.ray-address",
 }
 
 
@@ -50,6 +51,7 @@ class Request:
         "--run.devices",
         "--run.nodes",
         "--run.strategy",
+        "--run.ray-address",
     )
     NOTES = "Values shown are the defaults before configs/<domain>.yaml and the preset are laid over them."
 

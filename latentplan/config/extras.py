@@ -24,6 +24,7 @@ EXTRAS = {
     "trackio": ("trackio",),
     "mlflow": ("mlflow",),
     "hub": ("huggingface_hub",),
+    "ray": ("ray", "optuna"),
 }
 """By extra, the modules that it installs and the package without extras does not."""
 

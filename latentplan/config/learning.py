@@ -9,7 +9,10 @@ from latentplan.config.checks import MAX_EPISODES, above_zero, at_least, one_of,
 from latentplan.config.parsing import option
 
 Behaviour = Literal["planner", "actor", "both"]
+CollectionBackend = Literal["process", "ray"]
 BEHAVIOURS = get_args(Behaviour)
+COLLECTION_BACKENDS = get_args(CollectionBackend)
+MAX_WORKERS = 256
 MAX_UPDATES = 10**9
 MAX_ROWS = 1_000_000  # of a batch, or of decisions that are kept in memory
 
@@ -119,6 +122,12 @@ class CollectionConfig:
         round_decisions: Decisions of a round; a round is collected, then learned from.
         updates_per_decision: Updates per collected decision (the replay ratio, in updates).
         overlap: Whether the next round is collected in another process, on the CPU, while this round is learned from.
+        backend: How collection processes are started: `process` on this machine, or `ray` on the machines of a Ray
+            cluster. Needs `latentplan[ray]`.
+        workers: Collection processes that share each round and the episodes of each evaluation, in [1, 256]. Each has
+            `env.num_envs` environments.
+        asynchronous: Whether a round ends as soon as enough decisions have arrived, from any of the workers. A slow
+            worker then delays no round, but the results depend on the speed of the workers.
         max_restarts: Restarts of environments that fail (an exception, a crash, a hang, a frame or reward that is not
             as declared) before the run saves and stops. Each fault cuts one episode short.
         step_timeout_s: Seconds that a reset or a step may take of an environment in a process of its own: of several
@@ -141,13 +150,17 @@ class CollectionConfig:
     round_decisions: int = 250
     updates_per_decision: float = 0.5
     overlap: bool = True
+    backend: CollectionBackend = "process"
+    workers: int = 1
+    asynchronous: bool = False
     max_restarts: int = 10
     step_timeout_s: float = 60.0
     enabled: bool = True
     keep_episodes: str | None = option(None, metavar="DIR")
 
     def __post_init__(self) -> None:
-        one_of(self, behaviour=BEHAVIOURS)
+        one_of(self, behaviour=BEHAVIOURS, backend=COLLECTION_BACKENDS)
+        within(self, workers=(1, MAX_WORKERS))
         at_least(self, noise_std=0.0, prefill_decisions=1, round_decisions=1, goals_after=0)
         within(self, goal_share=(0.0, 1.0))
         if self.noise_correlation is not None:

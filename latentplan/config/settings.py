@@ -190,6 +190,8 @@ class RunConfig:
             of them see. Each machine starts the same command, with MASTER_ADDR, MASTER_PORT and NODE_RANK set, or by
             torchrun.
         strategy: How several processes learn together: `ddp` averages their gradients.
+        ray_address: Address of the Ray cluster of `collection.backend ray`, as HOST:PORT; the learner runs on one of
+            its machines. None starts Ray on this machine alone.
     """
 
     frames: int | None = None
@@ -203,6 +205,7 @@ class RunConfig:
     devices: int = 1
     nodes: int = 1
     strategy: Strategy = "ddp"
+    ray_address: str | None = option(None, metavar="HOST:PORT")
 
     def __post_init__(self) -> None:
         one_of(self, device=DEVICES, strategy=STRATEGIES)
@@ -228,7 +231,8 @@ class Config:
     Raises:
         UserError: Two settings contradict each other: collected episodes shorter than training sequences, a CUDA graph
             without a replay on the device or with several processes, a batch that the processes cannot share evenly,
-            agents that see turned frames without learning from turned frames, or no collection without demonstrations.
+            agents that see turned frames without learning from turned frames, no collection without demonstrations, or
+            settings of several collection processes where there is none.
     """
 
     env: EnvConfig = field(default_factory=EnvConfig)
@@ -255,6 +259,25 @@ class Config:
             self._check_ranks()
         if not self.collection.enabled:
             self._check_offline()
+        self._check_workers()
+
+    @property
+    def num_lanes(self) -> int:
+        """Environments that collect for one learning process, over all its workers."""
+        return self.env.num_envs * self.collection.workers
+
+    def _check_workers(self) -> None:
+        """Refuses settings of collection processes that have no effect."""
+        collection = self.collection
+        if not collection.overlap and (collection.workers > 1 or collection.backend == "ray"):
+            raise UserError(
+                "collection.overlap false collects in the learning process: leave out collection.workers and "
+                "collection.backend, or set collection.overlap true"
+            )
+        if collection.asynchronous and collection.workers == 1:
+            raise UserError("collection.asynchronous has no effect with one worker: give --collection.workers too")
+        if self.run.ray_address is not None and collection.backend != "ray":
+            raise UserError("run.ray_address has no effect here: give --collection.backend ray too")
 
     def _check_ranks(self) -> None:
         """Refuses settings that several learning processes cannot share."""

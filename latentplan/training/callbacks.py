@@ -18,8 +18,9 @@ from latentplan.config.writing import replaced_whole
 from latentplan.models import WorldModel
 from latentplan.replay.buffer import Replay
 from latentplan.training.collection.collector import Collected
+from latentplan.training.collection.crew import WORKER_RESTARTS, Worker
 from latentplan.training.collection.episodes import Stopped
-from latentplan.training.collection.process import RemoteWorker, Worker, WorkerEnded
+from latentplan.training.collection.process import RemoteWorker, WorkerEnded
 from latentplan.training.learner.batches import updates_per_epoch
 from latentplan.training.ranks import ALONE, Ranks
 from latentplan.training.state import RunState
@@ -29,7 +30,6 @@ if TYPE_CHECKING:
     from latentplan.training.learner.module import Learner
     from latentplan.training.trackers import Trackers
 
-WORKER_RESTARTS = 20  # collection processes that may end between two starts of a run before the run does
 CLOCKS = ("env_frames", "decisions", "updates", "minutes")
 COLUMNS = (*CLOCKS, "episode_return", "planner_return", "actor_return", "planner_minus_actor")  # the losses follow
 
@@ -316,7 +316,7 @@ class Collect(lightning.Callback):
         def take() -> tuple[Collected, int]:
             own.append(self._await_result())
             facts = {name: (own[0].memory or {}).get(name, 0) for name in ("restarts", "has_seen_end")}
-            return replace(own[0], rows=[], memory=facts), self._own_restarts
+            return replace(own[0], rows=[], memory=facts), self._own_restarts + self.worker.replaced
 
         rounds, restarts = zip(*self.ranks.together(take), strict=True)
         for lane, rows in enumerate(own[0].rows):

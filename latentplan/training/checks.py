@@ -31,6 +31,8 @@ def check_settings(config: Config) -> None:
     for name in config.run.logger:
         if name in EXTRAS:
             require_extra(f"the logger {name}", *EXTRAS[name])
+    if config.collection.backend == "ray":
+        require_extra("collection.backend ray", "ray")
     if config.collection.keep_episodes is not None:
         check_folder(config.collection.keep_episodes, "--collection.keep_episodes")
         require_extra("collection.keep_episodes", "h5py")

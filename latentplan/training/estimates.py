@@ -30,7 +30,7 @@ def count_replay_rows(config: Config, num_saved: int = 0) -> int:
     """
     ranks = config.run.num_ranks
     if not config.collection.enabled:
-        return max(config.env.num_envs, num_saved)
+        return max(config.num_lanes, num_saved)
     if config.replay.capacity is not None:
         return -(-config.replay.capacity // ranks)
     if config.run.frames is None:
@@ -89,7 +89,7 @@ def _estimate_update(config: Config) -> Part:
 
 
 def _estimate_environments(config: Config) -> Part:
-    num_envs = config.env.num_envs
+    num_envs = config.num_lanes
     num_bytes = num_envs * PROCESS_BYTES if num_envs > 1 else 0
     return Part("the environments", num_bytes, config.env.action_repeat * CONTROL_STEP_S, "--env.num_envs")
 

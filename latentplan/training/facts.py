@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import torch
 
 from latentplan import __version__
-from latentplan.config import Config, UserError
+from latentplan.config import CollectionConfig, Config, UserError
 from latentplan.config.run_results import read_evaluations, read_facts
 from latentplan.config.writing import write_whole
 from latentplan.evaluation.statistics import confidence_interval
@@ -55,6 +55,7 @@ def describe_run(
         "task": f"{env.domain}-{env.task}, action repeat {env.action_repeat}{note}",
         **({} if env.objective is None else {"objective": env.objective}),
         **({} if num_ranks == 1 else {"processes": shares}),
+        **_describe_workers(config.collection),
         "device": f"{learner.model.device}, {torch.get_num_threads()} threads",
         "renderer": f"{renderer}; {description.render_ms:.1f} ms per frame, quality {env.render_quality}",
         "parameters": f"{parameters:,}; discount {description.discount:g}",
@@ -62,6 +63,15 @@ def describe_run(
         "budget": " or ".join(budget),
         "run folder": str(folder),
     }
+
+
+def _describe_workers(collection: CollectionConfig) -> dict[str, str]:
+    """The line about several collection processes; none about one."""
+    if collection.workers == 1 and collection.backend == "process":
+        return {}
+    place = "a Ray cluster" if collection.backend == "ray" else "this machine"
+    note = ", asynchronous: the results depend on their speed" if collection.asynchronous else ""
+    return {"workers": f"{collection.workers} on {place}{note}"}
 
 
 def describe_change(before: int, now: int) -> str:

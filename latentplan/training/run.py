@@ -37,9 +37,10 @@ from latentplan.replay.disk import Counts, ReplayFiles, count_saved
 from latentplan.training.callbacks import Collect, Record, agree_on_signals, copy_weights
 from latentplan.training.checks import check_folder, check_settings
 from latentplan.training.collection.collector import Description, EnvFactory
+from latentplan.training.collection.crew import Worker, make_worker
 from latentplan.training.collection.episodes import Stopped, to_arrays
 from latentplan.training.collection.keeping import refuse_used_folder
-from latentplan.training.collection.process import Worker, WorkerEnded, make_worker
+from latentplan.training.collection.process import WorkerEnded
 from latentplan.training.console import Progress
 from latentplan.training.demonstrations.seeding import count_rows, read_demonstrations, seed_replay
 from latentplan.training.estimates import count_replay_rows
@@ -134,6 +135,7 @@ def resume(
     devices: int | None = None,
     nodes: int | None = None,
     strategy: Strategy | None = None,
+    ray_address: str | None = None,
     make_env: EnvFactory | None = None,
 ) -> Result:
     """Continues a run from its last save: weights, optimizers, replay, clocks, random streams and running episodes.
@@ -151,6 +153,7 @@ def resume(
             rows of all replays anew, and running episodes begin again.
         nodes: New number of machines; None keeps the old number.
         strategy: How several processes learn together; None keeps it.
+        ray_address: New address of the Ray cluster; None keeps the old address.
         make_env: Makes the user's environment, as for `train`.
 
     Returns:
@@ -170,7 +173,7 @@ def resume(
     run = config.run
     if frames is not None or minutes is not None or updates is not None:
         run = replace(run, frames=frames, minutes=minutes, updates=updates)
-    given = {"device": device, "devices": devices, "nodes": nodes, "strategy": strategy}
+    given = {"device": device, "devices": devices, "nodes": nodes, "strategy": strategy, "ray_address": ray_address}
     run = replace(run, **{name: value for name, value in given.items() if value is not None})  # type: ignore[arg-type]
     return _start(replace(config, run=run), folder, make_env, resume=True)
 
@@ -265,7 +268,8 @@ class _Run:
         self.demonstrations = [] if resume else read_demonstrations(config, make_env)
         self.device = choose_device(config.run, ranks.device)
         self.console = Progress(config.run, is_quiet=not ranks.is_first)
-        set_up_torch(config.run.threads or choose_threads(config.collection.overlap, config.run.devices), self.device)
+        collectors = config.collection.workers if config.collection.overlap else 0
+        set_up_torch(config.run.threads or choose_threads(collectors, config.run.devices), self.device)
         own = ranks.own_config(config)
         self.worker: Worker = make_worker(own, make_env, self.device, lambda: signals.received > 0)
         try:
@@ -302,7 +306,7 @@ class _Run:
             count_replay_rows(config, saved_rows.num_lanes * saved_rows.lane_rows),
             model.action_dim,
             config.model.deter_dim,
-            config.env.num_envs,
+            config.num_lanes,
             replay_device,
             len(model.labels) + model.spaces.vector_dim,
             model.spaces.frame_shape,

@@ -14,12 +14,14 @@ from bench.anchors import TASK_GROUPS
 from bench.runs import RunsRequest, TrainingRun
 from bench.suite_progress import Board
 from bench.suite_queue import Queue
+from bench.suite_ray import make_start
 from bench.suite_rows import Row, merge_rows, present_origin, read_rows, write_rows
 from latentplan.config import Config, UserError
 from latentplan.config.checks import at_least, output_file
 from latentplan.config.estimates import count_cores
 from latentplan.config.extras import require_extra
 from latentplan.config.files import has_cuda
+from latentplan.config.learning import CollectionBackend
 from latentplan.config.parsing import option
 from latentplan.config.run_folder import lock_folder
 from latentplan.config.suites import DEFAULT_SUITE, check_task
@@ -38,7 +40,10 @@ class Request(RunsRequest):
             dmc20 unless given.
         seeds: Seeds of each task; 0 and 1 unless given. The first seed of all tasks comes before the second.
         frames: Simulator frames of each run. The report compares returns at this number of frames.
-        jobs: Runs side by side. As many as there are cores get one thread each.
+        jobs: Runs side by side. As many as there are cores get one thread each, and so do runs on a cluster.
+        backend: Where the runs are: `process` starts them on this machine, `ray` on those of a Ray cluster, where
+            checkout and folder of results have the same paths.
+        ray_address: Address of the cluster as HOST:PORT; None starts Ray on this machine.
         report: Markdown file of tables; its plots are written beside it.
         results: File of rows, from which the report is made, and nothing is run.
         merge: Folder of a sweep, whose rows are added to the file of results first.
@@ -49,6 +54,8 @@ class Request(RunsRequest):
     frames: int = 100_000
     out: Path = option(Path("runs/suite"), metavar="DIR")
     jobs: int = 1
+    backend: CollectionBackend = "process"
+    ray_address: str | None = option(None, metavar="HOST:PORT")
     report: Path | None = option(None, metavar="FILE.md", is_output=True)
     results: Path | None = option(None, metavar="FILE")
     merge: Path | None = option(None, metavar="DIR")
@@ -59,6 +66,8 @@ class Request(RunsRequest):
         object.__setattr__(self, "tasks", expand_tasks(self.tasks))
         if self.report is not None and self.report.suffix != ".md":
             raise UserError(f"--report {str(self.report)!r} must end with .md")
+        if self.ray_address is not None and self.backend != "ray":
+            raise UserError("--ray-address has no effect here: give --backend ray too")
         if self.merge is not None and self.results is None:
             raise UserError("--merge needs --results FILE, the file to which the rows are added")
         if self.results is not None and self.merge is None and self.report is None:
@@ -68,7 +77,7 @@ class Request(RunsRequest):
     def runs(self) -> list[TrainingRun]:
         """The runs in the order in which they start: the first seed of every task, then the second."""
         extra = self.forwarded
-        if self.jobs >= count_cores() and "threads" not in self.settings.get("run", {}):
+        if (self.jobs >= count_cores() or self.backend == "ray") and "threads" not in self.settings.get("run", {}):
             extra = (*extra, "--run.threads", "1")
         return [
             TrainingRun(task, seed, self.out / f"{task}-seed{seed}", self.budget, extra)
@@ -130,12 +139,16 @@ def expand_tasks(names: tuple[str, ...]) -> tuple[str, ...]:
 def _sweep(request: Request) -> tuple[Board, int]:
     """Runs the sweep; returns its board, and the number of the signal that interrupted it or 0."""
     runs = request.runs
+    if request.backend == "ray":
+        require_extra("--backend ray", "ray")
     configs = [each.check() for each in runs]  # refuses a mistake in any run before the first run begins
     with lock_folder(request.out, "another sweep runs"):
-        origin = present_origin(request.jobs, any(map(_learns_on_gpu, configs)))
+        is_here = request.backend == "process"
+        origin = present_origin(request.jobs, any(map(_learns_on_gpu, configs))) if is_here else None
+        start = None if is_here else make_start(request.ray_address, request.jobs)
         board = Board(runs, request.jobs, request.out / RESULTS, origin)
         print(board.status(), flush=True)
-        number = Queue(runs, request.jobs, board).work_off()
+        number = Queue(runs, request.jobs, board, start).work_off()
     print(f"{request.out / RESULTS} holds {len(board.rows)} rows")
     return board, number
 

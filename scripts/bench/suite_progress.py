@@ -13,7 +13,7 @@ from typing import NamedTuple
 from bench.runs import TrainingRun
 from bench.suite_queue import LOG
 from bench.suite_rows import Origin, Row, merge_rows, note_origin, read_origin, read_rows, rows_of, write_rows
-from latentplan.config import UserError
+from latentplan.config import UserError, make_folder
 from latentplan.config.run_results import FINAL_FILE, METRICS_FILE, read_progress
 
 LOOK_S = 5.0
@@ -34,7 +34,7 @@ class Board:
         runs: All runs of the sweep, in their order.
         jobs: Runs side by side.
         results: File of results; rows of other runs in it stay.
-        origin: Origin of a run that begins now.
+        origin: Origin of a run that begins now; None where the machine of the run notes it.
 
     Attributes:
         rows: The rows in the file.
@@ -44,7 +44,7 @@ class Board:
         UserError: The file of results cannot be read.
     """
 
-    def __init__(self, runs: Sequence[TrainingRun], jobs: int, results: Path, origin: Origin) -> None:
+    def __init__(self, runs: Sequence[TrainingRun], jobs: int, results: Path, origin: Origin | None) -> None:
         self.runs, self.jobs, self.results, self.origin = runs, jobs, results, origin
         self.failures: dict[TrainingRun, str] = {}
         self.rows = read_rows(results)
@@ -59,7 +59,9 @@ class Board:
     def begin(self, run: TrainingRun) -> None:
         """Note the origin of a run, whose process is about to start."""
         is_begun = read_origin(run.folder) is not None
-        note_origin(run.folder, self.origin)
+        make_folder(run.folder)
+        if self.origin is not None:
+            note_origin(run.folder, self.origin)
         self._print(f"{run.name}: {'goes on' if is_begun else 'begins'}; its log is {run.folder / LOG}")
 
     def look(self, active: Sequence[TrainingRun]) -> None:

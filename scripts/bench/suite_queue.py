@@ -1,7 +1,8 @@
 """A queue of training runs, some of them side by side, that survives any interruption.
 
-Every run is a `train.py` process in a session of its own, which writes into `train.log` in the folder of the run. The
-first SIGINT, SIGTERM or SIGHUP lets each run save itself; where the queue itself is killed, the system tells the runs.
+Every run is a `train.py` process in a session of its own, on this machine or on one of a Ray cluster, which writes into
+`train.log` in the folder of the run. The first SIGINT, SIGTERM or SIGHUP lets each run save itself; where the queue
+itself is killed, the system tells the runs.
 """
 
 from __future__ import annotations
@@ -13,7 +14,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Protocol
 
@@ -55,6 +56,19 @@ class Observer(Protocol):
         """The run has ended after the signal, and goes on at the next start."""
 
 
+class Process(Protocol):
+    """The process of a run; see `LocalProcess`."""
+
+    def poll(self) -> int | None:
+        """The exit code; None while the process runs."""
+
+    def stop(self) -> None:
+        """Asks the process to save the run and to end."""
+
+    def wait(self) -> None:
+        """Returns when the process has ended."""
+
+
 class Queue:
     """Training runs in the order in which they start.
 
@@ -62,12 +76,20 @@ class Queue:
         runs: The runs; those that are finished are not started.
         jobs: Largest number of runs side by side.
         observer: Is told about every change.
+        start: Starts the process of a run; None starts it on this machine.
     """
 
-    def __init__(self, runs: Sequence[TrainingRun], jobs: int, observer: Observer) -> None:
+    def __init__(
+        self,
+        runs: Sequence[TrainingRun],
+        jobs: int,
+        observer: Observer,
+        start: Callable[[TrainingRun], Process] | None = None,
+    ) -> None:
+        self.start = start or (lambda run: LocalProcess(run.folder, run.command()))
         self.waiting = [run for run in runs if not run.is_finished()]
         self.jobs, self.observer = jobs, observer
-        self.active: dict[TrainingRun, subprocess.Popen[bytes]] = {}
+        self.active: dict[TrainingRun, Process] = {}
         self._busy: set[TrainingRun] = set()
         self._is_stopping = False
 
@@ -107,7 +129,7 @@ class Queue:
             self.waiting.remove(run)
             self.observer.begin(run)
             try:
-                self.active[run] = _start(run)
+                self.active[run] = self.start(run)
             except UserError as error:
                 self.observer.fail(run, str(error))
 
@@ -116,7 +138,7 @@ class Queue:
         if not self._is_stopping:
             self._is_stopping = True
             for process in self.active.values():
-                process.send_signal(signal.SIGTERM)
+                process.stop()
 
     def _collect(self) -> None:
         """Takes the runs that have ended from the active ones."""
@@ -125,8 +147,6 @@ class Queue:
             if code is None:
                 continue
             del self.active[run]
-            with contextlib.suppress(ProcessLookupError, PermissionError):
-                os.killpg(process.pid, signal.SIGKILL)  # what a run that was killed has left of its session
             if code == 0:
                 run.mark_finished()
                 self.observer.finish(run)
@@ -136,17 +156,40 @@ class Queue:
                 self.observer.fail(run, _describe_end(code, run.folder / LOG))
 
 
-def _start(run: TrainingRun) -> subprocess.Popen[bytes]:
-    command = run.command()
-    with (run.folder / LOG).open("ab") as log:
-        return subprocess.Popen(
-            command,
-            stdin=subprocess.DEVNULL,
-            stdout=log,
-            stderr=subprocess.STDOUT,
-            start_new_session=True,  # Ctrl-C reaches the queue alone, which tells each run once
-            preexec_fn=_end_with_parent,
-        )
+class LocalProcess:
+    """The process of a run on this machine.
+
+    Args:
+        folder: Folder of the run, which exists.
+        command: The command line.
+    """
+
+    def __init__(self, folder: Path, command: Sequence[str]) -> None:
+        with (folder / LOG).open("ab") as log:
+            self._process = subprocess.Popen(
+                command,
+                stdin=subprocess.DEVNULL,
+                stdout=log,
+                stderr=subprocess.STDOUT,
+                start_new_session=True,  # Ctrl-C reaches the queue alone, which tells each run once
+                preexec_fn=_end_with_parent,
+            )
+
+    def poll(self) -> int | None:
+        """The exit code; None while the process runs. Of a process that has ended, ends what it has left behind."""
+        code = self._process.poll()
+        if code is not None:
+            with contextlib.suppress(ProcessLookupError, PermissionError):
+                os.killpg(self._process.pid, signal.SIGKILL)
+        return code
+
+    def stop(self) -> None:
+        """Asks the process to save the run and to end."""
+        self._process.send_signal(signal.SIGTERM)
+
+    def wait(self) -> None:
+        """Returns when the process has ended."""
+        self._process.wait()
 
 
 _LIBRARY = ctypes.CDLL(None) if sys.platform == "linux" else None

@@ -83,7 +83,7 @@ def test_resume_takes_saved_settings_with_the_given_changes(tmp_path):
         (
             "--resume nowhere --seed 3",
             "--seed cannot be given with --resume; only --frames, --minutes, --updates, --device, --env-id, "
-            "--run.devices, --run.nodes, --run.strategy can",
+            "--run.devices, --run.nodes, --run.strategy, --run.ray-address can",
         ),
         ("--resume nowhere --preset auto", "--preset cannot be given with --resume"),
     ],

@@ -24,6 +24,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from latentplan.commands.flags import read_request
+from latentplan.config import extras
 from latentplan.config.run_folder import lock_folder
 from latentplan.config.run_results import read_evaluations
 
@@ -429,3 +430,36 @@ def test_run_is_finished_with_its_budget_or_a_larger_one(tmp_path):
         assert TrainingRun("walker-walk", 0, tmp_path, budget).is_finished() == finished
     (tmp_path / "finished.json").write_text("{")
     assert not run.is_finished()
+
+
+def test_sweep_refuses_a_ray_address_without_ray_and_says_what_to_install(tmp_path, capsys, monkeypatch):
+    assert sweep(tmp_path, "--ray-address", "10.0.0.1:6379") == 2
+    assert "--ray-address has no effect here: give --backend ray too" in capsys.readouterr().err
+    found = extras.util.find_spec
+    monkeypatch.setattr(extras.util, "find_spec", lambda name: None if name == "ray" else found(name))
+    assert sweep(tmp_path, "--backend", "ray") == 2
+    assert (
+        "--backend ray needs ray, which is not installed; run: pip install 'latentplan[ray]'" in capsys.readouterr().err
+    )
+
+
+@pytest.mark.slow
+def test_sweep_on_a_cluster_has_the_rows_of_one_on_this_machine(tmp_path, root):
+    pytest.importorskip("ray")
+    out = tmp_path / "ray"
+    assert sweep(tmp_path / "process", seeds=(0,)) == 0
+    environment = {**os.environ, "PYTHONPATH": f"{root}:{root / 'scripts'}"}
+    command = [sys.executable, "-c", DRIVER, *words(out, "--backend", "ray", tasks=TASKS, seeds=(0,))]
+    broken = Path(f"{out / 'walker-walk-seed0'}.broken")
+    out.mkdir()
+    broken.touch()
+    first = subprocess.run(command, env=environment, capture_output=True, text=True)
+    assert (
+        first.returncode == 1 and "walker-walk, seed 0: failed, exit code 2: error: this run is broken" in first.stdout
+    )
+    broken.unlink()
+    second = subprocess.run(command, env=environment, capture_output=True, text=True)
+    assert second.returncode == 0, second.stdout + second.stderr
+    assert results_of(out) == results_of(tmp_path / "process")
+    assert all(len(started) == 1 for name, started in processes(out).items())
+    assert " + " not in read_origin(out / "cartpole-swingup-seed0").hardware

@@ -117,7 +117,7 @@ def test_resume_continues_a_run_interrupted_before_it_learned(tiny, dot, tmp_pat
             super().submit(command, *arguments)
 
     with monkeypatch.context() as patch:
-        patch.setattr("latentplan.training.collection.process.LocalWorker", InterruptedWorker)
+        patch.setattr("latentplan.training.collection.crew.LocalWorker", InterruptedWorker)
         assert train(tiny(tmp_path / "run"), dot).exit_code == 143
     assert read_state(tmp_path / "run")["run"]["decisions"] == 0
     assert resume(tmp_path / "run", make_env=dot).exit_code == 0

@@ -37,6 +37,7 @@ from latentplan.reporting.film import filming_if_possible
 from latentplan.reporting.recorder import EpisodeRecorder, GuardedRecorder
 from latentplan.training.collection.episodes import Episodes, Stopped, to_arrays, to_tensors
 from latentplan.training.collection.keeping import EpisodeKeeper
+from latentplan.training.collection.rounds import RoundLog
 from latentplan.training.demonstrations.fitting import read_interface
 
 TRIES = 2  # of the environment before a run starts
@@ -100,13 +101,16 @@ class Collector:
         config: Settings of the run.
         make_user_env: Makes the user's own environment; None makes the suite's task.
         device: Device of the acting model.
+        number: Number of this collector among those of one run; each number has random streams of its own, and
+            evaluations do not depend on it.
 
     Raises:
         UserError: The environment cannot be made, or a goal in `config.collection.goals` cannot be pursued.
     """
 
-    def __init__(self, config: Config, make_user_env: EnvFactory | None, device: str) -> None:
-        self.config = config
+    def __init__(self, config: Config, make_user_env: EnvFactory | None, device: str, number: int = 0) -> None:
+        self.config, self._number = config, number
+        self._seed = config.run.seed if number == 0 else derive_seed(config.run.seed, "collector", number)
         self._make_user_env = make_user_env
         self.restarts = Restarts(config.collection.max_restarts)
         is_foreign = make_user_env is not None or config.env.suite != DEFAULT_SUITE
@@ -152,7 +156,7 @@ class Collector:
     def _make_episodes(self, guards: dict[str, Any]) -> Episodes:
         """The environments that collect, and the keeper of their episodes."""
         config = self.config
-        num_envs, seed = config.env.num_envs, config.run.seed
+        num_envs, seed = config.env.num_envs, self._seed
         cut = config.collection.episode_decisions or max(SHORT_DECISIONS, config.learning.sequence_length)
         short = cut, config.collection.short_share
         envs = make_vector_env(config.env, num_envs, seed, self._make_user_env, self.restarts, **guards)
@@ -160,6 +164,8 @@ class Collector:
             return Episodes(envs, seed, None, *short)
         try:
             facts, folder = self._eval_env.facts, Path(config.collection.keep_episodes)
+            if self._number > 0:
+                folder /= f"worker-{self._number}"
             keeper = EpisodeKeeper(folder, config.env, read_interface(facts), tuple(facts["labels"] or ()), num_envs)
             return Episodes(envs, seed, keeper, *short)
         except BaseException:
@@ -223,11 +229,11 @@ class Collector:
         if agent is not self._current_agent:
             agent.reset()
             self._current_agent = agent
-        agent.seed(derive_seed(self.config.run.seed, "collect", counter))
+        agent.seed(derive_seed(self._seed, "collect", counter))
         if isinstance(agent, ModelAgent):
             agent.noise.correlation = _choose_correlation(self.config.collection, counter)
         steps = -(-decisions // len(self._has_ended))
-        log = _Log(len(self._has_ended), self.model.action_dim, self.config.model.deter_dim)
+        log = RoundLog(len(self._has_ended), self.model.action_dim, self.config.model.deter_dim)
         taken, fault = 0, None
         try:
             for _ in range(steps):
@@ -293,6 +299,8 @@ class Collector:
         weights: dict[str, np.ndarray] | None = None,
         actor: bool = True,
         record: bool = False,
+        first: int = 0,
+        every: int = 1,
     ) -> dict[str, list[float]]:
         """Returns of planner and actor, without exploration, in episodes with the same starts.
 
@@ -302,14 +310,16 @@ class Collector:
             weights: State of the world model; None keeps the weights of the last round.
             actor: Whether the actor is evaluated too.
             record: Whether the planner's first episode is recorded, for `take_recording`.
+            first: Number of the first episode that is played here.
+            every: Step from one number to the next, where several collectors share the episodes.
 
         Returns:
-            One return per episode, under "planner" and, with `actor`, under "actor".
+            One return per episode that was played, under "planner" and, with `actor`, under "actor".
         """
         if weights is not None:
             self._load_weights(weights)
         stream = derive_seed(self.config.run.seed, "evaluation")
-        seeds = [episode_seed(stream, index) for index in range(episodes)]
+        seeds = [episode_seed(stream, index) for index in range(first, episodes, every)]
         planner = self._evaluation_agents["planner"]
         with contextlib.ExitStack() as stack:
             watchers: list[OnStep] = []
@@ -365,7 +375,7 @@ class Collector:
         return played
 
     def _load_weights(self, weights: dict[str, np.ndarray]) -> None:
-        self.model.load_state_dict({name: torch.from_numpy(value) for name, value in weights.items()})
+        self.model.load_state_dict({name: torch.tensor(value) for name, value in weights.items()})
 
     def _restart_ended(self, agent: ModelAgent | RandomAgent) -> None:
         if not self._has_ended.any():
@@ -388,7 +398,7 @@ class Collector:
             if isinstance(agent, PlanningAgent):
                 agent.weigh_ends()
 
-    def _step(self, agent: ModelAgent | RandomAgent, log: _Log) -> None:
+    def _step(self, agent: ModelAgent | RandomAgent, log: RoundLog) -> None:
         assert self._frames is not None and self._episodes is not None
         frames, labels, first = self._frames.copy(), self._labels.copy(), self._has_ended.copy()
         vectors = labels[:, len(self.labels) :]
@@ -423,57 +433,6 @@ def _choose_correlation(collection: CollectionConfig, counter: int) -> float:
     if collection.noise_correlation is not None:
         return collection.noise_correlation
     return CORRELATIONS[counter // 2 % len(CORRELATIONS)]
-
-
-class _Log:
-    """Collects the rows of every lane during one round."""
-
-    def __init__(self, lanes: int, action_dim: int, deter_dim: int) -> None:
-        self._lanes: list[list[tuple[Any, ...]]] = [[] for _ in range(lanes)]
-        self._no_deter = np.zeros((lanes, deter_dim), np.float32)
-        self._no_action = np.zeros(action_dim, np.float32)
-        self.returns: list[float] = []
-        self.env_frames = 0
-
-    def append(
-        self,
-        frames: np.ndarray,
-        deter: np.ndarray | None,
-        actions: np.ndarray,
-        rewards: np.ndarray,
-        continues: np.ndarray,
-        first: np.ndarray,
-        labels: np.ndarray,
-        env_frames: np.ndarray,
-        failed: np.ndarray,
-    ) -> None:
-        beliefs = self._no_deter if deter is None else deter
-        actions = np.where(
-            failed[:, None], self._no_action, actions
-        )  # of a step that failed, the next frame is unknown
-        for lane, entries in enumerate(self._lanes):
-            row = (frames, beliefs, actions, rewards, continues.astype(np.float32), first, labels)
-            entries.append(tuple(part[lane] for part in row))
-        self.env_frames += int(env_frames.sum())
-
-    def finish(self, lane: int, frame: np.ndarray, labels: np.ndarray) -> None:
-        self._lanes[lane].append((frame, self._no_deter[lane], self._no_action, 0.0, 1.0, False, labels))
-
-    def rows(self) -> list[Rows]:
-        return [_stack(entries) for entries in self._lanes]
-
-
-def _stack(entries: list[tuple[Any, ...]]) -> Rows:
-    frames, deter, actions, rewards, continues, is_first, labels = zip(*entries, strict=True)
-    return Rows(
-        frames=np.stack(frames),
-        deter=np.stack(deter),
-        actions=np.stack(actions),
-        rewards=np.asarray(rewards, np.float32),
-        continues=np.asarray(continues, np.float32),
-        is_first=np.asarray(is_first, bool),
-        labels=np.stack(labels),
-    )
 
 
 class RewardCheck:

@@ -15,6 +15,7 @@ from concurrent.futures import wait as wait_for
 from multiprocessing.connection import Connection
 from typing import Any
 
+import numpy as np
 import torch
 from gymnasium.vector.utils import CloudpickleWrapper
 
@@ -24,13 +25,68 @@ from latentplan.envs import single_threaded_children
 from latentplan.envs.process import end_with_parent
 from latentplan.training.collection.collector import CLOSING_SECONDS, Collector, EnvFactory
 from latentplan.training.collection.episodes import Stopped
-from latentplan.training.resources import choose_collector_threads
 
 POLL_SECONDS = 0.1  # between two looks at whether the run stops
 
 
 class WorkerEnded(RuntimeError):
     """The collection process ended, and its answers are lost."""
+
+
+Answer = tuple[str, Any]  # "ok", "user_error" or "error", and the result, the error or its traceback
+
+
+class Server:
+    """Answers requests in a collection process, by a `Collector` that the first request makes.
+
+    Args:
+        config: Settings of the run.
+        make_user_env: Makes the user's own environment; None makes the suite's task.
+        threads: CPU threads of the process.
+        modules: Modules that register the environment.
+        number: Number of the collector among those of one run.
+    """
+
+    def __init__(
+        self, config: Config, make_user_env: EnvFactory | None, threads: int, modules: tuple[str, ...], number: int
+    ) -> None:
+        torch.set_num_threads(threads)
+        self._arguments, self._modules = (config, make_user_env, "cpu", number), modules
+        self._collector: Collector | None = None
+
+    def answer(self, method: str, *arguments: Any) -> Answer:
+        """Runs a method of the collector; errors are answers too."""
+        try:
+            if self._collector is None:
+                for module in self._modules:
+                    importlib.import_module(module)
+                self._collector = Collector(*self._arguments)
+            return "ok", getattr(self._collector, method)(*arguments)
+        except UserError as error:
+            return "user_error", error if isinstance(error, EnvironmentFault) else UserError(str(error))
+        except Exception:
+            return "error", traceback.format_exc()
+
+
+def await_answer(future: Future[Answer], should_stop: Callable[[], bool]) -> Any:
+    """The result in the answer of a `Server`; waits until it is there.
+
+    Raises:
+        UserError: The method raised this error.
+        Stopped: The run stops.
+        RuntimeError: The method failed with another error.
+        Exception: The future has failed.
+    """
+    while not future.done() and not should_stop():
+        wait_for([future], timeout=POLL_SECONDS)
+    if not future.done():
+        raise Stopped
+    kind, value = future.result()
+    if kind == "user_error":
+        raise value
+    if kind == "error":
+        raise RuntimeError(f"collection failed:\n{value}")
+    return value
 
 
 class LocalWorker:
@@ -42,6 +98,8 @@ class LocalWorker:
         device: Device of the acting model.
         should_stop: Whether the run stops, so that a round is given up.
     """
+
+    replaced = 0
 
     def __init__(
         self,
@@ -103,7 +161,11 @@ class RemoteWorker:
         make_user_env: Makes the user's own environment; None makes the suite's task.
         threads: CPU threads of the process.
         should_stop: Whether the run stops, so that nobody waits for results.
+        number: Number of the collector among those of one run.
     """
+
+    replaced = 0  # processes that the worker itself has replaced
+    repeats_episodes = True  # a collector that continues from the memory of another repeats its episodes
 
     def __init__(
         self,
@@ -111,9 +173,10 @@ class RemoteWorker:
         make_user_env: EnvFactory | None,
         threads: int = 1,
         should_stop: Callable[[], bool] = lambda: False,
+        number: int = 0,
     ) -> None:
         modules = imported_modules(config.env)
-        self._arguments = (make_user_env and CloudpickleWrapper(make_user_env), config, threads, modules)
+        self._arguments = (config, make_user_env and CloudpickleWrapper(make_user_env), threads, modules, number)
         self._should_stop = should_stop
         self._start()
 
@@ -131,7 +194,11 @@ class RemoteWorker:
         child_end.close()
         # A thread waits on the pipe, so that neither process blocks while the buffer of the other is full.
         self._caller = ThreadPoolExecutor(max_workers=1)
-        self._futures: deque[Future[tuple[str, Any]]] = deque()
+        self._futures: deque[Future[Answer]] = deque()
+
+    def publish(self, weights: dict[str, np.ndarray]) -> Any:
+        """The weights in the form in which all workers take them."""
+        return weights
 
     def submit(self, method: str, *arguments: Any) -> None:
         """Ask the process to run a method; `result` returns the results in the order of the requests."""
@@ -146,24 +213,19 @@ class RemoteWorker:
             WorkerEnded: The process ended.
             RuntimeError: The method failed with another error.
         """
-        future = self._futures.popleft()
         try:
-            while not future.done() and not self._should_stop():
-                wait_for([future], timeout=POLL_SECONDS)
-            if not future.done():
-                raise Stopped
-            kind, value = future.result()
+            return await_answer(self._futures.popleft(), self._should_stop)
         except (EOFError, OSError):
             self._process.join(timeout=5.0)
             if self._should_stop():
                 raise Stopped from None
             code = self._process.exitcode
             raise WorkerEnded(f"the collection process ended unexpectedly (exit code {code})") from None
-        if kind == "user_error":
-            raise value
-        if kind == "error":
-            raise RuntimeError(f"collection failed:\n{value}")
-        return value
+
+    @property
+    def oldest(self) -> Future[Answer]:
+        """The answer that `result` returns next."""
+        return self._futures[0]
 
     def close(self) -> None:
         """Ends the process, even if a method is still running."""
@@ -176,55 +238,33 @@ class RemoteWorker:
         self._caller.shutdown(cancel_futures=True)
         self._connection.close()
 
-    def _call(self, method: str, arguments: tuple[Any, ...]) -> tuple[str, Any]:
+    def _call(self, method: str, arguments: tuple[Any, ...]) -> Answer:
         self._connection.send((method, arguments))
-        answer: tuple[str, Any] = self._connection.recv()
+        answer: Answer = self._connection.recv()
         return answer
-
-
-Worker = LocalWorker | RemoteWorker
-
-
-def make_worker(
-    config: Config, make_user_env: EnvFactory | None, device: torch.device, should_stop: Callable[[], bool]
-) -> Worker:
-    """The worker that `collection.overlap` selects; a local worker acts on the learner's device."""
-    if config.collection.overlap:
-        return RemoteWorker(config, make_user_env, choose_collector_threads(device), should_stop)
-    kind = LocalWorker if config.run.num_ranks == 1 else PatientWorker
-    return kind(config, make_user_env, str(device), should_stop)
 
 
 def _serve(
     connection: Connection,
-    make_user_env: EnvFactory | None,
     config: Config,
+    make_user_env: EnvFactory | None,
     threads: int,
     modules: tuple[str, ...],
+    number: int,
 ) -> None:
     """Runs methods of a `Collector` in this process as the learner requests them, until the connection closes."""
     signal.signal(signal.SIGTERM, lambda *_: sys.exit())  # an ordinary exit also ends the environments' processes
     # Ctrl-C and a closed terminal reach the whole process group, but only the learner reacts.
-    for number in (signal.SIGINT, signal.SIGHUP):
-        signal.signal(number, signal.SIG_IGN)
+    for received in (signal.SIGINT, signal.SIGHUP):
+        signal.signal(received, signal.SIG_IGN)
     threading.Thread(target=end_with_parent, daemon=True).start()
-    torch.set_num_threads(threads)
-    collector: Collector | None = None
+    server = Server(config, make_user_env, threads, modules, number)
     while True:
         try:
             method, arguments = connection.recv()
         except (EOFError, OSError):
             return
-        try:
-            if collector is None:
-                for module in modules:
-                    importlib.import_module(module)
-                collector = Collector(config, make_user_env, "cpu")
-            answer = "ok", getattr(collector, method)(*arguments)
-        except UserError as error:
-            answer = "user_error", error if isinstance(error, EnvironmentFault) else UserError(str(error))
-        except Exception:
-            answer = "error", traceback.format_exc()
+        answer = server.answer(method, *arguments)
         try:
             connection.send(answer)
         except OSError:  # the learner has ended

@@ -1,0 +1,202 @@
+"""Workers that are actors of a Ray cluster; Ray is imported when the first of them is asked for."""
+
+from __future__ import annotations
+
+import contextlib
+import importlib
+import os
+import signal
+import socket
+import sys
+import threading
+from collections import deque
+from collections.abc import Callable, Iterator
+from concurrent.futures import Future
+from concurrent.futures import wait as wait_for
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from gymnasium.vector.utils import CloudpickleWrapper
+
+from latentplan.config import Config, UserError
+from latentplan.config.checks import shown
+from latentplan.config.env_id import imported_modules
+from latentplan.config.estimates import count_cores
+from latentplan.config.extras import import_extra
+from latentplan.training.collection.collector import CLOSING_SECONDS, EnvFactory
+from latentplan.training.collection.episodes import Stopped
+from latentplan.training.collection.process import Answer, Server, WorkerEnded, await_answer
+
+PROBE_SECONDS = 5.0  # for the address of a cluster to answer
+
+
+def join_cluster(address: str | None, workers: int = 0, log_to_driver: bool = True) -> Any:
+    """The module `ray`, connected to a cluster.
+
+    Args:
+        address: Address of the cluster as HOST:PORT; None starts Ray on this machine alone.
+        workers: Workers that the cluster must have cores for.
+        log_to_driver: Whether this process prints what the workers print.
+
+    Raises:
+        UserError: Ray is not installed, nobody answers at the address, or the cluster has fewer cores than workers.
+    """
+    ray = import_extra("ray", "a Ray cluster")
+    if not ray.is_initialized():
+        if address is not None:
+            _probe(address)
+        os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
+        more: dict[str, Any] = {"log_to_driver": log_to_driver}
+        if address is None:
+            more |= {"include_dashboard": False, "num_cpus": max(workers, count_cores())}
+        with _own_sigterm(), _environment():
+            try:
+                ray.init(address=address or "local", logging_level="ERROR", **more)
+            except (ConnectionError, RuntimeError, ValueError) as error:
+                reason = (str(error).splitlines() or [type(error).__name__])[0]
+                raise UserError(f"cannot join the Ray cluster {address or 'of this machine'}: {reason}") from None
+    cores = int(ray.cluster_resources().get("CPU", 0))
+    if address is not None and cores < workers:
+        raise UserError(f"the Ray cluster has {cores} cores, too few for {workers} workers or runs side by side")
+    return ray
+
+
+class RayWorker:
+    """Calls methods of a `Collector` in an actor of the cluster that `join_cluster` has joined.
+
+    Arrays travel through Ray's object store. Worker 0 runs on the machine of the learner if that has a free core, so
+    that it can write films there.
+
+    Args:
+        config: Settings of the run.
+        make_user_env: Makes the user's own environment; None makes the suite's task.
+        threads: CPU threads of the actor.
+        should_stop: Whether the run stops, so that nobody waits for results.
+        number: Number of the collector among those of one run.
+    """
+
+    repeats_episodes = False  # the actor that takes the place of one that ended begins new episodes
+
+    def __init__(
+        self,
+        config: Config,
+        make_user_env: EnvFactory | None,
+        threads: int = 1,
+        should_stop: Callable[[], bool] = lambda: False,
+        number: int = 0,
+    ) -> None:
+        self._ray = import_extra("ray", "collection.backend ray")
+        folder = config.collection.keep_episodes
+        if folder is not None:  # actors start in another folder
+            config = replace(config, collection=replace(config.collection, keep_episodes=os.path.abspath(folder)))
+        modules = imported_modules(config.env)
+        self._arguments = (config, make_user_env and CloudpickleWrapper(make_user_env), threads, modules, number)
+        self._options: dict[str, Any] = {"num_cpus": 0 if config.run.ray_address is None else 1, "max_restarts": 0}
+        if number == 0:
+            scheduling = importlib.import_module("ray.util.scheduling_strategies")
+            here = self._ray.get_runtime_context().get_node_id()
+            self._options["scheduling_strategy"] = scheduling.NodeAffinitySchedulingStrategy(here, soft=True)
+        self._should_stop = should_stop
+        self._start()
+
+    def _start(self) -> None:
+        self._actor = self._ray.remote(Server).options(**self._options).remote(*self._arguments)
+        self._futures: deque[Future[Answer]] = deque()
+
+    def restart(self) -> None:
+        """Replace an actor that ended by a new one; requests that are not answered yet are dropped."""
+        self._kill()
+        self._start()
+
+    def publish(self, weights: dict[str, np.ndarray]) -> Any:
+        """A reference to weights in the object store, which all workers of a cluster take in place of the weights."""
+        return self._ray.put(weights)
+
+    def submit(self, method: str, *arguments: Any) -> None:
+        """Ask the actor to run a method; `result` returns the results in the order of the requests."""
+        self._futures.append(self._actor.answer.remote(method, *arguments).future())
+
+    def result(self) -> Any:
+        """The oldest result that was not returned before; waits until it is there.
+
+        Raises:
+            UserError: The method raised this error, or a module is missing where the actor runs.
+            Stopped: The run stops.
+            WorkerEnded: The actor ended, or its machine did.
+            RuntimeError: The method failed with another error.
+        """
+        exceptions = self._ray.exceptions
+        try:
+            return await_answer(self._futures.popleft(), self._should_stop)
+        except exceptions.RayTaskError:
+            raise
+        except exceptions.RayError as error:
+            if self._should_stop():
+                raise Stopped from None
+            if "creation task" in str(error):
+                reason = [line for line in str(error).splitlines() if line.strip()][-1].strip()
+                raise UserError(
+                    f"a Ray actor cannot start: {reason}; this package and the module of the environment must be "
+                    "installed on every machine of the cluster"
+                ) from None
+            raise WorkerEnded(f"the Ray actor ended unexpectedly ({type(error).__name__})") from None
+
+    @property
+    def oldest(self) -> Future[Answer]:
+        """The answer that `result` returns next."""
+        return self._futures[0]
+
+    def close(self) -> None:
+        """Ends the actor, even if a method is still running."""
+        if not self._futures:
+            self.submit("close")
+            wait_for(self._futures, timeout=CLOSING_SECONDS)
+        self._kill()
+
+    def _kill(self) -> None:
+        with contextlib.suppress(self._ray.exceptions.RayError):
+            self._ray.kill(self._actor)
+
+
+def _probe(address: str) -> None:
+    """Refuses an address at which nobody answers, because Ray itself would wait for minutes."""
+    host, _, port = address.rpartition(":")
+    if not host or not port.isdecimal():
+        raise UserError(f"the address of a Ray cluster must be HOST:PORT, got {shown(address)}")
+    try:
+        socket.create_connection((host, int(port)), timeout=PROBE_SECONDS).close()
+    except (OSError, OverflowError) as error:
+        raise UserError(f"no Ray cluster answers at {address}: {error}; start one with: ray start --head") from None
+
+
+@contextlib.contextmanager
+def _own_sigterm() -> Iterator[None]:
+    """Keeps this process's handler of SIGTERM, which `ray.init` replaces."""
+    handler = signal.getsignal(signal.SIGTERM)
+    try:
+        yield
+    finally:
+        if threading.current_thread() is threading.main_thread():
+            signal.signal(signal.SIGTERM, handler)
+
+
+@contextlib.contextmanager
+def _environment() -> Iterator[None]:
+    """Variables of a cluster that starts meanwhile.
+
+    Its workers find the modules of this process, as those of `multiprocessing` do, and what they have started may save
+    itself when they end.
+    """
+    modules = os.pathsep.join(os.path.abspath(folder) for folder in sys.path)
+    given = {"PYTHONPATH": modules, "RAY_kill_child_processes_on_worker_exit": "false"}
+    before = {name: os.environ.get(name) for name in given}
+    os.environ.update(given)
+    try:
+        yield
+    finally:
+        for name, value in before.items():
+            if value is None:
+                del os.environ[name]
+            else:
+                os.environ[name] = value

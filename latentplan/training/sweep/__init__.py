@@ -1,0 +1,1 @@
+"""Sweeps: many short runs that search for better settings."""
