@@ -4,7 +4,7 @@ All sequences that a decision evaluates count: those of the iterations, the mean
 and those of the gradient ascent. `num_samples` is what the budget leaves for each iteration.
 
 A planner `NAME-tuned` starts with a larger standard deviation than its default, a quarter of the range of the actions,
-may search outside of the bounds, and may start every search cold: one of `CHOICES` is taken for each problem, as the
+may have smoother noise, may search outside of the bounds, and may start every search cold: one of `CHOICES` is taken for each problem, as the
 settings of other libraries are.
 """
 
@@ -21,8 +21,8 @@ from bench.controllers.task import GRADIENT_COST, Act, Task
 from latentplan.planning import PLANNERS, ModelPredictiveController, make_planner
 
 CHOICES: tuple[dict[str, Any], ...] = tuple(
-    {"width": width, "overshoot": overshoot, "warm_start": is_warm}  # a width is a std in halves of the action range
-    for width, overshoot, is_warm in product((1.0, 1.5), (0.0, 3.0), (True, False))
+    {"width": width, "overshoot": overshoot, "noise_beta": beta, "warm_start": is_warm}  # width: std in half ranges
+    for width, overshoot, beta, is_warm in product((1.0, 1.5), (0.0, 3.0), (2.0, 3.0), (True, False))
 )
 
 
