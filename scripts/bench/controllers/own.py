@@ -4,8 +4,8 @@ All sequences that a decision evaluates count: those of the iterations, the mean
 and those of the gradient ascent. `num_samples` is what the budget leaves for each iteration.
 
 A planner `NAME-tuned` starts with a larger standard deviation than its default, a quarter of the range of the actions,
-may have smoother noise, may search outside of the bounds, and may start every search cold: one of `CHOICES` is taken for
-each problem, as the settings of other libraries are.
+may have smoother noise, may search outside of the bounds, and may start every search cold: one of `CHOICES` is taken
+for each problem, as the settings of other libraries are.
 """
 
 from __future__ import annotations
