@@ -110,7 +110,7 @@ class CollectionConfig:
         behaviour: Agent that acts while collecting: the planner, the actor, or both in alternate rounds.
         noise_std: Standard deviation of the noise added to the planner's action, in action units.
         noise_correlation: Correlation of the planner's and the actor's noise between one decision and the next, in
-            [0, 0.99]; null takes 0, 0.5 and 0.9 in turns, a round each, because no one of them explores every task.
+            [0, 0.99]; null takes 0, 0.5 and 0.9 in turns, a round each.
         goals: Expressions such as `speed -> 2.0 and height > 1.1` that the planner pursues in turn in some rounds, so
             that the model also learns about states away from the reward.
         goal_share: Share of all rounds in which the planner pursues a goal; `behaviour` divides the other rounds.
@@ -140,7 +140,7 @@ class CollectionConfig:
 
     behaviour: Behaviour = "both"
     noise_std: float = 0.4
-    noise_correlation: float | None = None
+    noise_correlation: float | None = 0.5
     goals: tuple[str, ...] = ()
     goal_share: float = 0.0
     goals_after: int = 0

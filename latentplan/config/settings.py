@@ -138,7 +138,7 @@ class ReplayConfig:
     """
 
     capacity: int | None = None
-    balance: float = 0.5
+    balance: float = 0.0
     on_device: bool = False
     demonstrations: tuple[str, ...] = option((), separator=",", metavar="FILE")
 

@@ -266,7 +266,7 @@ def test_close_returns_after_a_step_that_failed(two_environments, monkeypatch):
 
 def test_rounds_take_turns_among_the_correlations_of_noise(make_collector, tiny):
     weights = make_weights(tiny(""))
-    collector = make_collector()
+    collector = make_collector(collection={"noise_correlation": None})
     taken = []
     for counter in range(12):
         collector.collect(weights, ("planner", "actor")[counter % 2], 2, counter)
