@@ -110,7 +110,7 @@ class CollectionConfig:
         behaviour: Agent that acts while collecting: the planner, the actor, or both in alternate rounds.
         noise_std: Standard deviation of the noise added to the planner's action, in action units.
         noise_correlation: Correlation of the planner's and the actor's noise between one decision and the next, in
-            [0, 0.99]; null takes 0, 0.5 and 0.9 in turns, a round each.
+            [0, 0.99].
         goals: Expressions such as `speed -> 2.0 and height > 1.1` that the planner pursues in turn in some rounds, so
             that the model also learns about states away from the reward.
         goal_share: Share of all rounds in which the planner pursues a goal; `behaviour` divides the other rounds.
@@ -140,7 +140,7 @@ class CollectionConfig:
 
     behaviour: Behaviour = "both"
     noise_std: float = 0.4
-    noise_correlation: float | None = 0.5
+    noise_correlation: float = 0.5
     goals: tuple[str, ...] = ()
     goal_share: float = 0.0
     goals_after: int = 0
@@ -162,9 +162,7 @@ class CollectionConfig:
         one_of(self, behaviour=BEHAVIOURS, backend=COLLECTION_BACKENDS)
         within(self, workers=(1, MAX_WORKERS))
         at_least(self, noise_std=0.0, prefill_decisions=1, round_decisions=1, goals_after=0)
-        within(self, goal_share=(0.0, 1.0))
-        if self.noise_correlation is not None:
-            within(self, noise_correlation=(0.0, 0.99))
+        within(self, noise_correlation=(0.0, 0.99), goal_share=(0.0, 1.0))
         if self.goal_share > 0.0 and not self.goals:
             raise ValueError("goal_share needs goals; name at least one expression in collection.goals")
         if self.goals and self.goal_share == 0.0:

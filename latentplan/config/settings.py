@@ -129,8 +129,6 @@ class ReplayConfig:
     Attributes:
         capacity: Collected decisions kept; None keeps the whole run where its length in frames is known, else 200,000
             decisions, and never fewer than a resumed run already holds.
-        balance: How much more often sequences of rare reward are replayed, in [0, 1]: 0 replays all alike, 1 replays
-            sequences of every reward equally often.
         on_device: Whether frames are stored on the training device instead of in main memory.
         demonstrations: Recorded episodes that a new run starts with: files and folders of `collection.keep_episodes`,
             folders of Minari datasets and of LeRobot datasets (v3). They stay in replay for the whole run, beside
@@ -138,13 +136,11 @@ class ReplayConfig:
     """
 
     capacity: int | None = None
-    balance: float = 0.0
     on_device: bool = False
     demonstrations: tuple[str, ...] = option((), separator=",", metavar="FILE")
 
     def __post_init__(self) -> None:
         above_zero(self, "capacity")
-        within(self, balance=(0.0, 1.0))
 
 
 @dataclass(frozen=True)

@@ -23,8 +23,6 @@ from latentplan.replay.memory import check_memory, count_replay_bytes
 
 FRAME_SHAPE = (64, 64, 3)
 SAMPLING_ROUNDS = 1000
-CANDIDATES = 16  # sequences among which a balanced draw chooses one
-NUM_BINS = 16
 COLUMNS = ("deter", "actions", "rewards", "continues", "labels")
 
 
@@ -134,7 +132,6 @@ class Replay:
         self.labels = torch.zeros(total, num_labels, device=device)
         self.episode = np.full(total, -1, dtype=np.int64)
         self.is_end = np.zeros(total, dtype=bool)  # rows whose action led to a terminal state
-        self.gains = np.zeros(total, dtype=np.float32)  # the rewards, in main memory
         self.first = np.zeros(self.num_lanes, dtype=np.int64)
         self.written = np.zeros(self.num_lanes, dtype=np.int64)
 
@@ -154,8 +151,8 @@ class Replay:
         places = self.places(lane, self.written[lane] + newest)
         has_rows = self.written[lane] > self.first[lane]
         previous = self.episode[self.places(lane, self.written[lane] - 1)] if has_rows else -1
-        episodes = previous + np.cumsum(rows.is_first)[newest]
-        self.describe(places, episodes, rows.rewards[newest], rows.continues[newest])
+        self.episode[places] = previous + np.cumsum(rows.is_first)[newest]
+        self.is_end[places] = rows.continues[newest] == 0.0
         index = torch.as_tensor(places, device=self.device)
         for name in ("frames", *COLUMNS):
             store = getattr(self, name)
@@ -163,14 +160,8 @@ class Replay:
         self.written[lane] += count
         self.first[lane] = max(self.first[lane], self.written[lane] - self.sizes[lane])
 
-    def describe(self, places: np.ndarray, episodes: Any, rewards: np.ndarray, continues: np.ndarray) -> None:
-        """Notes in main memory what drawing asks of rows (n,): number of the episode, reward, 0 at a terminal state."""
-        self.episode[places] = episodes
-        self.gains[places] = rewards
-        self.is_end[places] = continues == 0.0
-
-    def draw(self, batch_size: int, sequence_length: int, rng: np.random.Generator, balance: float = 0.0) -> Tensor:
-        """Rows of drawn sequences, (batch, time + 1).
+    def draw(self, batch_size: int, sequence_length: int, rng: np.random.Generator) -> Tensor:
+        """Rows of uniformly drawn sequences, (batch, time + 1).
 
         A sequence lies within one episode, or continues in the next episode after a terminal state. Without the second
         kind only one sequence would contain the transition to a terminal state, while `sequence_length` sequences
@@ -180,19 +171,13 @@ class Replay:
             batch_size: Number of sequences.
             sequence_length: Decisions in each sequence; a sequence has one row more.
             rng: Random stream of the draw.
-            balance: How much more often sequences of rare reward are drawn, in [0, 1]: 0 draws all alike, 1 draws
-                sequences of every reward equally often; see `choose_balanced`.
 
         Raises:
             UserError: No episode is long enough.
         """
-        num_drawn = batch_size if balance == 0.0 else CANDIDATES * batch_size
-        lanes, starts = self._draw_starts(num_drawn, sequence_length, rng)
-        rows = self.places(lanes[:, None], starts[:, None] + np.arange(sequence_length + 1))
-        if balance > 0.0:
-            sums = self.gains[rows[:, :-1]].sum(axis=1)
-            rows = rows[choose_balanced(sums, batch_size, balance, rng)]
-        return torch.as_tensor(rows, device=self.device)
+        lanes, starts = self._draw_starts(batch_size, sequence_length, rng)
+        steps = np.arange(sequence_length + 1)
+        return torch.as_tensor(self.places(lanes[:, None], starts[:, None] + steps), device=self.device)
 
     def gather(self, rows: Tensor) -> Batch:
         """The sequences at rows (batch, time + 1); no value is read back from the device."""
@@ -261,30 +246,6 @@ class Replay:
             if len(starts) >= count:
                 return lanes[:count], starts[:count]
         raise UserError(f"{too_short}: lower --learning.sequence_length")
-
-
-def choose_balanced(sums: np.ndarray, count: int, balance: float, rng: np.random.Generator) -> np.ndarray:
-    """Chooses some of many sequences, those of rare reward more often.
-
-    The range of the rewards is divided into equal bins. A bin of n sequences is chosen with a probability proportional
-    to n ** (1 - balance), and then one of its sequences.
-
-    Args:
-        sums: Reward of each sequence, (n,).
-        count: Number of sequences to choose, with replacement.
-        balance: In [0, 1].
-        rng: Random stream of the choice.
-
-    Returns:
-        Indices of the chosen sequences, int64 (count,).
-    """
-    low, high = sums.min(), sums.max()
-    width = (high - low) / NUM_BINS
-    if not 0.0 < width < math.inf:  # all alike, or not finite
-        return rng.integers(0, len(sums), count)
-    bins = np.minimum((sums - low) / width, NUM_BINS - 1).astype(np.int64)
-    weights = np.bincount(bins, minlength=NUM_BINS)[bins].astype(np.float64) ** -balance
-    return rng.choice(len(sums), size=count, p=weights / weights.sum())
 
 
 def read_saved(path: Path, keys: Sequence[str] = ()) -> Any:

@@ -84,7 +84,8 @@ class DealtRows:
         places = replay.places(lane, np.arange(number + skipped, number + piece.length))
         index = torch.as_tensor(places, device=replay.device)
         saved, rows = self._saved[piece.rank], slice(piece.offset + skipped, piece.offset + piece.length)
-        replay.describe(places, episode, *(saved[name][rows].numpy() for name in ("rewards", "continues")))
+        replay.episode[places] = episode
+        replay.is_end[places] = saved["continues"][rows].numpy() == 0.0
         for name in COLUMNS:
             getattr(replay, name)[index] = saved[name][rows].to(replay.device)
         log = Log(self.save.folder.parent, log_name(piece.rank, lane), replay.frames[0].numel())

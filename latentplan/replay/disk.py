@@ -88,7 +88,8 @@ class ReplayFiles:
             replay.first[lane], replay.written[lane] = end - held, end
             index = replay.held_rows(lane)
             places = index.cpu().numpy()
-            replay.describe(places, *(saved[name][rows].numpy() for name in ("episode", "rewards", "continues")))
+            replay.episode[places] = saved["episode"][rows].numpy()
+            replay.is_end[places] = saved["continues"][rows].numpy() == 0.0
             for name in COLUMNS:
                 getattr(replay, name)[index] = saved[name][rows].to(replay.device)
             self._logs[lane].restore(save.logs)

@@ -21,7 +21,7 @@ def count_replay_bytes(
     num_rows: int, action_dim: int, deter_dim: int, num_labels: int = 0, frame_bytes: int = FRAME_BYTES
 ) -> int:
     """Memory that a replay of `num_rows` rows takes, in bytes."""
-    return num_rows * (frame_bytes + 2 * deter_dim + 4 * (action_dim + num_labels) + 4 + 4 + 4 + 8 + 1)
+    return num_rows * (frame_bytes + 2 * deter_dim + 4 * (action_dim + num_labels) + 4 + 4 + 8 + 1)
 
 
 def describe_replay(num_bytes: int) -> Part:

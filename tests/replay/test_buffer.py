@@ -2,13 +2,11 @@
 
 from pathlib import Path
 
-import numpy as np
 import pytest
 import torch
 
 from latentplan.config import UserError
 from latentplan.replay import memory
-from latentplan.replay.buffer import choose_balanced
 from latentplan.replay.memory import count_replay_bytes
 from tests.replay.numbered_rows import NumberedRows, frame_values, make_filled_replay, make_replay, sample
 
@@ -153,8 +151,7 @@ def test_replay_refuses_more_than_nine_tenths_of_the_free_memory(monkeypatch):
 def test_count_replay_bytes_equals_the_size_of_the_arrays():
     replay = make_replay(capacity=10, lanes=3)
     arrays = [replay.frames, replay.deter, replay.actions, replay.rewards, replay.continues, replay.labels]
-    index = [replay.episode, replay.is_end, replay.gains]
-    held = sum(array.numel() * array.element_size() for array in arrays) + sum(array.nbytes for array in index)
+    held = sum(array.numel() * array.element_size() for array in arrays) + replay.episode.nbytes + replay.is_end.nbytes
     assert held == replay.num_bytes
 
 
@@ -177,25 +174,3 @@ def test_free_memory_is_the_machines_without_a_containers_limit(tmp_path, monkey
         (tmp_path / f"memory.{name}").write_text(f"{text}\n")
     monkeypatch.setattr(memory, "LIMIT_FACTS", tmp_path)
     assert memory.free_memory() > 2**28
-
-
-@pytest.mark.parametrize(("balance", "share"), [(0.0, 0.02), (0.5, 0.125), (1.0, 0.5)])
-def test_balanced_choice_takes_rare_rewards_more_often(balance, share):
-    sums = np.zeros(50_000)
-    sums[::50] = 1.0  # one in fifty
-    chosen = choose_balanced(sums, 20_000, balance, np.random.default_rng(0))
-    assert (sums[chosen] > 0).mean() == pytest.approx(share, abs=0.01)
-
-
-@pytest.mark.parametrize("sums", [np.zeros(8), np.full(8, np.nan), np.array([0.0, np.inf, 1.0])])
-def test_balanced_choice_takes_all_alike_where_rewards_do_not_differ(sums):
-    chosen = choose_balanced(sums, 2000, 0.5, np.random.default_rng(0))
-    assert np.bincount(chosen, minlength=len(sums)).min() > 1500 / len(sums)
-
-
-def test_balanced_draw_takes_whole_sequences_of_one_episode():
-    replay = make_filled_replay(lengths=(5, 7, 9))
-    rows = replay.draw(64, 4, np.random.default_rng(0), balance=0.5)
-    again = replay.draw(64, 4, np.random.default_rng(0), balance=0.5)
-    assert_aligned(replay.gather(rows))
-    assert rows.equal(again)

@@ -18,7 +18,7 @@ from latentplan.agents.base import ModelAgent
 from latentplan.agents.modes import make_agent
 from latentplan.agents.planning import PlanningAgent
 from latentplan.agents.random import RandomAgent
-from latentplan.config import CollectionConfig, Config, EnvironmentFault, derive_seed
+from latentplan.config import Config, EnvironmentFault, derive_seed
 from latentplan.config.spaces import Spaces
 from latentplan.config.suites import DEFAULT_SUITE
 from latentplan.envs import make_vector_env
@@ -43,7 +43,6 @@ from latentplan.training.demonstrations.fitting import read_interface
 TRIES = 2  # of the environment before a run starts
 FILMED_FRAMES = 250
 SHORT_DECISIONS = 50  # of a short episode
-CORRELATIONS = (0.0, 0.5, 0.9)  # of noise
 CLOSING_SECONDS = 5.0
 
 EnvFactory = Callable[[], gymnasium.Env[Any, Any]]
@@ -131,11 +130,14 @@ class Collector:
         self.labels: dict[str, float] = facts["labels"] or {}
         self.spaces: Spaces = facts["spaces"] or Spaces()
         self.model = accelerate(WorldModel(config.model, action_dim, self.labels, spaces=self.spaces).to(device))
-        noise = config.collection.noise_std
-        planner, goal_planner = (PlanningAgent(self.model, config, discount, noise_std=noise) for _ in range(2))
+        noise, correlation = config.collection.noise_std, config.collection.noise_correlation
+        planner, goal_planner = (
+            PlanningAgent(self.model, config, discount, noise_std=noise, noise_correlation=correlation)
+            for _ in range(2)
+        )
         for goal in config.collection.goals:
             goal_planner.set_objective(goal)  # an expression that cannot be pursued is refused before the run starts
-        actor = ActorAgent(self.model, config, explore=True)
+        actor = ActorAgent(self.model, config, explore=True, noise_correlation=correlation)
         self._agents: dict[str, ModelAgent] = {"planner": planner, "actor": actor, "goal": goal_planner}
         self._evaluation_agents: dict[str, Any] = {
             mode: make_agent(mode, self.model, config, discount) for mode in ("planner", "actor")
@@ -230,8 +232,6 @@ class Collector:
             agent.reset()
             self._current_agent = agent
         agent.seed(derive_seed(self._seed, "collect", counter))
-        if isinstance(agent, ModelAgent):
-            agent.noise.correlation = _choose_correlation(self.config.collection, counter)
         steps = -(-decisions // len(self._has_ended))
         log = RoundLog(len(self._has_ended), self.model.action_dim, self.config.model.deter_dim)
         taken, fault = 0, None
@@ -426,13 +426,6 @@ class Collector:
 def _choose_discount(decisions: int | None) -> float:
     """Discount whose horizon is a fifth of an episode: 0.96 at 125 decisions, 0.99 at 500."""
     return 1.0 - 5.0 / min(max(decisions or 500, 50), 1000)
-
-
-def _choose_correlation(collection: CollectionConfig, counter: int) -> float:
-    """Correlation of the noise in a round; planner and actor, which take turns, each go through all of them."""
-    if collection.noise_correlation is not None:
-        return collection.noise_correlation
-    return CORRELATIONS[counter // 2 % len(CORRELATIONS)]
 
 
 class RewardCheck:

@@ -51,8 +51,7 @@ class ReplayBatches(IterableDataset[Batch | Tensor]):
         budget = self.config.run.updates
         end = first + self.length if budget is None else min(first + self.length, budget)
         for update in range(first, end):
-            size, length = learning.batch_size // ranks.size, learning.sequence_length
-            rows = self.replay.draw(size, length, rng, self.config.replay.balance)
+            rows = self.replay.draw(learning.batch_size // ranks.size, learning.sequence_length, rng)
             if update >= done:
                 yield rows if takes_rows else self.curriculum(self.replay.gather(rows))
 

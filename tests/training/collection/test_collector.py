@@ -262,16 +262,3 @@ def test_close_returns_after_a_step_that_failed(two_environments, monkeypatch):
     with pytest.raises(ZeroDivisionError):
         two_environments.collect(None, "random", 4, 1)
     two_environments.close()
-
-
-def test_rounds_take_turns_among_the_correlations_of_noise(make_collector, tiny):
-    weights = make_weights(tiny(""))
-    collector = make_collector(collection={"noise_correlation": None})
-    taken = []
-    for counter in range(12):
-        collector.collect(weights, ("planner", "actor")[counter % 2], 2, counter)
-        taken.append(collector._current_agent.noise.correlation)
-    assert taken[::2] == taken[1::2] == [0.0, 0.5, 0.9] * 2  # planner and actor
-    fixed = make_collector(collection={"noise_correlation": 0.3})
-    fixed.collect(weights, "actor", 2, 5)
-    assert fixed._current_agent.noise.correlation == 0.3
