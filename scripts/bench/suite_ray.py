@@ -12,7 +12,7 @@ from typing import Any
 from bench.runs import TrainingRun
 from bench.suite_queue import LocalProcess
 from bench.suite_rows import note_origin, present_origin
-from latentplan.training.collection.ray_workers import join_cluster
+from latentplan.training.cluster import join_cluster
 
 WAIT_S = 0.1
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections import deque
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import FIRST_COMPLETED
 from concurrent.futures import wait as wait_for
 from dataclasses import fields
@@ -16,10 +16,11 @@ import torch
 
 from latentplan.config import CollectionConfig, Config, EnvironmentFault
 from latentplan.replay.buffer import Rows
+from latentplan.training.cluster import join_cluster
 from latentplan.training.collection.collector import Collected, EnvFactory
 from latentplan.training.collection.episodes import Stopped
 from latentplan.training.collection.process import POLL_SECONDS, LocalWorker, PatientWorker, RemoteWorker, WorkerEnded
-from latentplan.training.collection.ray_workers import RayWorker, join_cluster
+from latentplan.training.collection.ray_workers import RayWorker
 from latentplan.training.resources import choose_collector_threads
 
 WORKER_RESTARTS = 20  # collection processes that may end between two starts of a run before the run does
@@ -356,8 +357,4 @@ def end_episodes(memory: dict[str, Any]) -> dict[str, Any]:
 def _concatenate(parts: Sequence[Rows]) -> Rows:
     if len(parts) == 1:
         return parts[0]
-    return Rows(**{name: np.concatenate([getattr(part, name) for part in parts]) for name in _names(parts[0])})
-
-
-def _names(rows: Rows) -> Iterator[str]:
-    return (each.name for each in fields(rows))
+    return Rows(**{each.name: np.concatenate([getattr(part, each.name) for part in parts]) for each in fields(Rows)})

@@ -24,7 +24,7 @@ from latentplan.config.files import Layer, compose, dump_config
 from latentplan.config.run_folder import run_saves
 from latentplan.config.run_results import FINAL_FILE, Evaluation, find_state, is_locked, read_evaluations
 from latentplan.config.writing import write_whole
-from latentplan.training.collection.ray_workers import join_cluster
+from latentplan.training.cluster import join_cluster
 from latentplan.training.signals import Signals
 from latentplan.training.sweep.space import Range, Space, as_layer
 
