@@ -14,6 +14,7 @@ from latentplan.commands.shell import run_guarded  # noqa: E402
 COMMANDS = {
     "train": Command("bench.train", "time of each part of an update, beside the peak FLOP/s of the machine"),
     "render": Command("bench.render", "milliseconds per frame and change of the picture in each render quality"),
+    "collect": Command("bench.collect", "frames per second of several workers, and what a cluster of them would do"),
     "decide": Command("bench.decide", "milliseconds per decision of planner, actor and exported actor"),
     "paths": Command("bench.paths", "milliseconds of every fast path of the world model beside plain torch"),
     "plan": Command("bench.plan", "milliseconds per search beside other planners, on the same model and settings"),
