@@ -18,6 +18,8 @@ export PATH="$PWD/.venv/bin:$PATH"
 mapfile -t nodes < <(scontrol show hostnames "$SLURM_JOB_NODELIST")
 head=$(srun --nodes=1 --ntasks=1 --nodelist="${nodes[0]}" hostname --ip-address | awk '{print $1}')
 port=6379
+export RAY_AUTH_MODE=token RAY_AUTH_TOKEN # other users reach these nodes
+RAY_AUTH_TOKEN=$(python -c 'import secrets; print(secrets.token_hex(32))')
 
 # The head is the node that runs this script; the learner has it to itself, with the worker that films.
 srun --nodes=1 --ntasks=1 --overlap --nodelist="${nodes[0]}" \

@@ -44,7 +44,14 @@ def join_cluster(address: str | None, workers: int = 0, log_to_driver: bool = Tr
                 ray.init(address=address or "local", logging_level="ERROR", **more)
             except (ConnectionError, RuntimeError, ValueError) as error:
                 reason = (str(error).splitlines() or [type(error).__name__])[0]
-                raise UserError(f"cannot join the Ray cluster {address or 'of this machine'}: {reason}") from None
+                token = (
+                    ""
+                    if address is None
+                    else "; if it has a token, RAY_AUTH_MODE and RAY_AUTH_TOKEN must be set here too"
+                )
+                raise UserError(
+                    f"cannot join the Ray cluster {address or 'of this machine'}: {reason}{token}"
+                ) from None
     cores = int(ray.cluster_resources().get("CPU", 0))
     if address is not None and cores < workers:
         raise UserError(f"the Ray cluster has {cores} cores, too few for {workers} workers or runs side by side")

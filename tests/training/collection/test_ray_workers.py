@@ -23,6 +23,7 @@ except ModuleNotFoundError:
 
 needs_ray = pytest.mark.skipif(ray is None, reason="needs latentplan[ray]")
 SETTINGS = {"evaluation": {"episodes": 3}}
+KILLS = 20
 
 
 def test_train_without_ray_says_what_to_install(monkeypatch, capsys):
@@ -119,19 +120,20 @@ def test_run_whose_actors_are_killed_loses_nothing_but_their_episodes(tiny, dot,
         def on_train_epoch_end(self, trainer, learner):
             super().on_train_epoch_end(trainer, learner)
             number = rng.randrange(2)
-            with contextlib.suppress(ray.exceptions.RayActorError):  # killed before, and not missed yet
-                kill(trainer.callbacks[1].worker, number)
-                killed.append(number)
+            if len(killed) < KILLS:
+                with contextlib.suppress(ray.exceptions.RayActorError):  # killed before, and not missed yet
+                    kill(trainer.callbacks[1].worker, number)
+                    killed.append(number)
 
     monkeypatch.setattr("latentplan.training.run.Guard", Killing)
-    settings = {"overlap": True, "workers": 2, "backend": "ray"}
+    settings = {"overlap": True, "workers": 2, "backend": "ray", "max_restarts": KILLS}
     with pytest.warns(RuntimeWarning, match="its episode is cut short"):
-        run = train(tiny(tmp_path / "run", collection=settings, run={"frames": 120}, **SETTINGS), dot)
+        run = train(tiny(tmp_path / "run", collection=settings, run={"frames": 600}, **SETTINGS), dot)
     state = read_state(run.run_dir)
-    assert run.exit_code == 0 and len(killed) >= 3
-    assert state["run"]["env_frames"] >= 120 and state["run"]["decisions"] >= 120
-    assert 2 <= state["memory"]["restarts"] == sum(state["memory"]["ended"]) <= len(killed)
-    assert state["memory"]["restarts"] == state["run"]["worker_restarts"]
+    assert run.exit_code == 0 and len(killed) == KILLS
+    assert state["run"]["env_frames"] >= 600 and state["run"]["decisions"] >= 600
+    assert state["memory"]["restarts"] == sum(state["memory"]["ended"]) == state["run"]["worker_restarts"]
+    assert 0.8 * KILLS <= state["run"]["worker_restarts"] <= KILLS  # one that is killed twice at once ends once
     assert read_rows(run.run_dir)[-1]["env_restarts"] or read_rows(run.run_dir)[-2]["env_restarts"]
 
 
