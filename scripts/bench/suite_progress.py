@@ -11,10 +11,10 @@ from pathlib import Path
 from typing import NamedTuple
 
 from bench.runs import TrainingRun
-from bench.suite_queue import LOG
 from bench.suite_rows import Origin, Row, merge_rows, note_origin, read_origin, read_rows, rows_of, write_rows
 from latentplan.config import UserError, make_folder
 from latentplan.config.run_results import FINAL_FILE, METRICS_FILE, read_progress
+from latentplan.training.child_run import LOG
 
 LOOK_S = 5.0
 LEAST_SHARE = 0.02  # of a run, from which its speed is known

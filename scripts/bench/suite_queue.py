@@ -1,18 +1,12 @@
 """A queue of training runs, some of them side by side, that survives any interruption.
 
-Every run is a `train.py` process in a session of its own, on this machine or on one of a Ray cluster, which writes into
-`train.log` in the folder of the run. The first SIGINT, SIGTERM or SIGHUP lets each run save itself; where the queue
-itself is killed, the system tells the runs.
+Every run is a `ChildRun`, on this machine or on one of a Ray cluster. The first SIGINT, SIGTERM or SIGHUP lets each run
+save itself; where the queue itself is killed, the system tells the runs.
 """
 
 from __future__ import annotations
 
-import contextlib
-import ctypes
-import os
 import signal
-import subprocess
-import sys
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -20,15 +14,12 @@ from typing import Protocol
 
 from bench.runs import TrainingRun
 from latentplan.config import UserError
-from latentplan.config.checks import cut
 from latentplan.config.run_results import is_locked
+from latentplan.training.child_run import ChildRun, last_line
 from latentplan.training.signals import Signals
 
-LOG = "train.log"
 STOPPED = (-signal.SIGTERM, 128 + signal.SIGTERM)  # exit codes of a run that was asked to end; the first while it loads
 POLL_S = 1.0
-_TAIL_BYTES = 4096  # of a log, for its last line
-_SET_DEATH_SIGNAL = 1  # PR_SET_PDEATHSIG of prctl(2)
 
 
 class Observer(Protocol):
@@ -57,7 +48,7 @@ class Observer(Protocol):
 
 
 class Process(Protocol):
-    """The process of a run; see `LocalProcess`."""
+    """The process of a run; see `ChildRun`."""
 
     def poll(self) -> int | None:
         """The exit code; None while the process runs."""
@@ -86,7 +77,7 @@ class Queue:
         observer: Observer,
         start: Callable[[TrainingRun], Process] | None = None,
     ) -> None:
-        self.start = start or (lambda run: LocalProcess(run.folder, run.command()))
+        self.start = start or (lambda run: ChildRun(run.folder, run.command()))
         self.waiting = [run for run in runs if not run.is_finished()]
         self.jobs, self.observer = jobs, observer
         self.active: dict[TrainingRun, Process] = {}
@@ -153,64 +144,9 @@ class Queue:
             elif self._is_stopping and code in STOPPED:
                 self.observer.pause(run)
             else:
-                self.observer.fail(run, _describe_end(code, run.folder / LOG))
+                self.observer.fail(run, _describe_end(code, run.folder))
 
 
-class LocalProcess:
-    """The process of a run on this machine.
-
-    Args:
-        folder: Folder of the run, which exists.
-        command: The command line.
-    """
-
-    def __init__(self, folder: Path, command: Sequence[str]) -> None:
-        with (folder / LOG).open("ab") as log:
-            self._process = subprocess.Popen(
-                command,
-                stdin=subprocess.DEVNULL,
-                stdout=log,
-                stderr=subprocess.STDOUT,
-                start_new_session=True,  # Ctrl-C reaches the queue alone, which tells each run once
-                preexec_fn=_end_with_parent,
-            )
-
-    def poll(self) -> int | None:
-        """The exit code; None while the process runs. Of a process that has ended, ends what it has left behind."""
-        code = self._process.poll()
-        if code is not None:
-            with contextlib.suppress(ProcessLookupError, PermissionError):
-                os.killpg(self._process.pid, signal.SIGKILL)
-        return code
-
-    def stop(self) -> None:
-        """Asks the process to save the run and to end."""
-        self._process.send_signal(signal.SIGTERM)
-
-    def wait(self) -> None:
-        """Returns when the process has ended."""
-        self._process.wait()
-
-
-_LIBRARY = ctypes.CDLL(None) if sys.platform == "linux" else None
-
-
-def _end_with_parent() -> None:
-    """Makes the system send SIGTERM to this process when its parent ends, however it ends."""
-    if _LIBRARY is not None:
-        _LIBRARY.prctl(_SET_DEATH_SIGNAL, signal.SIGTERM, 0, 0, 0)
-
-
-def _describe_end(code: int, log: Path) -> str:
+def _describe_end(code: int, folder: Path) -> str:
     end = f"exit code {code}" if code >= 0 else f"{signal.Signals(-code).name}"
-    return f"{end}: {_last_line(log)}"
-
-
-def _last_line(log: Path) -> str:
-    try:
-        with log.open("rb") as file:
-            file.seek(max(0, log.stat().st_size - _TAIL_BYTES))
-            lines = file.read().decode(errors="replace").split("\n")
-    except OSError as error:
-        return f"{log} cannot be read: {error.strerror}"
-    return next((cut(line.strip()) for line in reversed(lines) if line.strip()), f"{log} is empty")
+    return f"{end}: {last_line(folder)}"

@@ -10,8 +10,8 @@ from pathlib import Path
 from typing import Any
 
 from bench.runs import TrainingRun
-from bench.suite_queue import LocalProcess
 from bench.suite_rows import note_origin, present_origin
+from latentplan.training.child_run import ChildRun
 from latentplan.training.cluster import join_cluster
 
 WAIT_S = 0.1
@@ -69,7 +69,7 @@ class Starter:
     def __init__(self, place: str, folder: Path, command: Sequence[str], jobs: int, on_gpu: bool) -> None:
         os.chdir(place)
         note_origin(folder, present_origin(jobs, on_gpu))
-        self._process = LocalProcess(folder, command)
+        self._process = ChildRun(folder, command)
 
     def poll(self) -> int | None:
         """The exit code of the process."""

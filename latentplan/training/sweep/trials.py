@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import contextlib
-import ctypes
 import json
 import logging
 import os
 import signal
-import subprocess
 import sys
 import time
 import warnings
@@ -18,24 +16,23 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from latentplan.config import Config, UserError, make_folder
-from latentplan.config.checks import cut
 from latentplan.config.extras import MissingExtra, import_extra
 from latentplan.config.files import Layer, compose, dump_config
 from latentplan.config.run_folder import run_saves
 from latentplan.config.run_results import FINAL_FILE, Evaluation, find_state, is_locked, read_evaluations
 from latentplan.config.writing import write_whole
+from latentplan.training.child_run import ChildRun, last_line
 from latentplan.training.cluster import join_cluster
 from latentplan.training.signals import Signals
 from latentplan.training.sweep.space import Range, Space, as_layer
 
 PART = "latentplan sweep"
-TUNE_FOLDER, SETTINGS_FOLDER, SWEEP_FILE, TRIAL_FILE, LOG = "tune", "settings", "sweep.json", "trial.json", "train.log"
+TUNE_FOLDER, SETTINGS_FOLDER, SWEEP_FILE, TRIAL_FILE = "tune", "settings", "sweep.json", "trial.json"
 POLL_S = 0.5
 SAVING_S = 60.0  # for a run that was asked to stop
 LEAST_SHARE = 1 / 9  # of the frames, before which no trial is stopped
 REDUCTION = 3  # one of so many trials goes on at each rung
 RETRIES = 2  # of a trial whose process or machine ended
-_SET_DEATH_SIGNAL = 1  # PR_SET_PDEATHSIG of prctl(2)
 
 
 @dataclass(frozen=True)
@@ -211,7 +208,7 @@ def _make_lines(folder: Path) -> Any:
             self.say(trial, f"{frames:>9,} frames  planner {planner:6.1f}")
 
         def on_trial_error(self, iteration: int, trials: list[Any], trial: Any, **_: Any) -> None:
-            self.say(trial, "failed: " + _last_line(folder / trial.trial_id / LOG))
+            self.say(trial, "failed: " + last_line(folder / trial.trial_id))
 
         def say(self, trial: Any, text: str) -> None:
             print(f"trial {trial.experiment_tag.partition('_')[0]:>3}  {text}", flush=True)
@@ -245,11 +242,11 @@ def run_trial(values: dict[str, Any], sweep: Sweep) -> None:
                 break
             time.sleep(POLL_S)
     if code:
-        raise RuntimeError(f"exit code {code}: {_last_line(folder / LOG)}")
+        raise RuntimeError(f"exit code {code}: {last_line(folder)}")
 
 
 @contextlib.contextmanager
-def _training(sweep: Sweep, folder: Path, settings: Path) -> Iterator[subprocess.Popen[bytes] | None]:
+def _training(sweep: Sweep, folder: Path, settings: Path) -> Iterator[ChildRun | None]:
     """The process of a run, which saves itself and ends with the context; None where the run has ended before."""
     while is_locked(folder):  # by a process of an earlier start that still saves itself
         time.sleep(POLL_S)
@@ -261,31 +258,13 @@ def _training(sweep: Sweep, folder: Path, settings: Path) -> Iterator[subprocess
         words = ["--resume", str(folder)]
     if sweep.env_id is not None:
         words += ["--env-id", sweep.env_id]
-    with (folder / LOG).open("ab") as log:
-        process = subprocess.Popen(
-            [sys.executable, *sweep.program, *words],
-            stdin=subprocess.DEVNULL,
-            stdout=log,
-            stderr=subprocess.STDOUT,
-            start_new_session=True,
-            preexec_fn=_end_with_parent,
-        )
+    process = ChildRun(folder, [sys.executable, *sweep.program, *words])
     try:
         yield process
     finally:
         if process.poll() is None:
-            process.send_signal(signal.SIGTERM)
-            with contextlib.suppress(subprocess.TimeoutExpired):
-                process.wait(SAVING_S)
-
-
-_LIBRARY = ctypes.CDLL(None) if sys.platform == "linux" else None
-
-
-def _end_with_parent() -> None:
-    """Makes the system send SIGTERM to this process when the thread that started it ends."""
-    if _LIBRARY is not None:
-        _LIBRARY.prctl(_SET_DEATH_SIGNAL, signal.SIGTERM, 0, 0, 0)
+            process.stop()
+            process.wait(SAVING_S)
 
 
 def _note(sweep: Sweep) -> None:
@@ -322,8 +301,3 @@ def _evaluations(folder: Path) -> list[Evaluation]:
         return read_evaluations(folder)
     except UserError:
         return []
-
-
-def _last_line(log: Path) -> str:
-    lines = log.read_text(errors="replace").splitlines() if log.exists() else []
-    return next((cut(line.strip()) for line in reversed(lines) if line.strip()), "no message")
