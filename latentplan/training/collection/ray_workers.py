@@ -5,6 +5,8 @@ from __future__ import annotations
 import contextlib
 import importlib
 import os
+import time
+import warnings
 from collections import deque
 from collections.abc import Callable
 from concurrent.futures import Future
@@ -20,7 +22,9 @@ from latentplan.config.env_id import imported_modules
 from latentplan.config.extras import import_extra
 from latentplan.training.collection.collector import CLOSING_SECONDS, EnvFactory
 from latentplan.training.collection.episodes import Stopped
-from latentplan.training.collection.process import Answer, Server, WorkerEnded, await_answer
+from latentplan.training.collection.process import POLL_SECONDS, Answer, Server, WorkerEnded, await_answer
+
+PATIENCE_SECONDS = 30.0  # of an actor that has not started, before a warning says why
 
 
 class RayWorker:
@@ -58,11 +62,12 @@ class RayWorker:
             scheduling = importlib.import_module("ray.util.scheduling_strategies")
             here = self._ray.get_runtime_context().get_node_id()
             self._options["scheduling_strategy"] = scheduling.NodeAffinitySchedulingStrategy(here, soft=True)
-        self._should_stop = should_stop
+        self._should_stop, self._number = should_stop, number
         self._start()
 
     def _start(self) -> None:
         self._actor = self._ray.remote(Server).options(**self._options).remote(*self._arguments)
+        self._started: Any = self._actor.__ray_ready__.remote()
         self._futures: deque[Future[Answer]] = deque()
 
     def restart(self) -> None:
@@ -88,6 +93,7 @@ class RayWorker:
             RuntimeError: The method failed with another error.
         """
         exceptions = self._ray.exceptions
+        self._await_start()
         try:
             return await_answer(self._futures.popleft(), self._should_stop)
         except exceptions.RayTaskError:
@@ -102,6 +108,23 @@ class RayWorker:
                     "installed on every machine of the cluster"
                 ) from None
             raise WorkerEnded(f"the Ray actor ended unexpectedly ({type(error).__name__})") from None
+
+    def _await_start(self) -> None:
+        """Returns when the actor has started or failed to, or when the run stops; warns once if that takes long."""
+        if self._started is None:
+            return
+        asked, has_warned = time.monotonic(), False
+        while not self._ray.wait([self._started], timeout=POLL_SECONDS)[0]:
+            if self._should_stop():
+                return
+            if not has_warned and time.monotonic() - asked > PATIENCE_SECONDS:
+                has_warned = True
+                warnings.warn(
+                    f"worker {self._number} waits for a free core of the Ray cluster",
+                    RuntimeWarning,
+                    stacklevel=2,
+                )
+        self._started = None
 
     @property
     def oldest(self) -> Future[Answer]:

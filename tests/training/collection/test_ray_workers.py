@@ -6,6 +6,7 @@ import random
 import signal
 import socket
 import sys
+import threading
 
 import pytest
 import torch
@@ -13,6 +14,7 @@ import torch
 from latentplan.commands.main import main
 from latentplan.config import UserError, extras
 from latentplan.training import saving, train
+from latentplan.training.collection import ray_workers
 from latentplan.training.collection.crew import make_worker
 from tests.training.run_folder import fingerprint, read_rows, read_state
 
@@ -152,9 +154,17 @@ def test_crew_goes_on_elsewhere_when_a_machine_of_the_cluster_ends(tiny, dot, mo
         crew = make(tiny, dot, run={"ray_address": machines.address})
         collect(crew, 0)
         machines.remove_node(lost, allow_graceful=False)
-        machines.add_node(num_cpus=1)
-        with pytest.warns(RuntimeWarning, match="worker 1: .*its episode is cut short"):
+        monkeypatch.setattr(ray_workers, "PATIENCE_SECONDS", 0.0)
+        later = threading.Timer(5.0, machines.add_node, kwargs={"num_cpus": 1})
+        later.start()
+        with pytest.warns(RuntimeWarning) as warned:
             second = collect(crew, 1)
+        later.join()
+        assert any(
+            str(each.message).startswith("worker 1: ") and "its episode is cut short" in str(each.message)
+            for each in warned
+        )
+        assert any(str(each.message) == "worker 1 waits for a free core of the Ray cluster" for each in warned)
         assert second.decisions == 30 and second.memory["ended"] == [0, 1]
         crew.close()
     finally:
