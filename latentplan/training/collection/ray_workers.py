@@ -120,7 +120,7 @@ class RayWorker:
             if not has_warned and time.monotonic() - asked > PATIENCE_SECONDS:
                 has_warned = True
                 warnings.warn(
-                    f"worker {self._number} waits for a free core of the Ray cluster",
+                    f"worker {self._number} has not started yet: the cluster has no free core, or is busy",
                     RuntimeWarning,
                     stacklevel=2,
                 )
