@@ -22,8 +22,8 @@ _LIBRARY = ctypes.CDLL(None) if sys.platform == "linux" else None
 class ChildRun:
     """The process of a run on this machine, in a session of its own, which writes into `train.log` of its folder.
 
-    Ctrl-C reaches the parent alone, which decides what becomes of its runs. On Linux, the system asks the run to save
-    itself when the thread that started it ends.
+    Ctrl-C reaches the parent alone, which decides what becomes of its runs. On Linux, the system sends the run a SIGHUP
+    when the thread that started it ends, so that the run saves itself; one that is saving already goes on.
 
     Args:
         folder: Folder of the run, which exists.
@@ -72,6 +72,7 @@ def last_line(folder: Path) -> str:
 
 
 def _end_with_parent() -> None:
-    """Makes the system send SIGTERM to this process when the thread that started it ends, however it ends."""
+    """Makes the system send SIGHUP to this process when the thread that started it ends, however it ends."""
+    signal.signal(signal.SIGHUP, signal.SIG_DFL)  # which a parent under `nohup` ignores
     if _LIBRARY is not None:
-        _LIBRARY.prctl(_SET_DEATH_SIGNAL, signal.SIGTERM, 0, 0, 0)
+        _LIBRARY.prctl(_SET_DEATH_SIGNAL, signal.SIGHUP, 0, 0, 0)

@@ -1,4 +1,4 @@
-"""Signals: the first SIGINT, SIGTERM or SIGHUP asks a program to save and stop, the second ends it at once."""
+"""Signals: the first SIGINT, SIGTERM or SIGHUP asks a program to save and stop, a second SIGINT or SIGTERM ends it."""
 
 from __future__ import annotations
 
@@ -27,6 +27,7 @@ def raise_interrupt(number: int) -> None:
 class Signals:
     """While its context is open, handles the signals that stop a program.
 
+    A SIGHUP that follows another signal changes nothing: who has ended wants no more than what was asked for before.
     SIGHUP stays ignored if it was ignored before, as under `nohup`. Outside of the main thread, where Python handles no
     signals, the context changes nothing.
 
@@ -60,6 +61,8 @@ class Signals:
             signal.signal(number, handler)
 
     def _handle(self, number: int, frame: FrameType | None) -> None:
+        if self.received and number == signal.SIGHUP:
+            return
         if self.received:
             with contextlib.suppress(OSError, RuntimeError, ValueError):  # a stream that is closed or being written to
                 sys.stdout.flush()
