@@ -3,7 +3,8 @@
 Workers collect rounds as in a run, with a learner that does nothing but ask for the next round. A round of D decisions
 by K workers on C cores takes a + b K + c D / min(K, C) seconds, where a, b and c are fitted (least squares): a is what
 a round costs however small it is, b is what each worker costs the learner, and c is the time of one decision on one
-core. Numbers of workers that are held out test the fit. `limits` says what stops growth first on a cluster.
+core. Numbers of workers that are held out test the fit. For a cluster, `limits` are the numbers of workers at which
+each part of it is busy all the time.
 """
 
 from __future__ import annotations
@@ -122,7 +123,7 @@ def copy_model(config: Config, facts: Any) -> dict[str, Any]:
 
 
 def time_rounds(worker: Worker, weights: dict[str, Any], decisions: int, rounds: int) -> dict[str, Any]:
-    """Medians over the rounds of the actor, after those that warm up."""
+    """Median times of rounds of the actor, after those that warm up, and the frames per second of all of them."""
     wall, own, frames, size = [], [], [], 0
     for number in range(WARM_UP + rounds):
         started = time.perf_counter(), time.process_time()
