@@ -27,7 +27,7 @@ def raise_interrupt(number: int) -> None:
 class Signals:
     """While its context is open, handles the signals that stop a program.
 
-    A SIGHUP that follows another signal changes nothing: who has ended wants no more than what was asked for before.
+    A SIGHUP that follows another signal changes nothing, because the program is stopping already.
     SIGHUP stays ignored if it was ignored before, as under `nohup`. Outside of the main thread, where Python handles no
     signals, the context changes nothing.
 

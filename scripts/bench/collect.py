@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from latentplan.config import Config
     from latentplan.training.collection.crew import Worker
 
-WARM_UP = 2  # rounds before the timed ones: the first makes the environments, the second compiles the actor
+WARM_UP = 2  # rounds before the timed ones, in which environments begin and weights arrive for the first time
 
 
 @dataclass(frozen=True, kw_only=True)
