@@ -27,7 +27,8 @@ def raise_interrupt(number: int) -> None:
 class Signals:
     """While its context is open, handles the signals that stop a program.
 
-    A SIGHUP that follows another signal changes nothing, because the program is stopping already.
+    A SIGHUP is never the second signal that ends a program: where it arrives together with a SIGTERM, as from a parent
+    that asks and ends, Python handles it first.
     SIGHUP stays ignored if it was ignored before, as under `nohup`. Outside of the main thread, where Python handles no
     signals, the context changes nothing.
 
@@ -41,6 +42,7 @@ class Signals:
 
     def __init__(self, receive: Callable[[int], None] = lambda number: None) -> None:
         self.received, self.receive = 0, receive
+        self._was_asked = False  # by a signal other than SIGHUP
         self._previous: dict[int, Any] = {}
 
     def __enter__(self) -> Signals:
@@ -61,12 +63,12 @@ class Signals:
             signal.signal(number, handler)
 
     def _handle(self, number: int, frame: FrameType | None) -> None:
-        if self.received and number == signal.SIGHUP:
-            return
-        if self.received:
+        if self._was_asked and number != signal.SIGHUP:
             with contextlib.suppress(OSError, RuntimeError, ValueError):  # a stream that is closed or being written to
                 sys.stdout.flush()
                 sys.stderr.flush()
             os._exit(exit_code(number))  # worker processes notice that this process has ended
-        self.received = number
-        self.receive(number)
+        self._was_asked |= number != signal.SIGHUP
+        if not self.received:
+            self.received = number
+            self.receive(number)

@@ -70,3 +70,21 @@ def test_second_signal_ends_a_run_at_once_unless_it_is_a_hangup(tmp_path, second
     run._process.send_signal(second)
     run.wait()
     assert (tmp_path / LOG).read_text().splitlines()[-1] == last
+
+
+def test_hangup_and_request_to_stop_that_arrive_together_are_one(tmp_path):
+    """Python handles pending signals by number: the hangup first, though it was sent last."""
+    both = "{signal.SIGHUP, signal.SIGTERM}"
+    waits = f"""
+    signal.pthread_sigmask(signal.SIG_BLOCK, {both})
+    print("ready", flush=True)
+    while signal.sigpending() != {both}:
+        time.sleep(0.01)
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, {both})
+"""
+    run = ChildRun(tmp_path, [sys.executable, "-c", RUN.replace('\n    print("ready", flush=True)\n', waits)])
+    wait_for(tmp_path, "ready")
+    run.stop()
+    run._process.send_signal(signal.SIGHUP)
+    run.wait()
+    assert (tmp_path / LOG).read_text().splitlines()[-1] == "saved"
