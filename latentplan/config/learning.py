@@ -30,14 +30,16 @@ class LearningConfig:
         model_learning_rate: Adam step of encoder, dynamics, decoder, reward head and continue head.
         behaviour_learning_rate: Adam step of actor and value.
         max_grad_norm: Gradient norm at which each optimizer clips.
-        reconstruction_scale: Weight of the squared error summed over the 32 x 32 picture.
+        reconstruction_scale: Weight of the picture's squared error, which is divided by its own mean over the batch, so
+            that small things on a plain ground count as much as a body that fills the picture.
         dynamics_scale: Weight of the KL that moves the prior towards the posterior.
         representation_scale: Weight of the KL that moves the posterior towards the prior.
         free_nats: KL in nats below which both KL losses have no gradient.
         overshooting_scale: Weight of the KL that moves open-loop predictions towards the posterior.
         overshooting_horizon: Decisions that an open-loop prediction spans.
         reward_scale: Weight of the reward loss.
-        vector_scale: Weight of the squared error of the numbers that `env.vectors` names, summed over them.
+        vector_scale: Weight of the squared error of each of the numbers that `env.vectors` names, which is divided by
+            its own mean over the batch.
         imagination_horizon: Model steps of each imagined rollout.
         imagination_starts: Imagined rollouts per update; their starts are drawn from the states of the batch.
         gradient_decay: Share of the actor's gradient that each imagined step passes back to the step before, in [0, 1].
@@ -62,14 +64,14 @@ class LearningConfig:
     model_learning_rate: float = 1e-3
     behaviour_learning_rate: float = 3e-4
     max_grad_norm: float = 100.0
-    reconstruction_scale: float = 4.0
+    reconstruction_scale: float = 30.0
     dynamics_scale: float = 1.0
     representation_scale: float = 0.5
     free_nats: float = 1.0
     overshooting_scale: float = 0.1
     overshooting_horizon: int = 8
     reward_scale: float = 1.0
-    vector_scale: float = 1.0
+    vector_scale: float = 2.0
     imagination_horizon: int = 15
     imagination_starts: int = 128
     gradient_decay: float = 0.9

@@ -134,7 +134,7 @@ def test_vectors_are_learned(tiny, tmp_path):
     torch.manual_seed(0)
     config = tiny(tmp_path)
     model = WorldModel(config.model, 1, spaces=Spaces(vector_dim=1))
-    settings = replace(config.learning, vector_scale=100.0)
+    settings = config.learning
     optimizer = torch.optim.Adam(model.parameters(), lr=1e-2)
     places = 2.0 * torch.rand(16, 6, 1) - 1.0
     batch = Batch(

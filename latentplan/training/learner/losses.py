@@ -6,6 +6,7 @@ that weighs it. A new loss needs only its function here and its setting in `conf
 
 from __future__ import annotations
 
+from functools import partial
 from typing import NamedTuple
 
 import torch
@@ -19,6 +20,9 @@ from latentplan.replay.buffer import Batch
 from latentplan.training.learner.augmentation import random_shift
 from latentplan.training.learner.registry import BEHAVIOUR_LOSSES, WORLD_MODEL_LOSSES, register, weighted_sum
 from latentplan.training.ranks import ALONE, MODEL, Ranks
+
+SMALLEST_ERROR = 0.05  # of a picture: about one of 255 grey levels in each of 3,072 numbers
+SMALLEST_VECTOR_ERROR = 1e-5  # in squared symlog units
 
 
 class Imagination(NamedTuple):
@@ -204,11 +208,11 @@ def world_model_loss(
         within=Counted(batch.within, counts.sum()),
         reached=Counted(batch.within[:, :reached], counts[:reached].sum()),
     )
-    loss, parts = weighted_sum(WORLD_MODEL_LOSSES, prediction, config)
+    loss, parts = weighted_sum(WORLD_MODEL_LOSSES, prediction, config, partial(ranks.mean, half=MODEL))
     return Learned(loss, State(*(part.detach() for part in states)), open_loop.detach(), parts)
 
 
-@register(WORLD_MODEL_LOSSES, "reconstruction", "reconstruction_scale")
+@register(WORLD_MODEL_LOSSES, "reconstruction", "reconstruction_scale", floor=SMALLEST_ERROR)
 def _reconstruction(predicted: Prediction) -> Tensor:
     """Squared error of the decoded picture, summed over the picture."""
     return predicted.seen.mean(predicted.reconstruction_errors)
@@ -269,16 +273,16 @@ def _probe(predicted: Prediction) -> Tensor:
     return errors + predicted.reached.mean(open_loop_errors)
 
 
-@register(WORLD_MODEL_LOSSES, "vectors", "vector_scale", is_recorded=False)
+@register(WORLD_MODEL_LOSSES, "vectors", "vector_scale", is_recorded=False, floor=SMALLEST_VECTOR_ERROR)
 def _vectors(predicted: Prediction) -> Tensor:
-    """Squared error of the numbers beside the frames, in symlog units, summed over the numbers."""
+    """Squared error of each of the numbers beside the frames, in symlog units, (vector,)."""
     model, batch = predicted.model, predicted.batch
     if not model.spaces.vector_dim:
-        return batch.rewards.new_zeros(())
+        return batch.rewards.new_zeros(0)
     with model.trunk_precision(cache=False):
         painted = model.backend.apply(model.vector_head, predicted.features)
-    errors = (painted - symlog(model.seen_vectors(batch.labels))).square().sum(-1)
-    return predicted.seen.mean(errors)
+    errors = (painted - symlog(model.seen_vectors(batch.labels))).square()
+    return torch.stack([predicted.seen.mean(error) for error in errors.unbind(-1)])
 
 
 @register(BEHAVIOUR_LOSSES, "actor")

@@ -5,7 +5,7 @@ import torch
 
 from latentplan.models import Gaussian, State, WorldModel, kl_divergence
 from latentplan.models.backend import lambda_return
-from latentplan.training.learner.losses import draw_noise, imagine, imitation_loss, world_model_loss
+from latentplan.training.learner.losses import SMALLEST_ERROR, draw_noise, imagine, imitation_loss, world_model_loss
 from latentplan.training.learner.optimization import descend, return_scale
 
 
@@ -58,7 +58,8 @@ def test_world_model_loss_is_the_sum_of_its_losses_times_their_scales(model, bat
     chosen = {"reconstruction_scale": 2.0, "reward_scale": 3.0, "representation_scale": 0.5, "overshooting_scale": 0.7}
     config = tiny("", learning=chosen).learning
     loss, states, _, parts = world_model_loss(model, batch, config, make_generator())
-    scales = {"reconstruction": 2.0, "reward": 3.0, "continue": 1.0, "dynamics": 1.0, "representation": 0.5}
+    relative = 2.0 / (SMALLEST_ERROR + parts["reconstruction"].item())  # the squared error weighs itself
+    scales = {"reconstruction": relative, "reward": 3.0, "continue": 1.0, "dynamics": 1.0, "representation": 0.5}
     scales |= {"overshooting": 0.7, "open_loop_reward": 3.0, "probe": 1.0}
     assert parts.keys() == scales.keys()
     assert loss.item() == pytest.approx(sum(scale * parts[name].item() for name, scale in scales.items()), rel=1e-5)

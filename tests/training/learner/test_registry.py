@@ -7,7 +7,7 @@ import torch
 
 from latentplan.config import LearningConfig
 from latentplan.training.learner.losses import world_model_loss
-from latentplan.training.learner.registry import BEHAVIOUR_LOSSES, WORLD_MODEL_LOSSES, register
+from latentplan.training.learner.registry import BEHAVIOUR_LOSSES, WORLD_MODEL_LOSSES, register, weighted_sum
 
 
 def make_generator():
@@ -42,3 +42,18 @@ def test_registered_losses_enter_both_sums(learner, batch, restored_losses):
     behaviour_after, parts = learner._behaviour_loss(before, batch, make_generator())
     assert behaviour_after.item() == pytest.approx(behaviour_before.item() + 6.0, rel=1e-5)
     assert (after.parts["one"], parts["two"]) == (1.0, 2.0)
+
+
+@pytest.mark.parametrize("unit", [1.0, 100.0])
+def test_a_relative_loss_has_the_gradient_of_its_logarithm_whatever_its_unit(unit):
+    """Of several numbers each is weighed by itself; where several processes share a batch, by their common mean."""
+    place = torch.tensor([0.5, -2.0], requires_grad=True)
+    losses = {}
+    register(losses, "distance", "vector_scale", floor=0.0)(lambda inputs: (unit * inputs).square())
+    config = dataclasses.replace(LearningConfig(), vector_scale=3.0)
+    total, parts = weighted_sum(losses, place, config)
+    (gradient,) = torch.autograd.grad(total, place)
+    assert torch.allclose(gradient, 3.0 * 2.0 / place.detach())
+    assert parts["distance"].item() == pytest.approx(unit**2 * 4.25)
+    shared, _ = weighted_sum(losses, place, config, lambda own: 2.0 * own)
+    assert torch.allclose(*torch.autograd.grad(shared, place), 0.5 * gradient)
