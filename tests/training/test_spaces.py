@@ -1,7 +1,6 @@
 """Runs in environments whose actions are not a Box of one axis."""
 
 import json
-from dataclasses import replace
 
 import gymnasium
 import numpy as np
