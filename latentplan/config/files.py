@@ -17,7 +17,7 @@ from typing import Any, Literal
 from latentplan.config.checks import UserError, shown
 from latentplan.config.parsing import Setting, list_settings, raise_unknown, read_values
 from latentplan.config.reading import read_yaml
-from latentplan.config.removed import drop_removed
+from latentplan.config.removed import as_saved, drop_removed
 from latentplan.config.settings import Config
 from latentplan.config.suites import DEFAULT_SUITE, SUITES, check_task, find_suite
 from latentplan.config.writing import write_whole
@@ -82,7 +82,7 @@ def read_config(path: Path) -> Config:
     Raises:
         UserError: The file is missing, malformed, or holds an unknown key or bad value.
     """
-    return build_config(read_layer(Path(path)))
+    return build_config({section: as_saved(section, fields) for section, fields in read_layer(Path(path)).items()})
 
 
 def dump_config(config: Config, path: Path) -> None:

@@ -1,7 +1,8 @@
-"""Settings of earlier versions that no longer exist, with what to use in their place.
+"""Settings that earlier versions had or lacked.
 
-A file or checkpoint that an earlier version saved names every setting. The value that had no effect is read and
-dropped; any other value is refused, because the run that it describes cannot be repeated.
+A file or checkpoint that an earlier version saved names every setting that it knew. Of a setting that no longer exists,
+the value that had no effect is read and dropped; any other value is refused, because the run that it describes cannot be
+repeated. A setting that came later gets the value that stands for what the earlier version did.
 """
 
 from __future__ import annotations
@@ -35,6 +36,13 @@ REMOVED = {
     "learning.imitation_scale": Removed(0.0, "scripts/distill.py teaches the actor from the planner"),
     "collection.noise_share": Removed(1.0, "every round is collected with noise of collection.noise_std"),
 }
+
+ADDED: dict[str, dict[str, Any]] = {"model": {"decoder_layers": 0}}
+
+
+def as_saved(section: str, fields: Mapping[Any, Any]) -> dict[Any, Any]:
+    """The settings of a section that a program saved, with the later settings that it did not know."""
+    return {**ADDED.get(section, {}), **fields}
 
 
 def drop_removed(section: str, fields: Mapping[Any, Any]) -> dict[Any, Any]:

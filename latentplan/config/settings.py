@@ -14,7 +14,7 @@ from latentplan.config.learning import CollectionConfig, LearningConfig
 from latentplan.config.parsing import option
 from latentplan.config.planner import PlannerConfig
 from latentplan.config.reading import read_kwargs
-from latentplan.config.removed import drop_removed
+from latentplan.config.removed import as_saved, drop_removed
 from latentplan.config.spaces import FRAME_SIZES, MOST_CAMERAS, check_frame_size
 
 LATENT_DIM = 32
@@ -101,6 +101,8 @@ class ModelConfig:
         encoder_channels: Channels of the encoder's layers; the first layer reads patches of 4 x 4 pixels, each later
             layer halves the grid.
         decoder_channels: Channels of the decoder's 8 x 8 grid of tokens.
+        decoder_layers: Hidden layers of width `hidden_dim` that the tokens read beside the features; agents of earlier
+            versions have none.
         num_bins: Bins of the distributional reward and value heads.
         turns: Quarter turns of each frame for which an agent keeps a belief, and over which its action is averaged: 1,
             or 4 for a body that looks the same from every side.
@@ -111,13 +113,14 @@ class ModelConfig:
     hidden_dim: int = 192
     encoder_channels: tuple[int, ...] = (32, 48, 64)
     decoder_channels: int = 16
+    decoder_layers: int = 2
     num_bins: int = 63
     turns: int = 1
 
     def __post_init__(self) -> None:
         if self.turns not in (1, 4):
             raise ValueError(f"turns must be 1 or 4, got {self.turns}")
-        at_least(self, latent_dim=1, deter_dim=1, hidden_dim=1, decoder_channels=1, num_bins=3)
+        at_least(self, latent_dim=1, deter_dim=1, hidden_dim=1, decoder_channels=1, decoder_layers=0, num_bins=3)
         if not 1 <= len(self.encoder_channels) <= 5 or min(self.encoder_channels) < 1:
             raise ValueError(f"encoder_channels must hold 1 to 5 positive sizes, got {self.encoder_channels}")
 
@@ -315,7 +318,9 @@ def to_dict(config: Any) -> dict[str, Any]:
 
 
 def from_dict(values: dict[str, Any]) -> Config:
-    """The inverse of `to_dict`; absent fields take their defaults, and settings that no longer exist are dropped.
+    """The inverse of `to_dict`, which may have been called by an earlier version.
+
+    Absent fields take their defaults, or what earlier versions did; settings that no longer exist are dropped.
 
     Raises:
         ValueError: A section or field is unknown, a value is not allowed, or a setting that no longer exists has a
@@ -328,7 +333,7 @@ def from_dict(values: dict[str, Any]) -> Config:
             raise ValueError(f"unknown section {section!r}; available: {', '.join(sections)}")
         kind: Any = sections[section]
         names = {f.name for f in dataclasses.fields(kind)}
-        settings = drop_removed(section, settings)
+        settings = as_saved(section, drop_removed(section, settings))
         for name in settings:
             if name not in names:
                 raise ValueError(f"unknown setting {section}.{name}; available: {', '.join(sorted(names))}")

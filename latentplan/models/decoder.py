@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import torch
 from einops import rearrange
 from torch import Tensor, nn
 from torch.nn import functional
 
 from latentplan.models.encoder import FRAME_SIZE
-from latentplan.models.heads import single_or_double
+from latentplan.models.heads import NormedLinear, single_or_double
 
 SHRINK = 2  # each pixel of the decoded picture is the mean of SHRINK x SHRINK pixels of the frame
 GRIDS = 8, 7  # tokens along a side: the first that divides the decoded picture
@@ -16,6 +18,9 @@ GRIDS = 8, 7  # tokens along a side: the first that divides the decoded picture
 
 class Decoder(nn.Module):
     """A grid of 8 x 8 tokens, one 3 x 3 convolution over it, and a patch of 4 x 4 pixels from each token.
+
+    The tokens read the features and hidden layers behind them: where a small thing is painted depends on its coordinates
+    in a way that one product cannot compute, and the product of the features alone learns the coarse picture sooner.
 
     The picture has half the frame's resolution, which still shows a body and costs a quarter. Patches replace
     transposed convolutions, whose bfloat16 gradient is five times as slow on a CPU. Frames of more than 64 x 64 pixels
@@ -25,26 +30,42 @@ class Decoder(nn.Module):
         in_features: Size of the features.
         channels: Channels of the tokens.
         frame_shape: Shape of a frame: (height, width, channel).
+        hidden_dim: Width of the hidden layers.
+        layers: Number of hidden layers, or 0 for tokens that read the features alone.
     """
 
     pool: Tensor
 
     def __init__(
-        self, in_features: int, channels: int, frame_shape: tuple[int, int, int] = (FRAME_SIZE, FRAME_SIZE, 3)
+        self,
+        in_features: int,
+        channels: int,
+        frame_shape: tuple[int, int, int] = (FRAME_SIZE, FRAME_SIZE, 3),
+        hidden_dim: int = 1,
+        layers: int = 0,
     ) -> None:
         super().__init__()
+        self.in_features = in_features
         side = frame_shape[0] // SHRINK
         self.grid = next(grid for grid in GRIDS if side % grid == 0)
         self.patch = side // self.grid
-        self.tokens = nn.Linear(in_features, channels * self.grid**2)
+        sizes = [in_features, *[hidden_dim] * layers]
+        self.hidden = nn.Sequential(*(NormedLinear(before, after) for before, after in pairwise(sizes)))
+        self.tokens = nn.Linear(in_features + (hidden_dim if layers else 0), channels * self.grid**2)
         self.mix = nn.Conv2d(channels, 4 * channels, kernel_size=3, padding=1)
         self.paint = nn.Linear(4 * channels, frame_shape[2] * self.patch**2)
         self.register_buffer("pool", _pooling(self.patch, frame_shape[2]), persistent=False)
 
+    def widen(self, features: Tensor) -> Tensor:
+        """Features (rows, in) and the last hidden layer side by side, the input of the tokens, (rows, in + hidden)."""
+        if not len(self.hidden):
+            return features
+        return torch.cat([features, self.hidden(features).to(features.dtype)], -1)
+
     def forward(self, features: Tensor) -> Tensor:
         """Patches of the pictures, pixels in about [-0.5, 0.5], usually (rows, 8, 8, 48), for features (rows, in)."""
         grid = rearrange(
-            self.tokens(features),
+            self.tokens(self.widen(features)),
             "rows (height width channel) -> rows channel height width",
             height=self.grid,
             width=self.grid,

@@ -65,7 +65,9 @@ class WorldModel(nn.Module):
         self.dynamics: Dynamics = Rssm(
             config.latent_dim, config.deter_dim, config.hidden_dim, action_dim, embedding_dim, spaces.choices
         )
-        self.decoder = Decoder(features, config.decoder_channels, spaces.frame_shape)
+        self.decoder = Decoder(
+            features, config.decoder_channels, spaces.frame_shape, config.hidden_dim, config.decoder_layers
+        )
         self.reward_head = ScalarHead(features, config.hidden_dim, config.num_bins)
         self.continue_head = Mlp(features, config.hidden_dim, 1)
         self.value_head = ScalarHead(features, config.hidden_dim, config.num_bins)

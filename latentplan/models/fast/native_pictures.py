@@ -91,7 +91,8 @@ def encode(encoder: Encoder, frames: Tensor) -> Tensor:
 
 def reconstruction_errors(decoder: Decoder, features: Tensor, frames: Tensor) -> Tensor:
     """Squared errors (rows,) of decoded pictures; gradients reach features (rows, feature) and weights."""
-    check_shape("features", features, len(features), decoder.tokens.in_features)
+    check_shape("features", features, len(features), decoder.in_features)
+    features = decoder.widen(features)
     _check_frames(frames, len(features))
     kernel, bias = decoder.mix.parameters()
     layers = [decoder.tokens.weight, decoder.tokens.bias, decoder.paint.weight, decoder.paint.bias]

@@ -143,9 +143,9 @@ def test_encoder_equals_autograd(channels, rows, dtype):
     assert_equal(*results, dtype)
 
 
-@pytest.mark.parametrize(("inputs", "channels"), [(10, 3), (64, 16)])
-def test_reconstruction_errors_equal_autograd(inputs, channels, dtype):
-    decoder = randomized(Decoder(inputs, channels), dtype)
+@pytest.mark.parametrize(("inputs", "channels", "layers"), [(10, 3, 0), (64, 16, 0), (10, 3, 2)])
+def test_reconstruction_errors_equal_autograd(inputs, channels, layers, dtype):
+    decoder = randomized(Decoder(inputs, channels, hidden_dim=12, layers=layers), dtype)
     features = draw(35, inputs, dtype=dtype).requires_grad_()
     frames = torch.randint(0, 256, (35, 64, 64, 3), generator=torch.Generator().manual_seed(0), dtype=torch.uint8)
     found = native_pictures.reconstruction_errors(decoder, features, frames)
