@@ -1,8 +1,8 @@
 """Settings that earlier versions had or lacked.
 
 A file or checkpoint that an earlier version saved names every setting that it knew. Of a setting that no longer exists,
-the value that had no effect is read and dropped; any other value is refused, because the run that it describes cannot be
-repeated. A setting that came later gets the value that stands for what the earlier version did.
+the value that had no effect is read and dropped; any other value is refused, because the run that it describes cannot
+be repeated. A setting that came later gets the value that stands for what the earlier version did.
 """
 
 from __future__ import annotations

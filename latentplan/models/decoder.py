@@ -19,8 +19,8 @@ GRIDS = 8, 7  # tokens along a side: the first that divides the decoded picture
 class Decoder(nn.Module):
     """A grid of 8 x 8 tokens, one 3 x 3 convolution over it, and a patch of 4 x 4 pixels from each token.
 
-    The tokens read the features and hidden layers behind them: where a small thing is painted depends on its coordinates
-    in a way that one product cannot compute, and the product of the features alone learns the coarse picture sooner.
+    The tokens read the features, which suffice for the coarse picture, and hidden layers on them: where a small thing
+    is painted depends on its coordinates in a way that one product cannot compute.
 
     The picture has half the frame's resolution, which still shows a body and costs a quarter. Patches replace
     transposed convolutions, whose bfloat16 gradient is five times as slow on a CPU. Frames of more than 64 x 64 pixels

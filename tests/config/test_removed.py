@@ -1,10 +1,10 @@
-"""Settings that no longer exist: dropped where they had no effect, refused with advice elsewhere."""
+"""Settings that earlier versions had or lacked: read with the meaning that they had then, or refused with advice."""
 
 import pytest
 
 from latentplan.config import Config, UserError, from_dict, to_dict
 from latentplan.config.files import build_config, read_config, to_yaml
-from latentplan.config.removed import REMOVED, drop_removed
+from latentplan.config.removed import ADDED, REMOVED, as_saved, drop_removed
 
 
 @pytest.mark.parametrize("key", REMOVED)
@@ -33,3 +33,17 @@ def test_saved_settings_are_refused_with_advice_when_the_removed_one_had_an_effe
     for load in (from_dict, build_config, lambda _: read_config(tmp_path / "config.yaml")):
         with pytest.raises(UserError, match=REMOVED[key].advice):
             load(saved)
+
+
+def test_later_settings_of_saved_files_stand_for_what_earlier_versions_did(tmp_path):
+    """A program that knows a setting saves it, so its own value is kept."""
+    known, earlier, expected = to_dict(Config()), to_dict(Config()), to_dict(Config())
+    for section, settings in ADDED.items():
+        assert as_saved(section, known[section]) == known[section]
+        expected[section] |= settings
+        for name in settings:
+            del earlier[section][name]
+    (tmp_path / "config.yaml").write_text(to_yaml(earlier))
+    assert expected != known
+    assert to_dict(from_dict(earlier)) == to_dict(read_config(tmp_path / "config.yaml")) == expected
+    assert to_dict(from_dict(known)) == known
