@@ -133,7 +133,7 @@ def test_compiled_rollout_allows_a_latent_wider_than_all_layers(weights):
     assert wide.packed is not None
     rewards, last = imagine(wide, state, actions)
     expected, reached = imagine(wide._replace(packed=None), state, actions)
-    torch.testing.assert_close(rewards, expected, atol=0.1, rtol=0.1)
+    torch.testing.assert_close(rewards, expected, atol=0.05 * float(expected.abs().mean()), rtol=0.1)
     torch.testing.assert_close(last.stoch, reached.stoch, atol=0.1, rtol=0.1)
 
 
