@@ -38,10 +38,8 @@ def push(dot):
     return Push
 
 
-@pytest.fixture(scope="session")
-def model(tiny):
-    """An untrained world model that predicts reward for pushing to the right, and an actor that stays at zero."""
-    torch.manual_seed(0)
+def make_model(tiny, seed):
+    torch.manual_seed(seed)
     model = WorldModel(tiny("").model, action_dim=1)
     with torch.no_grad():
         model.reward_head.mlp.output.weight.normal_(std=1.0)
@@ -49,6 +47,20 @@ def model(tiny):
         for parameter in model.parameters():
             parameter.copy_(parameter.half().float())
     return model.eval()
+
+
+def pushing_right_pays(model):
+    """Share of states in which the model predicts more reward for the largest action than for any other."""
+    states, actions = draw_states(model), torch.linspace(-1.0, 1.0, 9)
+    with torch.no_grad():
+        rewards = [model.step(states, action.expand(len(states.deter), 1))[1] for action in actions]
+    return (torch.stack(rewards).argmax(0) == len(actions) - 1).float().mean().item()
+
+
+@pytest.fixture(scope="session")
+def model(tiny):
+    """An untrained world model that predicts reward for pushing to the right, and an actor that stays at zero."""
+    return max((make_model(tiny, seed) for seed in range(20)), key=pushing_right_pays)
 
 
 @pytest.fixture(scope="session")
