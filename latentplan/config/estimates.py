@@ -49,9 +49,10 @@ def count_parameters(model: ModelConfig, action_dim: int = 1, frame_size: int = 
     encoder += channels[-1] * side * side * hidden
     dynamics = (model.latent_dim + action_dim) * hidden + (hidden + deter) * 3 * deter + 2 * deter * hidden
     dynamics += 4 * hidden * model.latent_dim
-    widths = [features, *[hidden] * model.decoder_layers]
-    decoder = sum(before * after for before, after in pairwise(widths)) + 36 * model.decoder_channels**2
-    decoder += (features + (hidden if model.decoder_layers else 0)) * model.decoder_channels * 64
+    widths = [features, *[hidden // 2] * model.decoder_layers]
+    tokens = features + sum(widths[1:][-1:])
+    decoder = sum(before * after for before, after in pairwise(widths))
+    decoder += tokens * model.decoder_channels * 64 + 36 * model.decoder_channels**2
     trunk = features * hidden + hidden * hidden
     heads = 4 * trunk + 2 * hidden * model.num_bins + 2 * hidden * action_dim
     return encoder + dynamics + decoder + heads

@@ -101,8 +101,8 @@ class ModelConfig:
         encoder_channels: Channels of the encoder's layers; the first layer reads patches of 4 x 4 pixels, each later
             layer halves the grid.
         decoder_channels: Channels of the decoder's 8 x 8 grid of tokens.
-        decoder_layers: Hidden layers of width `hidden_dim` that the tokens read beside the features; agents of earlier
-            versions have none.
+        decoder_layers: Hidden layers of half of `hidden_dim` that the tokens read beside the features; agents of
+            earlier versions have none.
         num_bins: Bins of the distributional reward and value heads.
         turns: Quarter turns of each frame for which an agent keeps a belief, and over which its action is averaged: 1,
             or 4 for a body that looks the same from every side.
@@ -112,7 +112,7 @@ class ModelConfig:
     deter_dim: int = 192
     hidden_dim: int = 192
     encoder_channels: tuple[int, ...] = (32, 48, 64)
-    decoder_channels: int = 16
+    decoder_channels: int = 12
     decoder_layers: int = 2
     num_bins: int = 63
     turns: int = 1

@@ -19,6 +19,7 @@ from latentplan.models.encoder import Encoder, Observation
 from latentplan.models.goal_heads import GoalHeads
 from latentplan.models.heads import Actor, MixedActor, Mlp, ScalarHead, sample_action
 
+DECODER_SHARE = 2  # the decoder's hidden layers have half of the width of heads, so that an agent's file stays small
 PROBE_SHARE = 3  # the probe has a third of the width of other heads, because quantities are easy to predict
 
 
@@ -66,7 +67,11 @@ class WorldModel(nn.Module):
             config.latent_dim, config.deter_dim, config.hidden_dim, action_dim, embedding_dim, spaces.choices
         )
         self.decoder = Decoder(
-            features, config.decoder_channels, spaces.frame_shape, config.hidden_dim, config.decoder_layers
+            features,
+            config.decoder_channels,
+            spaces.frame_shape,
+            max(1, config.hidden_dim // DECODER_SHARE),
+            config.decoder_layers,
         )
         self.reward_head = ScalarHead(features, config.hidden_dim, config.num_bins)
         self.continue_head = Mlp(features, config.hidden_dim, 1)

@@ -127,13 +127,13 @@ def test_pack_returns_none_for_other_sizes_and_precisions(weights):
 
 
 def test_compiled_rollout_allows_a_latent_wider_than_all_layers(weights):
-    sizes = ModelConfig(deter_dim=32, hidden_dim=32, latent_dim=512, num_bins=31)
+    sizes = ModelConfig(latent_dim=512, deter_dim=32, hidden_dim=32, decoder_channels=16, decoder_layers=0, num_bins=31)
     wide = weights_of(build(sizes))
     state, actions = State(draw(ROWS, 32).tanh(), draw(ROWS, 512, seed=1)), draw(ROWS, TIME, ACTION, seed=2)
     assert wide.packed is not None
     rewards, last = imagine(wide, state, actions)
     expected, reached = imagine(wide._replace(packed=None), state, actions)
-    torch.testing.assert_close(rewards, expected, atol=0.05 * float(expected.abs().mean()), rtol=0.1)
+    torch.testing.assert_close(rewards, expected, atol=0.1, rtol=0.1)
     torch.testing.assert_close(last.stoch, reached.stoch, atol=0.1, rtol=0.1)
 
 
