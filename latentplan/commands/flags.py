@@ -15,8 +15,8 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from latentplan.config import UserError, output_file
+from latentplan.config.earlier import REMOVED
 from latentplan.config.parsing import Setting, alternatives, list_settings, raise_unknown, read_values
-from latentplan.config.removed import REMOVED
 
 Request = TypeVar("Request")
 

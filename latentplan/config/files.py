@@ -15,9 +15,9 @@ from pathlib import Path
 from typing import Any, Literal
 
 from latentplan.config.checks import UserError, shown
+from latentplan.config.earlier import as_saved, drop_removed
 from latentplan.config.parsing import Setting, list_settings, raise_unknown, read_values
 from latentplan.config.reading import read_yaml
-from latentplan.config.removed import as_saved, drop_removed
 from latentplan.config.settings import Config
 from latentplan.config.suites import DEFAULT_SUITE, SUITES, check_task, find_suite
 from latentplan.config.writing import write_whole

@@ -10,11 +10,11 @@ from dataclasses import dataclass, field
 from typing import Any, Literal, get_args
 
 from latentplan.config.checks import MAX_EPISODES, MAX_THREADS, UserError, above_zero, at_least, one_of, shown, within
+from latentplan.config.earlier import as_saved, drop_removed
 from latentplan.config.learning import CollectionConfig, LearningConfig
 from latentplan.config.parsing import option
 from latentplan.config.planner import PlannerConfig
 from latentplan.config.reading import read_kwargs
-from latentplan.config.removed import as_saved, drop_removed
 from latentplan.config.spaces import FRAME_SIZES, MOST_CAMERAS, check_frame_size
 
 LATENT_DIM = 32

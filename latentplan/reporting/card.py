@@ -16,9 +16,9 @@ import numpy as np
 
 from latentplan.config import USER_DOMAIN, Config, PlannerConfig, to_dict
 from latentplan.config.checks import LONGEST_WORD
+from latentplan.config.earlier import drop_removed
 from latentplan.config.env_id import as_file_name, is_by_id, repeat_flag
 from latentplan.config.files import to_yaml
-from latentplan.config.removed import drop_removed
 from latentplan.config.run_results import read_log
 from latentplan.config.spaces import Spaces
 

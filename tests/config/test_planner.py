@@ -5,7 +5,7 @@ import json
 import pytest
 
 from latentplan.config import PlannerConfig, from_dict
-from latentplan.config.removed import drop_removed
+from latentplan.config.earlier import drop_removed
 from latentplan.planning import PLANNERS, make_planner
 
 

@@ -29,8 +29,8 @@ from latentplan.agents.checkpoint import load_model, read_info, resolve_checkpoi
 from latentplan.agents.planning import PlanningAgent
 from latentplan.config import USER_DOMAIN, DistillConfig, PlannerConfig, UserError, derive_seed, to_dict
 from latentplan.config.commit import Saves
+from latentplan.config.earlier import drop_removed
 from latentplan.config.env_id import choose_env, repeat_flag
-from latentplan.config.removed import drop_removed
 from latentplan.config.run_folder import SAVES_FOLDER, lock_folder, require_saves
 from latentplan.envs import make_env, make_from
 from latentplan.evaluation.episodes import OnStep, Step, episode_seed, iterate_episodes

@@ -87,4 +87,6 @@ def weighted_sum(
 def _scale(loss: Loss, config: LearningConfig, part: Tensor, mean: Callable[[Tensor], Tensor]) -> float | Tensor:
     """The factor of a loss that has a value."""
     scale: float = 1.0 if loss.scale is None else getattr(config, loss.scale)
-    return scale if loss.floor is None else scale / (loss.floor + mean(part.detach()))
+    if loss.floor is None or part.numel() == 0:  # no message between processes about nothing
+        return scale
+    return scale / (loss.floor + mean(part.detach()))

@@ -3,8 +3,8 @@
 import pytest
 
 from latentplan.config import Config, UserError, from_dict, to_dict
+from latentplan.config.earlier import ADDED, REMOVED, as_saved, drop_removed
 from latentplan.config.files import build_config, read_config, to_yaml
-from latentplan.config.removed import ADDED, REMOVED, as_saved, drop_removed
 
 
 @pytest.mark.parametrize("key", REMOVED)
