@@ -49,7 +49,7 @@ def count_parameters(model: ModelConfig, action_dim: int = 1, frame_size: int = 
     encoder += channels[-1] * side * side * hidden
     dynamics = (model.latent_dim + action_dim) * hidden + (hidden + deter) * 3 * deter + 2 * deter * hidden
     dynamics += 4 * hidden * model.latent_dim
-    widths = [features, *[hidden // 2] * model.decoder_layers]
+    widths = [features, *[model.decoder_width] * model.decoder_layers]
     tokens = features + sum(widths[1:][-1:])
     decoder = sum(before * after for before, after in pairwise(widths))
     decoder += tokens * model.decoder_channels * 64 + 36 * model.decoder_channels**2

@@ -101,7 +101,7 @@ class ModelConfig:
         encoder_channels: Channels of the encoder's layers; the first layer reads patches of 4 x 4 pixels, each later
             layer halves the grid.
         decoder_channels: Channels of the decoder's 8 x 8 grid of tokens.
-        decoder_layers: Hidden layers of half of `hidden_dim` that the tokens read beside the features; agents of
+        decoder_layers: Hidden layers of width `decoder_width` that the tokens read beside the features; agents of
             earlier versions have none.
         num_bins: Bins of the distributional reward and value heads.
         turns: Quarter turns of each frame for which an agent keeps a belief, and over which its action is averaged: 1,
@@ -123,6 +123,11 @@ class ModelConfig:
         at_least(self, latent_dim=1, deter_dim=1, hidden_dim=1, decoder_channels=1, decoder_layers=0, num_bins=3)
         if not 1 <= len(self.encoder_channels) <= 5 or min(self.encoder_channels) < 1:
             raise ValueError(f"encoder_channels must hold 1 to 5 positive sizes, got {self.encoder_channels}")
+
+    @property
+    def decoder_width(self) -> int:
+        """Width of the decoder's hidden layers: half of `hidden_dim`, so that an agent's file stays small."""
+        return max(1, self.hidden_dim // 2)
 
 
 @dataclass(frozen=True)

@@ -19,7 +19,6 @@ from latentplan.models.encoder import Encoder, Observation
 from latentplan.models.goal_heads import GoalHeads
 from latentplan.models.heads import Actor, MixedActor, Mlp, ScalarHead, sample_action
 
-DECODER_SHARE = 2  # the decoder's hidden layers have half of the width of heads, so that an agent's file stays small
 PROBE_SHARE = 3  # the probe has a third of the width of other heads, because quantities are easy to predict
 
 
@@ -70,7 +69,7 @@ class WorldModel(nn.Module):
             features,
             config.decoder_channels,
             spaces.frame_shape,
-            max(1, config.hidden_dim // DECODER_SHARE),
+            config.decoder_width,
             config.decoder_layers,
         )
         self.reward_head = ScalarHead(features, config.hidden_dim, config.num_bins)
