@@ -72,6 +72,11 @@ def processes(out):
     return found
 
 
+def saves(out):
+    """The saves that runs can go on from."""
+    return list(out.glob("*/resume/save-000001/frames"))
+
+
 def wait_for(condition, seconds=60.0):
     deadline = time.monotonic() + seconds
     while not condition():
@@ -141,10 +146,11 @@ def test_sweep_runs_everything_once_and_writes_a_row_per_evaluation(tmp_path, ca
 @pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGTERM, signal.SIGINT], ids=lambda number: number.name)
 def test_interrupted_sweep_goes_on_and_ends_like_one_that_was_not(root, tmp_path, number):
     whole, cut = tmp_path / "whole", tmp_path / "cut"
-    changes = {"tasks": TASKS[:2], "frames": 300}
+    changes = {"tasks": TASKS[:2], "frames": 400}
     assert sweep(whole, **changes) == 0
     first = start(root, cut, **changes)
-    wait_for(lambda: len(list(cut.glob("*/final.json"))) >= 2 and len(processes(cut)) > 2)
+    # A run that is killed before its first save begins again, so all four must have saved themselves.
+    wait_for(lambda: len(list(cut.glob("*/final.json"))) >= 2 and len(saves(cut)) == 4)
     os.kill(first.pid, number)
     first.communicate(timeout=60)
     assert first.returncode == (-number if number == signal.SIGKILL else 128 + number)
@@ -168,7 +174,7 @@ def is_running(number):
 
 def test_runs_that_are_killed_with_their_sweep_go_on(root, tmp_path):
     first = start(root, tmp_path, tasks=TASKS[:1], frames=400)
-    wait_for(lambda: len(list(tmp_path.glob("*/resume/save-000001/frames"))) == 2)
+    wait_for(lambda: len(saves(tmp_path)) == 2)
     first.kill()
     for each in processes(tmp_path).values():
         os.kill(int(each[0][1]), signal.SIGKILL)
