@@ -83,17 +83,30 @@ def check_task(suite: str, domain: str, task: object = None) -> tuple[str, ...]:
     """
     domains = find_suite(suite).tasks
     if domain not in tuple(domains):  # settings that are made in Python may hold a value that is no text
-        raise UserError(_describe_unknown("domain", domain, domains))
+        raise UserError(_describe_unknown("domain", domain, domains, domains))
     tasks = domains[domain]
     if isinstance(tasks, str):
         return (tasks,)
     if task is not None and task not in tasks:
-        raise UserError(_describe_unknown(f"task of {domain}", task, tasks))
+        raise UserError(_describe_unknown(f"task of {domain}", task, tasks, domains))
     return tasks
 
 
-def _describe_unknown(kind: str, name: object, available: Iterable[str]) -> str:
-    """An error message for an unknown name, with all available names and the nearest name."""
+def _describe_unknown(
+    kind: str, name: object, available: Iterable[str], domains: Mapping[str, tuple[str, ...] | str]
+) -> str:
+    """An error message for an unknown name, with all available names and what may have been meant.
+
+    Args:
+        kind: What the name should have been the name of.
+        name: The name.
+        available: The names that there are.
+        domains: All tasks of the suite, by domain.
+    """
     choices = sorted(available)
-    similar = nearest(name, choices, cutoff=0.0)
-    return f"unknown {kind} {shown(name)}; available: {', '.join(choices)}. Did you mean {similar!r}?"
+    meant = repr(nearest(name, choices, cutoff=0.0))
+    domain, _, task = str(name).partition("-")
+    known = domains.get(domain, ())
+    if task in ((known,) if isinstance(known, str) else known):  # both in one name, as in published tables
+        meant = f"--domain {domain} --task {task}"
+    return f"unknown {kind} {shown(name)}; available: {', '.join(choices)}. Did you mean {meant}?"

@@ -197,6 +197,8 @@ def test_render_large_shows_the_same_view(env):
     ("changes", "message"),
     [
         ({"domain": "cartpol"}, r"unknown domain 'cartpol'; available: acrobot, .* Did you mean 'cartpole'\?"),
+        ({"task": "cheetah-run"}, r"unknown task of cartpole .* Did you mean --domain cheetah --task run\?"),
+        ({"domain": "walker-walk"}, r"unknown domain 'walker-walk'; .* Did you mean --domain walker --task walk\?"),
         ({"task": "swing"}, r"unknown task of cartpole 'swing'; available: balance, .* Did you mean 'swingup'\?"),
         ({"camera": 9}, r"camera 9 does not exist; cartpole has 2 cameras"),
     ],
