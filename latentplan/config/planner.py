@@ -166,7 +166,7 @@ class SearchOptions:
 class PlannerConfig(SearchOptions):
     """The planner of an agent, with the options of its search (`SearchOptions`).
 
-    Five options have other defaults than in the planning library, because the agents were evaluated with them: a value
+    Six options have other defaults than in the planning library, because the agents were evaluated with them: a value
     that was learned is noisy, and its mistakes favour the best candidate more than the mean of the elites.
 
     Attributes:
@@ -174,6 +174,7 @@ class PlannerConfig(SearchOptions):
         final: See `SearchOptions`.
         noise_beta: See `SearchOptions`.
         keep_elite_fraction: See `SearchOptions`.
+        temperature: See `SearchOptions`.
         use_continues: Whether the predicted probability that the episode goes on discounts the later rewards, which
             takes slower rollouts; null follows what a run has seen: true once an episode ended in a terminal state.
         method: Name of a registered planner, such as `cem`, `icem` or `mppi`. An option that has its default value is
@@ -187,6 +188,7 @@ class PlannerConfig(SearchOptions):
     final: str = "mean"
     noise_beta: float = 0.0
     keep_elite_fraction: float = 0.0
+    temperature: float | None = 0.5
     use_continues: bool | None = None  # type: ignore[assignment]  # wider than the option of a search
     method: str = "cem"
     surprise_limit: float | None = None

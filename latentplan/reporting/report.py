@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from latentplan import __version__
 from latentplan.config import Config, to_dict
 from latentplan.config.run_results import Evaluation
-from latentplan.reporting.compare import published_rows
+from latentplan.reporting.compare import CLOCKS, OFFLINE_CLOCKS, published_rows
 from latentplan.reporting.frame import Frame
 from latentplan.reporting.page import Section, figure, film, picture, render_page, scrubber, table
 from latentplan.reporting.published import published_returns_of
@@ -26,8 +26,6 @@ SEPARATOR = 128  # grey between pictures, visible on light and dark pictures
 GAP = 1
 SHOWN_DIMENSIONS = 2
 NUM_BINS = 40
-CLOCKS = {"env_frames": "frames", "minutes": "minutes"}
-OFFLINE_CLOCKS = {"updates": "updates", "minutes": "minutes"}  # of a run that has collected no frames
 
 
 @dataclass(frozen=True)
