@@ -49,6 +49,10 @@ class SearchOptions:
         final: The sequence that is executed: the `mean` of the distribution, the `best` candidate, or the `better` of
             the mean and another sequence, by predicted return: the policy's own sequence, or the best candidate where
             the policy makes no proposals or constraints or an objective that it was not trained for are set.
+        policy_margin: The policy's own sequence is executed unless the return that the plan is predicted to earn is
+            higher by more than this share of the policy's, at least 0: a smaller gain is within the error of a learned
+            value. No effect where the policy makes no proposals, or constraints or an objective that it was not trained
+            for are set. null always executes the plan.
         noise_beta: Exponent of coloured sampling noise, in [0, 100]; 0 is white, larger is smoother over the horizon.
         white_noise_share: Share of the samples whose noise is white although `noise_beta` is above 0, in [0, 1]. Where
             both kinds exist, the smooth ones explore further than `init_std`, and the white ones less far.
@@ -86,6 +90,7 @@ class SearchOptions:
     use_continues: bool = False
     tail: str = "zero"
     final: str = "better"
+    policy_margin: float | None = None
     noise_beta: float = 2.0
     white_noise_share: float = 0.5
     overshoot: float = 0.0
@@ -108,8 +113,10 @@ class SearchOptions:
         within(self, noise_beta=(0.0, STEEPEST_NOISE), min_std=(0.0, WIDEST_STD), overshoot=(0.0, 10.0))
         if isinstance(self.init_std, Real):  # a planner checks a std per action dimension, which it alone accepts
             within(self, init_std=(0.0, WIDEST_STD))
-        if self.constraint_penalty is not None and not 0.0 <= self.constraint_penalty < math.inf:
-            raise ValueError(f"constraint_penalty must be finite and at least 0, got {self.constraint_penalty}")
+        for name in ("constraint_penalty", "policy_margin"):
+            value = getattr(self, name)
+            if value is not None and not 0.0 <= value < math.inf:
+                raise ValueError(f"{name} must be finite and at least 0, got {value}")
         one_of(self, tail=("zero", "hold", "policy"), final=("mean", "best", "better"))
         self._check_spline()
         self._check_num_elites()
@@ -174,7 +181,7 @@ class PlannerConfig(SearchOptions):
         final: See `SearchOptions`.
         noise_beta: See `SearchOptions`.
         keep_elite_fraction: See `SearchOptions`.
-        temperature: See `SearchOptions`.
+        policy_margin: See `SearchOptions`.
         use_continues: Whether the predicted probability that the episode goes on discounts the later rewards, which
             takes slower rollouts; null follows what a run has seen: true once an episode ended in a terminal state.
         method: Name of a registered planner, such as `cem`, `icem` or `mppi`. An option that has its default value is
@@ -188,7 +195,7 @@ class PlannerConfig(SearchOptions):
     final: str = "mean"
     noise_beta: float = 0.0
     keep_elite_fraction: float = 0.0
-    temperature: float | None = 0.5
+    policy_margin: float | None = 0.01
     use_continues: bool | None = None  # type: ignore[assignment]  # wider than the option of a search
     method: str = "cem"
     surprise_limit: float | None = None

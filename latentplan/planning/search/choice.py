@@ -33,16 +33,38 @@ class Finalists(NamedTuple):
     policy_mode: Tensor | None
 
 
-def choose(final: str, scorer: Scorer, state: State, finalists: Finalists) -> Choice:
+def choose(final: str, margin: float | None, scorer: Scorer, state: State, finalists: Finalists) -> Choice:
     """Returns the sequence of a finished search that is executed, its expected return and its violation.
 
     Args:
         final: `mean`; `best`, the best candidate; or `better`, the mean or another sequence, by predicted return: the
             policy's mode sequence if there is one, else the best candidate.
+        margin: Share of the return of the policy's mode sequence by which the return of this choice must be higher, or
+            the policy's sequence takes its place; None never lets it.
         scorer: Scores sequences.
         state: Start of the plans, rows (batch,).
         finalists: The sequences.
     """
+    choice = _choose_final(final, scorer, state, finalists)
+    if margin is None or finalists.policy_mode is None:
+        return choice
+    return _prefer_policy(margin, scorer, state, choice, finalists.policy_mode)
+
+
+def _prefer_policy(margin: float, scorer: Scorer, state: State, choice: Choice, mode: Tensor) -> Choice:
+    """Returns the policy's sequence where the choice does not gain the margin, else the choice."""
+    actions, expected, violation = choice
+    is_valid = torch.isfinite(mode).flatten(1).all(1)  # a model may give an action that is NaN a finite return
+    both = torch.stack([actions, torch.where(is_valid[:, None, None], mode, actions)], dim=1)
+    returns, policy_returns = scorer.score(scorer.start_rows(state, 2), both).returns.unbind(1)
+    is_enough = returns - policy_returns > margin * policy_returns.abs()
+    is_policy = is_valid & torch.isfinite(policy_returns) & ~is_enough
+    actions = torch.where(is_policy[:, None, None], mode, actions)
+    expected = torch.where(torch.isfinite(returns), returns, expected)
+    return actions, torch.where(is_policy, policy_returns, expected), violation
+
+
+def _choose_final(final: str, scorer: Scorer, state: State, finalists: Finalists) -> Choice:
     if final == "better":
         return _choose_better(scorer, state, finalists)
     if scorer.constraints:

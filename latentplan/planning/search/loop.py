@@ -159,7 +159,7 @@ class Search:
         best = self.space.decode(progress.elites.actions[:, :1])[:, 0]
         mode = proposals[:, 0] if proposals is not None and self.may_use_policy else None
         finalists = Finalists(mean, best, progress.elites.scores.first(1), progress.expected_return, mode)
-        return choose(self.options.final, self.scorer, self.state, finalists)
+        return choose(self.options.final, self.options.policy_margin, self.scorer, self.state, finalists)
 
     def _propose(self, budget: Budget) -> Tensor:
         generators = self.streams.policy_generators()

@@ -1,4 +1,4 @@
-"""`final="better"` executes the mean or another sequence: the policy's mode, or the best candidate."""
+"""The sequence that is executed: the mean, the best candidate or the policy's mode."""
 
 import math
 
@@ -43,6 +43,47 @@ def test_final_better_executes_mean_or_policy_mode_by_return(make_planner, seede
     torch.testing.assert_close(plan.actions[1], plan.mean[1])
     rewards = [spiked_reward(states, action) for action in plan.actions.unbind(dim=1)]  # the discount is 1
     torch.testing.assert_close(plan.expected_return, sum(rewards))
+
+
+@pytest.mark.parametrize("final", ["mean", "best", "better"])
+@pytest.mark.parametrize("margin", [0.0, 0.05, 0.5, 1e6])
+def test_policy_is_executed_where_the_plan_does_not_gain_the_margin(make_planner, seeded, final, margin):
+    states = torch.tensor([[0.2], [-0.4], [0.3], [0.0]])
+    share = torch.tensor([1.0, 0.97, 0.8, 0.4])  # of the largest action, by the policy
+
+    def policy(state, generator):
+        return share[torch.bucketize(state, states.flatten().sort().values)].expand(len(state), 2)
+
+    model = make_model(policy, lambda state, action: action.sum(dim=1))
+    plain, planner = (make_planner(num_policy_samples=1, final=final, policy_margin=each) for each in (None, margin))
+    chosen, plan = (each.plan(model, states, generator=seeded()) for each in (plain, planner))
+    torch.testing.assert_close(plan.mean, chosen.mean)  # the search itself is the same
+    mode = policy(states, None)[:, None].expand_as(plan.actions)
+    gains = returns_of(model, states, chosen.actions) - returns_of(model, states, mode)
+    is_enough = gains > margin * returns_of(model, states, mode).abs()
+    torch.testing.assert_close(plan.actions, torch.where(is_enough[:, None, None], chosen.actions, mode))
+    torch.testing.assert_close(plan.expected_return, returns_of(model, states, plan.actions))
+
+
+@pytest.mark.parametrize(
+    "given", [{"objective": learned_return()}, {"constraints": [lambda rollout: rollout.rewards[:, 0] * 0.0]}]
+)
+def test_policy_replaces_no_plan_for_what_it_was_not_trained_for(make_planner, seeded, given):
+    model, states = make_model(constant(0.3)), torch.tensor([[0.2], [-0.4]])
+    plain, planner = (make_planner(num_policy_samples=1, policy_margin=each) for each in (None, 1e6))
+    plans = [each.plan(model, states, generator=seeded(), **given) for each in (plain, planner)]
+    torch.testing.assert_close(plans[0].actions, plans[1].actions)
+
+
+def test_policy_that_is_not_finite_replaces_no_plan(make_planner, seeded):
+    def reward(state, action):
+        return torch.nan_to_num(action, nan=9.0).sum(dim=1)
+
+    model = make_model(constant(NAN), reward)
+    plan = make_planner(num_policy_samples=4, policy_margin=1e6, final="mean").plan(
+        model, torch.zeros(2, 1), generator=seeded()
+    )
+    torch.testing.assert_close(plan.actions, plan.mean)
 
 
 @pytest.mark.parametrize("policy", [NAN, 5.0])
