@@ -1,10 +1,14 @@
 """Settings that earlier versions had or lacked: read with the meaning that they had then, or refused with advice."""
 
+import dataclasses
+import json
+
 import pytest
 
 from latentplan.config import Config, UserError, from_dict, to_dict
 from latentplan.config.earlier import ADDED, REMOVED, as_saved, drop_removed
 from latentplan.config.files import build_config, read_config, to_yaml
+from latentplan.config.planner import SearchOptions
 
 
 @pytest.mark.parametrize("key", REMOVED)
@@ -47,3 +51,13 @@ def test_later_settings_of_saved_files_stand_for_what_earlier_versions_did(tmp_p
     assert expected != known
     assert to_dict(from_dict(earlier)) == to_dict(read_config(tmp_path / "config.yaml")) == expected
     assert to_dict(from_dict(known)) == known
+
+
+def test_shipped_agents_search_without_options_that_came_later(root):
+    """An option of the search that an agent was saved without has no effect, as in the planning library."""
+    for info in root.glob("checkpoints/*/info.json"):
+        saved = json.loads(info.read_text())["config"]
+        planner = from_dict(saved).planner
+        for field in dataclasses.fields(SearchOptions):
+            if field.name not in saved["planner"]:
+                assert getattr(planner, field.name) == field.default, f"{info.parent.name}: {field.name}"

@@ -194,7 +194,8 @@ def test_measure_decisions_counts_the_model_steps_of_a_warm_search(config):
     torch.manual_seed(0)
     model = WorldModel(config.model, action_dim=1)
     steps = measure_decisions(PlanningAgent(model, config, 0.9), batch=1, decisions=2)["model_steps"]
-    assert steps == 3 * (2 * (8 - 2) + 2)  # horizon, times fresh candidates of two refits and the proposals
+    # The horizon, times fresh candidates of two refits, the proposals, and the plan beside the policy's sequence.
+    assert steps == 3 * (2 * (8 - 2) + 2 + 2)
     assert measure_decisions(PlanningAgent(model, config, 0.9), batch=3, decisions=1)["model_steps"] == steps
     assert measure_decisions(ActorAgent(model, config), batch=1, decisions=2)["model_steps"] == 0
 
@@ -217,7 +218,7 @@ def test_decide_applies_planner_settings_of_the_command_line(tmp_path, checkpoin
     assert benchmark.main([str(word) for word in [*command, "--planner.horizon", 1]]) == 0
     result = json.loads(path.read_text())
     assert result["planner"]["horizon"] == 1
-    assert result["arms"]["planner"]["model_steps"] == 14
+    assert result["arms"]["planner"]["model_steps"] == 16
     assert result["arms"]["planner without actor"]["model_steps"] == 16
     assert result["arms"]["exported actor"]["model_steps"] == 0
 
