@@ -52,7 +52,7 @@ class SearchOptions:
         policy_margin: The policy's own sequence is executed unless the return that the plan is predicted to earn is
             higher by more than this share of the policy's, at least 0: a smaller gain is within the error of a learned
             value. No effect where the policy makes no proposals, or constraints or an objective that it was not trained
-            for are set. null always executes the plan.
+            for are set. null stands for 0 where `final` is `better`, else the plan is always executed.
         noise_beta: Exponent of coloured sampling noise, in [0, 100]; 0 is white, larger is smoother over the horizon.
         white_noise_share: Share of the samples whose noise is white although `noise_beta` is above 0, in [0, 1]. Where
             both kinds exist, the smooth ones explore further than `init_std`, and the white ones less far.

@@ -82,8 +82,9 @@ class Plan:
         actions: The chosen sequence within the bounds, (batch, horizon, action).
         mean: Mean of the search distribution, (batch, horizon, action).
         var: Variance of the search distribution, (batch, horizon, action).
-        expected_return: Predicted return of the chosen sequence, (batch,); with the option `final` `mean` and without
-            gradient steps it is the mean return of the last elites, which may be higher than the return of their mean.
+        expected_return: Predicted return of the chosen sequence, (batch,); with the option `final` `mean`, and
+            without `policy_margin` and gradient steps, it is the mean return of the last elites, which may be higher
+            than the return of their mean.
             NaN where no candidate had a finite return.
         info: Diagnostics by name, see above.
         elites: Kept elites, (batch, kept, horizon, action), if the planner keeps some; with the option `overshoot` they

@@ -41,6 +41,7 @@ def test_from_dict_inverts_to_dict(config):
 
 
 def test_from_dict_takes_defaults_for_absent_settings():
+    assert from_dict({"collection": {"noise_std": 0.1}}) == Config(collection=CollectionConfig(noise_std=0.1))
     saved = from_dict({"planner": {"horizon": 3}})  # by a version without the margin, see `ADDED`
     assert saved == Config(planner=PlannerConfig(horizon=3, policy_margin=None))
 

@@ -55,7 +55,9 @@ def test_later_settings_of_saved_files_stand_for_what_earlier_versions_did(tmp_p
 
 def test_shipped_agents_search_without_options_that_came_later(root):
     """An option of the search that an agent was saved without has no effect, as in the planning library."""
-    for info in root.glob("checkpoints/*/info.json"):
+    agents = list(root.glob("checkpoints/*/info.json"))
+    assert agents
+    for info in agents:
         saved = json.loads(info.read_text())["config"]
         planner = from_dict(saved).planner
         for field in dataclasses.fields(SearchOptions):

@@ -40,20 +40,32 @@ def choose(final: str, margin: float | None, scorer: Scorer, state: State, final
         final: `mean`; `best`, the best candidate; or `better`, the mean or another sequence, by predicted return: the
             policy's mode sequence if there is one, else the best candidate.
         margin: Share of the return of the policy's mode sequence by which the return of this choice must be higher, or
-            the policy's sequence takes its place; None never lets it.
+            the policy's sequence takes its place; None stands for 0 with `better`, else the policy's never does.
         scorer: Scores sequences.
         state: Start of the plans, rows (batch,).
         finalists: The sequences.
     """
-    choice = _choose_final(final, scorer, state, finalists)
-    if margin is None or finalists.policy_mode is None:
-        return choice
-    return _prefer_policy(margin, scorer, state, choice, finalists.policy_mode)
+    mode = finalists.policy_mode  # None under constraints
+    if mode is None and final == "better":
+        return _choose_better(scorer, state, finalists)
+    if scorer.constraints:
+        return _choose_feasible(final, scorer, state, finalists)
+    actions, expected = _choose_one(final, finalists)
+    if margin is None and final == "better":
+        margin = 0.0
+    if mode is None or margin is None:
+        return actions, expected, None
+    return *_prefer_policy(margin, scorer, state, (actions, expected), mode), None
 
 
-def _prefer_policy(margin: float, scorer: Scorer, state: State, choice: Choice, mode: Tensor) -> Choice:
-    """Returns the policy's sequence where the choice does not gain the margin, else the choice."""
-    actions, expected, violation = choice
+def _prefer_policy(
+    margin: float, scorer: Scorer, state: State, choice: tuple[Tensor, Tensor], mode: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Returns the policy's sequence where the choice does not gain the margin, else the choice.
+
+    The expected return is that of the sequence itself, which the mean return of the elites is not.
+    """
+    actions, expected = choice
     is_valid = torch.isfinite(mode).flatten(1).all(1)  # a model may give an action that is NaN a finite return
     both = torch.stack([actions, torch.where(is_valid[:, None, None], mode, actions)], dim=1)
     returns, policy_returns = scorer.score(scorer.start_rows(state, 2), both).returns.unbind(1)
@@ -61,35 +73,25 @@ def _prefer_policy(margin: float, scorer: Scorer, state: State, choice: Choice, 
     is_policy = is_valid & torch.isfinite(policy_returns) & ~is_enough
     actions = torch.where(is_policy[:, None, None], mode, actions)
     expected = torch.where(torch.isfinite(returns), returns, expected)
-    return actions, torch.where(is_policy, policy_returns, expected), violation
+    return actions, torch.where(is_policy, policy_returns, expected)
 
 
-def _choose_final(final: str, scorer: Scorer, state: State, finalists: Finalists) -> Choice:
-    if final == "better":
-        return _choose_better(scorer, state, finalists)
-    if scorer.constraints:
-        return _choose_feasible(final, scorer, state, finalists)
-    if final == "mean":
-        return finalists.mean, finalists.elite_return, None
+def _choose_one(final: str, finalists: Finalists) -> tuple[Tensor, Tensor]:
+    """Returns the mean, or the best candidate where `final` is `best` and there is one."""
     best_return = finalists.best_scores.returns[:, 0]
-    is_best = torch.isfinite(best_return)
+    is_best = torch.isfinite(best_return) if final == "best" else torch.zeros_like(best_return, dtype=torch.bool)
     actions = torch.where(is_best[:, None, None], finalists.best, finalists.mean)
-    return actions, torch.where(is_best, best_return, finalists.elite_return), None
+    return actions, torch.where(is_best, best_return, finalists.elite_return)
 
 
 def _choose_better(scorer: Scorer, state: State, finalists: Finalists) -> Choice:
-    """Returns the mean or the other sequence, by violation and return; the mean where neither has a finite return.
+    """Returns the mean or the best candidate, by violation and return; the mean where neither has a finite return.
 
     The mean of several good sequences is another sequence, and may have a lower return than any of them.
     """
     mean = finalists.mean
-    if finalists.policy_mode is not None:
-        other = finalists.policy_mode
-        is_valid = torch.isfinite(other).flatten(1).all(1)  # a model may give an action that is NaN a finite return
-    else:
-        other = finalists.best
-        is_valid = torch.isfinite(finalists.best_scores.returns[:, 0])
-    both = torch.stack([mean, torch.where(is_valid[:, None, None], other, mean)], dim=1)
+    is_valid = torch.isfinite(finalists.best_scores.returns[:, 0])
+    both = torch.stack([mean, torch.where(is_valid[:, None, None], finalists.best, mean)], dim=1)
     scores = scorer.score(scorer.start_rows(state, 2), both)
     better = select_elites(both, scores, num_elites=1, temperature=None)
     is_known = better.weights[:, 0] > 0

@@ -58,7 +58,13 @@ def test_planner_config_and_planner_share_options_defaults_and_checks():
         shared = {field.name: field.default for field in dataclasses.fields(SearchOptions)}
         assert fields.keys() - own == shared.keys()
         assert {name: fields[name] for name in shared} == shared | other
-    for bad in ({"num_elites": 129}, {"smoothing": 0.0}, {"tail": "head"}, {"policy_margin": -1.0}):
+    for bad in (
+        {"num_elites": 129},
+        {"smoothing": 0.0},
+        {"tail": "head"},
+        {"temperature": -1.0},
+        {"policy_margin": -1.0},
+    ):
         messages = []
         for make in (lambda bad=bad: PlannerConfig(**bad), lambda bad=bad: CEMPlanner(action_dim=1, **bad)):
             with pytest.raises(ValueError, match=next(iter(bad))) as caught:
