@@ -37,7 +37,10 @@ REMOVED = {
     "collection.noise_share": Removed(1.0, "every round is collected with noise of collection.noise_std"),
 }
 
-ADDED: dict[str, dict[str, Any]] = {"model": {"decoder_layers": 0}, "planner": {"policy_margin": None}}
+ADDED: dict[str, dict[str, Any]] = {
+    "model": {"decoder_layers": 0, "decoder_width": 96},  # 96 of the agents that have layers and name no width
+    "planner": {"policy_margin": None},
+}
 
 
 def as_saved(section: str, fields: Mapping[Any, Any]) -> dict[Any, Any]:

@@ -101,8 +101,8 @@ class ModelConfig:
         encoder_channels: Channels of the encoder's layers; the first layer reads patches of 4 x 4 pixels, each later
             layer halves the grid.
         decoder_channels: Channels of the decoder's 8 x 8 grid of tokens.
-        decoder_layers: Hidden layers of width `decoder_width` that the tokens read beside the features; agents of
-            earlier versions have none.
+        decoder_layers: Hidden layers that the tokens read beside the features; agents of earlier versions have none.
+        decoder_width: Width of these layers. With 88 an agent for a body of 6 actions takes 2.5 MB.
         num_bins: Bins of the distributional reward and value heads.
         turns: Quarter turns of each frame for which an agent keeps a belief, and over which its action is averaged: 1,
             or 4 for a body that looks the same from every side.
@@ -114,20 +114,17 @@ class ModelConfig:
     encoder_channels: tuple[int, ...] = (32, 48, 64)
     decoder_channels: int = 12
     decoder_layers: int = 2
+    decoder_width: int = 88
     num_bins: int = 63
     turns: int = 1
 
     def __post_init__(self) -> None:
         if self.turns not in (1, 4):
             raise ValueError(f"turns must be 1 or 4, got {self.turns}")
-        at_least(self, latent_dim=1, deter_dim=1, hidden_dim=1, decoder_channels=1, decoder_layers=0, num_bins=3)
+        at_least(self, latent_dim=1, deter_dim=1, hidden_dim=1, num_bins=3)
+        at_least(self, decoder_channels=1, decoder_layers=0, decoder_width=1)
         if not 1 <= len(self.encoder_channels) <= 5 or min(self.encoder_channels) < 1:
             raise ValueError(f"encoder_channels must hold 1 to 5 positive sizes, got {self.encoder_channels}")
-
-    @property
-    def decoder_width(self) -> int:
-        """Width of the decoder's hidden layers: half of `hidden_dim`, so that an agent's file stays small."""
-        return max(1, self.hidden_dim // 2)
 
 
 @dataclass(frozen=True)
