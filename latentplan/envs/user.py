@@ -57,6 +57,7 @@ def wrap_user_env(
             of steps of `env`, or until the episode ends, and sums the rewards.
         seed: Seed of the first reset that is called without one; None draws a seed from the system.
         config: Size of the frames, names of cameras and vectors, such as `agent.config.env`; None takes the defaults.
+            Its `action_repeat` is not read.
             With `pixels` "render" the frames are what `env.render()` draws, which needs `env.render_mode` "rgb_array",
             and the observations may be anything.
 
