@@ -143,7 +143,8 @@ class ModelAgent:
         """A copy of what the agent knows of the running episodes: tensors on the CPU, None and plain values.
 
         An agent with the same weights and settings to which `set_memory` gives it, and whose random stream is restarted
-        with the same seed, acts as this agent does from here on.
+        with the same seed, acts as this agent does from here on. The gate of a `GatedAgent` and the plans of a
+        `BackgroundAgent` are not part of it.
         """
         belief = None if self.state is None else [copy_tensor(part) for part in self.state]
         parts = {"action": self._action, "is_reset": self._is_reset, "noise": self.noise.last}

@@ -155,7 +155,7 @@ class GatedAgent(PlanningAgent):
         has_plan = is_planned
         if bool(is_planned.any()):
             with self.model.trunk_precision():
-                planned = self.controller.act_where(state, is_planned)
+                planned = self.controller.act_where(state, is_planned, self._last_action())
             plan = self.controller.plan
             assert plan is not None
             has_plan = is_planned & ~plan.info["is_fallback"].cpu()
@@ -168,6 +168,13 @@ class GatedAgent(PlanningAgent):
         self._count_decisions(is_planned, has_plan, is_tail)
         self._drift = torch.where(is_planned.to(self._drift.device), 0.0, self._drift)
         return action
+
+    def _last_action(self) -> Tensor | None:
+        """The action executed last, (batch, action), NaN at the first decision of an episode; None before any."""
+        assert self._is_first is not None
+        if self._action is None:
+            return None
+        return self._action.masked_fill(self._is_first.to(self._action.device)[:, None], torch.nan)
 
     @property
     def _is_goal_untrained(self) -> bool:

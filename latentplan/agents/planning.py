@@ -117,7 +117,7 @@ class PlanningAgent(ModelAgent):
         with self.model.trunk_precision():
             action = self.controller.act(state)
         self.last_source = self.controller.source
-        if self.last_source != "plan" and self.controller.plan is not None:
+        if self.controller.plan is not None:
             self.controller.plan.warn_of_failures()
         self.was_surprised = False
         if self.surprise_limit is None or self.controller.objective is not None or self.controller.constraints:

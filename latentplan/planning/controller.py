@@ -84,18 +84,21 @@ class ModelPredictiveController:
         """
         return self._act(state, self.generator, last_action)
 
-    def act_where(self, state: State, where: Tensor) -> Tensor:
+    def act_where(self, state: State, where: Tensor, last_action: Tensor | None = None) -> Tensor:
         """Returns the next action of some environments; in the others another agent acts, and their plans age.
 
         Args:
             state: Present state of each environment, rows (batch,).
             where: Environments to decide for, (batch,) bool.
+            last_action: The action executed last in each environment, (batch, action), NaN where there is none; None
+                takes it from the previous plans, which know it where this controller decided last.
 
         Returns:
             Actions of the environments in `where`, in order: (chosen, action).
 
         Raises:
-            ValueError: `where` selects no environment, or the objective has one goal for each of all environments.
+            ValueError: `where` selects no environment, or the objective or the bounds have one value for each of all
+                environments.
         """
         where = where.to("cpu", torch.bool)
         rows = where.nonzero().squeeze(1)
@@ -108,7 +111,8 @@ class ModelPredictiveController:
         self._is_stale = None if stale is None else stale[rows]
         generator = _select_streams(self.generator, where) or self.generator
         try:
-            action = self._act(tree_map(lambda leaf: leaf[rows.to(leaf.device)], state), generator)
+            last = None if last_action is None else last_action[rows.to(last_action.device)]
+            action = self._act(tree_map(lambda leaf: leaf[rows.to(leaf.device)], state), generator, last)
         except BaseException:
             self.plan, self._is_stale = before
             raise

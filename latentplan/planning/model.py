@@ -42,7 +42,7 @@ State = Any  # a tensor, or a pytree (tuple, NamedTuple, dict, list, dataclass) 
 Bound = float | Sequence[Any] | Tensor  # one number, (action,), (horizon, action) or (batch, horizon, action)
 
 
-_takes_generator: WeakKeyDictionary[FunctionType, bool] = WeakKeyDictionary()
+_generators: WeakKeyDictionary[FunctionType, inspect.Parameter | None] = WeakKeyDictionary()
 
 
 class Model(Protocol):
@@ -122,16 +122,22 @@ def has_policy(model: object) -> bool:
 
 
 def takes_generator(function: Callable[..., Any]) -> bool:
-    """Returns whether a function has an argument `generator`."""
+    """Returns whether a function, or the `forward` of a module, has an argument `generator`."""
+    return _find_generator(function) is not None
+
+
+def _find_generator(function: Callable[..., Any]) -> inspect.Parameter | None:
+    """Returns the argument `generator` of a function, or of the `forward` of a module; None without one."""
+    function = function.forward if isinstance(function, torch.nn.Module) else function
     plain = getattr(function, "__func__", function)  # of a method; methods are made anew at each access
     if isinstance(plain, FunctionType):
-        if plain not in _takes_generator:  # a signature takes longer to read than a small step
-            _takes_generator[plain] = "generator" in inspect.signature(plain).parameters
-        return _takes_generator[plain]
+        if plain not in _generators:  # a signature takes longer to read than a small step
+            _generators[plain] = inspect.signature(plain).parameters.get("generator")
+        return _generators[plain]
     try:
-        return "generator" in inspect.signature(function).parameters
+        return inspect.signature(function).parameters.get("generator")
     except (TypeError, ValueError):  # a compiled function may have no signature
-        return False
+        return None
 
 
 def is_sampling(model: Any) -> bool:
@@ -141,8 +147,12 @@ def is_sampling(model: Any) -> bool:
 
 
 def call_with(function: Callable[..., Any], generator: torch.Generator | None, *arguments: Any) -> Any:
-    """Returns the result of a model's method, which is given the generator if there is one and the method takes it."""
-    if generator is None or not takes_generator(function):
+    """Returns the result of a model's method, which is given the generator if the method takes one.
+
+    Without a generator the method takes its own default, or None where it has no default.
+    """
+    wanted = _find_generator(function)
+    if wanted is None or (generator is None and wanted.default is not inspect.Parameter.empty):
         return function(*arguments)
     return function(*arguments, generator=generator)
 
@@ -246,7 +256,7 @@ def per_dimension(value: float | Sequence[float] | Tensor, action_dim: int, name
     Raises:
         ValueError: The value is neither one number nor one per dimension, or is not finite.
     """
-    numbers = torch.as_tensor(value, dtype=torch.float64)
+    numbers = torch.as_tensor(value, dtype=torch.float64, device="cpu")
     if numbers.ndim > 1 or numbers.numel() not in (1, action_dim):
         raise ValueError(f"{name} must be one number or {action_dim} numbers, got shape {tuple(numbers.shape)}")
     if not bool(torch.isfinite(numbers).all()):
@@ -265,7 +275,7 @@ def per_step(value: Bound, action_dim: int, name: str) -> Tensor:
     Raises:
         ValueError: The value has another shape, or is not finite.
     """
-    numbers = torch.as_tensor(value, dtype=torch.float64)
+    numbers = torch.as_tensor(value, dtype=torch.float64, device="cpu")
     if numbers.ndim < 2:
         return per_dimension(numbers, action_dim, name)[None, None]
     if numbers.ndim > 3 or numbers.shape[-1] != action_dim:
@@ -302,8 +312,11 @@ def compile_rollout(model: Model, **options: Any) -> Model:
         A model with all attributes of `model`. It can be pickled if `model` can, and compiles again after unpickling.
 
     Raises:
+        ValueError: The model samples: a compiled program cannot draw from the stream that a search passes to it.
         torch._dynamo.exc.BackendCompilerFailed: While planning, if torch finds no C++ compiler.
     """
+    if is_sampling(model):
+        raise ValueError("compile_rollout() needs a model that does not sample, but this one takes a generator")
     return _CompiledModel(model, options)
 
 

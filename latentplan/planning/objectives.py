@@ -21,7 +21,7 @@ from einops import rearrange, reduce, repeat
 from torch import Tensor
 from torch.nn import functional
 
-from latentplan.planning.model import Model, State, check_shape, require, supports
+from latentplan.planning.model import Model, State, call_with, check_shape, require, supports
 
 Term = Callable[["Rollout"], Tensor]  # the value of each row, (rows,), maximised
 Constraint = Callable[["Rollout"], Tensor]  # the violation of each row, (rows,); at most 0 where it is satisfied
@@ -130,6 +130,16 @@ class Objective:
 def as_objective(term: Term) -> Objective:
     """Returns the term as an objective; a plain function is assumed to read the states of the rollout."""
     return term if isinstance(term, Objective) else Objective(term, needs_states=True)
+
+
+def name_term(term: Term) -> str:
+    """Returns the names of the functions of a term, without the numbers and tensors that they were given."""
+    if isinstance(term, Objective):
+        return name_term(term.function)
+    if isinstance(term, partial):
+        inner = [name_term(argument) for argument in term.args if callable(argument)]
+        return f"{name_term(term.func)}({', '.join(inner)})"
+    return getattr(term, "__qualname__", type(term).__qualname__)
 
 
 def learned_return() -> Objective:
@@ -346,8 +356,8 @@ def _distance(
 ) -> Tensor:
     features = state if select is None else select(state)
     target = goal.to(features)
+    check_shape("the goal", goal, (rollout.batch, features.shape[-1])[-goal.ndim :])
     if goal.ndim == 2:
-        check_shape("the goal", goal, (rollout.batch, features.shape[-1]))
         target = repeat(target, "batch feature -> (batch num) feature", num=len(features) // rollout.batch)
     if metric == "mse":
         return (features - target).square().mean(dim=-1)
@@ -397,7 +407,7 @@ def _conditioned_return(view: View, rollout: Rollout) -> Tensor:
     require(viewed, "value", "a learned goal")
     before = (rollout.start, *rollout.states[:-1])
     pairs = zip(before, rollout.actions.unbind(1), strict=True)
-    rewards = torch.stack([viewed.step(state, action)[1] for state, action in pairs], dim=1)
+    rewards = torch.stack([call_with(viewed.step, None, state, action)[1] for state, action in pairs], dim=1)
     rewards = rewards.to(rollout.rewards.dtype)
     value: Tensor = viewed.value(rollout.last_state).to(rewards.dtype)  # type: ignore[attr-defined]
     return (rewards * rollout.weights[..., :-1]).sum(dim=1) + rollout.weights[..., -1] * value

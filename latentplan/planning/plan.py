@@ -276,21 +276,21 @@ def shift_plan(
     """Shifts a plan by the actions executed since it was made, and fills its tail.
 
     Args:
-        previous: The previous plan, of any length.
+        previous: The previous plan, of any length, on any device.
         rest: The start of a cold search, (batch, horizon, action), in the precision of the next plan.
         tail: How the tail is filled: `zero` (with `rest`), `hold` (the last action repeated) or `policy`.
         fit: `fit(sequence) -> sequence` makes actions allowed, for (batch, horizon, action) and (batch, kept, ...).
         policy_tail: `policy_tail(sequence, is_tail) -> sequence` fills the tail with the model's policy.
     """
     length, horizon = previous.mean.shape[1], rest.shape[1]
-    device = previous.mean.device
+    device = rest.device
     position = torch.arange(horizon)[None] + previous.elapsed[:, None]
     is_tail = (position >= length).to(device)[..., None]  # (batch, horizon, 1)
     index = position.clamp_max(length - 1).to(device)[..., None]
 
     def move(sequence: Tensor) -> Tensor:
         """Returns the shifted sequence in this search's precision, its last action repeated past its end (`hold`)."""
-        return torch.take_along_dim(sequence, index, dim=1).to(rest.dtype)
+        return torch.take_along_dim(sequence.to(rest), index, dim=1)
 
     is_warm = previous.is_warm.to(device)[:, None, None]
     mean = move(previous.actions)
@@ -302,6 +302,6 @@ def shift_plan(
 
     elites = previous.elites
     if elites is not None:
-        elites = torch.take_along_dim(elites, index[:, None], dim=2).to(rest.dtype)
+        elites = torch.take_along_dim(elites.to(rest), index[:, None], dim=2)
         elites = fit(torch.where(is_tail[:, None], mean[:, None], elites))
     return WarmStart(mean, elites, previous.is_warm)

@@ -273,7 +273,10 @@ class _JaxCall(torch.autograd.Function):
     def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
         arguments = _to_jax(ctx.saved_tensors, ctx.structure)
         found = ctx.gradient(arguments, _to_jax(gradients, ctx.wanted))
-        return None, None, None, None, *_to_torch(found, ctx.structure)
+        leaves = zip(ctx.structure.flatten_up_to(found), ctx.saved_tensors, strict=True)
+        # An integer, such as a counter of steps, has no gradient in torch, and one without numbers (float0) in jax.
+        known = [torch.from_dlpack(leaf) if tensor.is_floating_point() else None for leaf, tensor in leaves]
+        return None, None, None, None, *known
 
 
 def _evaluate(

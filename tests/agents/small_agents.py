@@ -6,7 +6,9 @@ from latentplan.config import Config, ModelConfig, PlannerConfig
 from latentplan.models import WorldModel
 from latentplan.models.fast import accelerate
 
-SIZES = ModelConfig(deter_dim=16, hidden_dim=16, encoder_channels=(8, 8), decoder_channels=2, num_bins=15)
+SIZES = ModelConfig(
+    deter_dim=16, hidden_dim=16, decoder_width=8, encoder_channels=(8, 8), decoder_channels=2, num_bins=15
+)
 CONFIG = Config(
     model=SIZES,
     planner=PlannerConfig(horizon=3, num_samples=24, num_elites=6, num_iterations=2, num_policy_samples=4),

@@ -11,6 +11,7 @@ from latentplan.agents.actor import ActorAgent
 from latentplan.agents.gated import SIGNALS, GatedAgent, RunningScale
 from latentplan.agents.planning import PlanningAgent
 from latentplan.config import Config, PlannerConfig
+from latentplan.planning import rate_limit
 from tests.agents.small_agents import SIZES, make_plain_model
 
 CONFIG = Config(
@@ -303,3 +304,12 @@ def test_gated_agent_plans_at_once_when_an_objective_is_set(model, film):
         agent.set_objective(learned)
         agent.act(film[2, 0])
         assert agent.last_source == "actor"
+
+
+def test_rate_limit_holds_between_plans_their_tails_and_the_actor(model, film):
+    """Between searches the agent executes the rest of its plan; the next plan starts from the action executed last."""
+    agent = make(model, planning_budget=0.3)
+    agent.set_objective(lambda rollout: rollout.actions[:, 0, 0], [rate_limit(0.1)])
+    actions = np.stack([agent.act(frames) for frames in film[:20]])
+    assert np.abs(np.diff(actions, axis=0)).max() <= 0.1 + 1e-5
+    assert agent.planned_fraction < 1.0

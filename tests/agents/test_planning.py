@@ -59,9 +59,9 @@ def test_planning_agent_acts_by_the_actor_when_the_deadline_is_too_short(model, 
     assert agent.last_source == "plan"
     agent.reset()
     pace = agent.controller.planner.pace
-    size = next(key[1] for key in pace._durations)
-    for _ in range(33):
-        pace.record(("iteration", size), 1e3)  # seconds
+    for key in [key for key in pace._durations if key[0] == "iteration"]:
+        for _ in range(33):
+            pace.record(key, 1e3)  # seconds
     assert np.allclose(agent.act(film[0, 0]), actor.act(film[0, 0]), atol=0.02) and agent.last_source == "actor"
 
 
@@ -95,3 +95,14 @@ def test_planning_agent_ignores_surprise_when_an_objective_or_constraint_is_set(
     for agent in (planner, limited):
         agent.set_objective(**goals)
     assert np.array_equal(planner.act(frames[0]), limited.act(frames[0])) and limited.last_source == "plan"
+
+
+@pytest.mark.parametrize("broken", [0, 1])
+def test_failed_search_of_any_environment_is_warned_of(model, frames, broken):
+    agent = make_planner(model)
+    agent.act(frames)
+    state = State(*(part.clone() for part in agent.state))
+    state.deter[broken] = float("nan")
+    agent.state = state
+    with pytest.warns(RuntimeWarning, match="a search found nothing finite"):
+        agent.act(frames)

@@ -12,7 +12,9 @@ from latentplan.models import WorldModel
 
 CONFIG = Config(
     env=EnvConfig(domain="cartpole", task="swingup", action_repeat=100, render_quality="fastest"),
-    model=ModelConfig(deter_dim=8, hidden_dim=8, encoder_channels=(4, 4), decoder_channels=2, num_bins=5),
+    model=ModelConfig(
+        deter_dim=8, hidden_dim=8, decoder_width=4, encoder_channels=(4, 4), decoder_channels=2, num_bins=5
+    ),
     planner=PlannerConfig(horizon=3, num_samples=8, num_elites=2, num_policy_samples=1, num_iterations=2),
 )
 

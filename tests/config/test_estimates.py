@@ -14,7 +14,9 @@ from latentplan.training.estimates import check_run
 GIB = 2**30
 MODELS = [
     ModelConfig(),
-    ModelConfig(deter_dim=64, hidden_dim=96, encoder_channels=(8, 16), decoder_channels=4, num_bins=31),
+    ModelConfig(
+        deter_dim=64, hidden_dim=96, decoder_width=48, encoder_channels=(8, 16), decoder_channels=4, num_bins=31
+    ),
 ]
 
 

@@ -49,7 +49,9 @@ def test_train_refuses_odd_environments_before_it_learns(name, tmp_path):
     _, settings, words = odd.REFUSED[name]
     config = Config(
         env=config_of(f"odd/{name}", **settings),
-        model=ModelConfig(deter_dim=8, hidden_dim=8, encoder_channels=(4, 4), decoder_channels=2, num_bins=5),
+        model=ModelConfig(
+            deter_dim=8, hidden_dim=8, decoder_width=4, encoder_channels=(4, 4), decoder_channels=2, num_bins=5
+        ),
         collection=CollectionConfig(overlap=False),
         run=RunConfig(frames=100, device="cpu", threads=1, run_dir=str(tmp_path / "run")),
     )

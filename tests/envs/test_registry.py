@@ -103,7 +103,9 @@ def test_table_needs_no_simulator(run_python):
 def test_train_and_evaluate_play_a_registered_suite(tmp_path):
     config = Config(
         env=LAMP,
-        model=ModelConfig(deter_dim=8, hidden_dim=8, encoder_channels=(4, 4), decoder_channels=2, num_bins=5),
+        model=ModelConfig(
+            deter_dim=8, hidden_dim=8, decoder_width=4, encoder_channels=(4, 4), decoder_channels=2, num_bins=5
+        ),
         planner=PlannerConfig(horizon=2, num_samples=8, num_elites=2, num_iterations=1, num_policy_samples=2),
         learning=LearningConfig(batch_size=4, sequence_length=5, imagination_horizon=3, imagination_starts=8),
         collection=CollectionConfig(prefill_decisions=40, round_decisions=20, updates_per_decision=0.2, overlap=False),

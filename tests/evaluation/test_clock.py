@@ -19,7 +19,7 @@ from latentplan.evaluation.timed import iterate_timed_episodes, summarize_timed
 from latentplan.models import WorldModel
 
 ENV = EnvConfig(domain="cartpole", task="swingup", action_repeat=50, render_quality="fastest")
-MODEL = ModelConfig(deter_dim=8, hidden_dim=8, encoder_channels=(4, 4), decoder_channels=2, num_bins=5)
+MODEL = ModelConfig(deter_dim=8, hidden_dim=8, decoder_width=4, encoder_channels=(4, 4), decoder_channels=2, num_bins=5)
 PLANNER = PlannerConfig(horizon=4, num_samples=8, num_elites=2, num_policy_samples=1, num_iterations=2)
 
 

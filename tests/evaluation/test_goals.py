@@ -23,7 +23,7 @@ from latentplan.models import WorldModel
 from latentplan.planning.objectives import learned_return
 
 ENV = EnvConfig(domain="cartpole", task="swingup", action_repeat=100, render_quality="fastest")
-MODEL = ModelConfig(deter_dim=8, hidden_dim=8, encoder_channels=(4, 4), decoder_channels=2, num_bins=5)
+MODEL = ModelConfig(deter_dim=8, hidden_dim=8, decoder_width=4, encoder_channels=(4, 4), decoder_channels=2, num_bins=5)
 PLANNER = PlannerConfig(horizon=3, num_samples=8, num_elites=2, num_policy_samples=1, num_iterations=2)
 CONFIG = Config(env=ENV, model=MODEL, planner=PLANNER)
 

@@ -6,7 +6,9 @@ import torch
 from latentplan.config import ModelConfig
 from latentplan.models import State, WorldModel
 
-SMALL = ModelConfig(deter_dim=24, hidden_dim=20, encoder_channels=(8, 8), decoder_channels=4, num_bins=31)
+SMALL = ModelConfig(
+    deter_dim=24, hidden_dim=20, decoder_width=10, encoder_channels=(8, 8), decoder_channels=4, num_bins=31
+)
 
 
 @pytest.fixture(scope="module")

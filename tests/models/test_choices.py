@@ -12,7 +12,9 @@ from latentplan.models.heads import ActionCode, MixedActor
 from latentplan.planning import check_model
 
 CHOICES = (0, 3, 0, 5)
-SIZES = ModelConfig(deter_dim=32, hidden_dim=32, encoder_channels=(8, 8), decoder_channels=2, num_bins=15)
+SIZES = ModelConfig(
+    deter_dim=32, hidden_dim=32, decoder_width=16, encoder_channels=(8, 8), decoder_channels=2, num_bins=15
+)
 
 
 @pytest.fixture

@@ -13,7 +13,9 @@ from latentplan.models import WorldModel
 from latentplan.models.backend import Backend, FrameFunctions
 from latentplan.models.fast import accelerate
 
-SIZES = ModelConfig(deter_dim=16, hidden_dim=16, encoder_channels=(8, 8, 8), decoder_channels=2, num_bins=15)
+SIZES = ModelConfig(
+    deter_dim=16, hidden_dim=16, decoder_width=8, encoder_channels=(8, 8, 8), decoder_channels=2, num_bins=15
+)
 SHAPES = [Spaces(frame_size=size, cameras=cameras) for size in FRAME_SIZES for cameras in (1, 2)]
 
 

@@ -13,7 +13,9 @@ from latentplan.planning.check import check_model
 from latentplan.planning.objectives import learned_return, risk, terminal_value
 from latentplan.planning.search.scorer import Scorer
 
-SIZES = ModelConfig(deter_dim=16, hidden_dim=16, encoder_channels=(8, 8), decoder_channels=2, num_bins=15)
+SIZES = ModelConfig(
+    deter_dim=16, hidden_dim=16, decoder_width=8, encoder_channels=(8, 8), decoder_channels=2, num_bins=15
+)
 
 
 @pytest.fixture(scope="module")

@@ -221,6 +221,19 @@ def test_gradient_planner_refines_plans_in_a_jax_model():
     assert float(refined.expected_return) > float(plain.expected_return)
 
 
+def test_gradient_planner_accepts_a_jax_state_with_a_counter():
+    pytest.importorskip("jax")
+
+    def count(state, action):
+        position, steps = state
+        return (position + 0.1 * action, steps + 1), -((position + 0.1 * action) ** 2).sum()
+
+    model, state = JaxModel(count), (torch.ones(2, 1), torch.zeros(2, dtype=torch.int32))
+    planner = CEMPlanner(action_dim=1, horizon=3, num_samples=16, num_elites=4, gradient_steps=5)
+    plan = planner.plan(model, state, generator=torch.Generator().manual_seed(0))
+    assert (plan.actions[:, 0] < 0).all()
+
+
 def test_jax_model_keeps_the_order_of_dictionary_keys_and_strided_rows():
     pytest.importorskip("jax")
     model = JaxModel(lambda state, action: ({"a": state["a"], "z": state["z"] + action}, action.sum()))

@@ -65,7 +65,9 @@ def config():
     """Settings of a tiny agent for cartpole, with ten decisions per episode."""
     return Config(
         env=EnvConfig(domain="cartpole", task="swingup", action_repeat=10, render_quality="fastest"),
-        model=ModelConfig(deter_dim=8, hidden_dim=8, encoder_channels=(4, 4), decoder_channels=2, num_bins=5),
+        model=ModelConfig(
+            deter_dim=8, hidden_dim=8, decoder_width=4, encoder_channels=(4, 4), decoder_channels=2, num_bins=5
+        ),
         planner=PlannerConfig(
             horizon=3, num_samples=8, num_elites=2, num_policy_samples=2, num_iterations=4, warm_start_iterations=2
         ),

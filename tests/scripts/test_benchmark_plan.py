@@ -21,7 +21,9 @@ from torch.utils.flop_counter import FlopCounterMode
 from latentplan.config import ModelConfig, to_dict
 from latentplan.planning import check_model
 
-MODEL = ModelConfig(deter_dim=8, hidden_dim=12, encoder_channels=(4, 4), decoder_channels=2, num_bins=5)
+MODEL = ModelConfig(
+    deter_dim=8, hidden_dim=12, decoder_width=6, encoder_channels=(4, 4), decoder_channels=2, num_bins=5
+)
 PROBLEM = Problem(
     samples=20,
     horizon=3,

@@ -28,7 +28,9 @@ from tests.training.dot import Dot
 
 TINY = Config(
     env=EnvConfig(action_repeat=1),
-    model=ModelConfig(deter_dim=16, hidden_dim=16, encoder_channels=(4, 4), decoder_channels=2, num_bins=15),
+    model=ModelConfig(
+        deter_dim=16, hidden_dim=16, decoder_width=8, encoder_channels=(4, 4), decoder_channels=2, num_bins=15
+    ),
     planner=PlannerConfig(
         horizon=2, num_samples=8, num_elites=2, num_iterations=1, warm_start_iterations=1, num_policy_samples=2
     ),

@@ -191,10 +191,10 @@ class BackgroundPlanner:
         """Starts the search of a plan whose first action is due at `tick`; see `PlanExecutor.request`."""
         if not self.is_idle:
             return False
-        self._is_idle = False
-        goals, self._goals = self._goals, None
         count_rows(state)  # refuses what is no state, and makes dataclasses in it pytrees
         copied = tree_map(lambda leaf: leaf.detach().clone(), state)
+        self._is_idle = False
+        goals, self._goals = self._goals, None
         self._requests.put(Request(copied, tick, previous, seed, goals))
         return True
 

@@ -23,6 +23,7 @@ from latentplan.planning.objectives import Constraint, Term, apply_view
 from latentplan.planning.plan import Plan
 from latentplan.planning.realtime.planner import PlanBuffer
 from latentplan.planning.search.choices import Choices, read_choices
+from latentplan.planning.search.problem import find_max_change, split_limits
 from latentplan.planning.search.registry import Planner
 from latentplan.planning.search.space import Bounds, read_bounds
 
@@ -132,6 +133,8 @@ class PlanScheduler:
         self._nominals: dict[int, NominalTrajectory] = {}  # by the tick of the plan's first action
         self._last: tuple[int, Plan] | None = None
         self._batch: int | None = None
+        self._limits: list[Tensor] = []  # rate limits among the constraints, each (1,) or (action,)
+        self._action: Tensor | None = None  # of the last tick, (batch, action)
 
     @property
     def latency_ticks(self) -> int:
@@ -144,6 +147,8 @@ class PlanScheduler:
     @torch.no_grad()
     def decide(self, state: State) -> Decision:
         """Returns the decision of this tick, and requests a plan for a later tick.
+
+        Where no plan is due and the policy's action is NaN, the decision is NaN: the caller knows what is safe.
 
         Args:
             state: Believed state of each environment, rows (batch,); a change of the number of rows drops all plans.
@@ -160,6 +165,7 @@ class PlanScheduler:
             action, source = self._act_by_policy(state), "actor"
         else:
             action = self._act_by_plan(state, self.tick, age)
+        self._action = action = self._limit_change(action, state)
         if self.executor.is_idle:
             self._request(state, action)
         self.tick += 1
@@ -168,16 +174,18 @@ class PlanScheduler:
     def set_objective(self, objective: Term | None = None, constraints: Sequence[Constraint] = ()) -> None:
         """Changes the objective and constraints of the next requests; earlier plans are used until new ones arrive.
 
-        For a learned goal (`conditioned`) the goal's policy acts where there is no plan.
+        For a learned goal (`conditioned`) the goal's policy acts where there is no plan. Rate limits hold from the next
+        decision on.
         """
         self.executor.set_objective(objective, constraints)
+        self._limits, _ = split_limits(constraints)
         self._acting, _ = apply_view(self.model, objective)
 
     def reset(self) -> None:
         """Drops all plans, and the plan of the running request when it arrives."""
         self.buffer.clear()
         self._nominals = {}
-        self._requested = self._last = None
+        self._requested = self._last = self._action = None
 
     def _collect(self) -> None:
         """Puts a finished plan, if there is one, into the buffer."""
@@ -237,18 +245,35 @@ class PlanScheduler:
         return self._bounds(state, age).fit_step(nominal.correct(age, state, self._act_by_policy), 0)
 
     def _act_by_policy(self, state: State) -> Tensor:
-        """Returns the policy's mode, or the middle of the bounds without a policy, (batch, action)."""
-        bounds, num = self._bounds(state), count_rows(state)
+        """Returns the policy's mode, or the middle of the bounds without a policy, (rows, action).
+
+        The rows may hold the batch several times, one copy after the other.
+        """
+        bounds = self._bounds(state)
         if supports(self._acting, "policy"):
             return bounds.fit_step(self._acting.policy(state, None), 0)
-        return bounds.fit_step(((bounds.low + bounds.high) / 2)[:, 0].expand(num, -1), 0)
+        return bounds.fit_step(((bounds.low + bounds.high) / 2)[:, 0].expand(count_rows(state), -1), 0)
+
+    def _limit_change(self, action: Tensor, state: State) -> Tensor:
+        """Returns the action, near the last one if there are rate limits; the bounds prevail over the limits."""
+        if not self._limits or self._action is None:
+            return action
+        bounds, last = self._bounds(state), self._action
+        largest = find_max_change(self._limits, bounds)
+        near = torch.clamp(action, last - largest, last + largest)
+        return torch.clamp(torch.where(torch.isnan(last), action, near), bounds.low[:, 0], bounds.high[:, 0])
 
     def _bounds(self, state: State, step: int = 0) -> Bounds:
-        """Returns the bounds of a step of a plan, (1 or batch, 1, action), and its discrete dimensions."""
+        """Returns the bounds of a step of a plan, (1 or rows, 1, action), and its discrete dimensions.
+
+        Rows that hold the batch several times, one copy after the other, have the bounds as often.
+        """
         planner, dtype, device = self.planner, action_dtype(state), state_device(state)
         values = read_choices(getattr(planner, "action_choices", None), planner.action_dim)
         bounds = read_bounds(planner.action_low, planner.action_high, planner.action_dim, values)
         low, high = (bound[:, [min(step, bound.shape[1] - 1)]].to(device, dtype) for bound in bounds)
+        copies = count_rows(state) // max(len(low), len(high)) if max(len(low), len(high)) > 1 else 1
+        low, high = (bound.repeat(copies, 1, 1) if len(bound) > 1 else bound for bound in (low, high))
         return Bounds(low, high, Choices(values, dtype, device) if values else None)
 
 

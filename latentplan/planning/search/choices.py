@@ -16,6 +16,7 @@ from latentplan.planning.search.elites import Elites
 from latentplan.planning.search.products import contract
 
 LEAST_PROBABILITY = 0.02  # of a value, before the sum is made 1, so that no value is excluded for ever
+LEAST_TOGETHER = 0.2  # the most that the least probabilities of all values of a dimension may come to
 SHARE_OF_PREVIOUS = 0.5  # probability of the previous plan's value at a warm start
 
 
@@ -37,6 +38,8 @@ class Choices:
         padded = [[*values[dim], *[float("inf")] * (most - len(values[dim]))] for dim in sorted(values)]
         self._values = torch.tensor(padded, dtype=dtype, device=device)  # (discrete, value)
         self._exists = torch.isfinite(self._values)
+        num_values = self._exists.sum(dim=1, keepdim=True).to(dtype)
+        self._least = (LEAST_TOGETHER / num_values).clamp_max(LEAST_PROBABILITY)  # (discrete, 1)
 
     def start(self, mean: Tensor, is_warm: Tensor) -> Tensor:
         """Returns the probabilities at the start of a search, (batch, length, discrete, value).
@@ -72,7 +75,7 @@ class Choices:
             smoothing: Weight of the new frequencies, in (0, 1].
         """
         frequencies = contract("be,beldv->bldv", elites.weights, self._one_hot(elites.actions))
-        moved = torch.lerp(probabilities, frequencies, smoothing).clamp_min(LEAST_PROBABILITY) * self._exists
+        moved = torch.lerp(probabilities, frequencies, smoothing).clamp_min(self._least) * self._exists
         moved = moved / moved.sum(dim=-1, keepdim=True)
         has_elites = rearrange(elites.weights.sum(dim=1) > 0, "batch -> batch 1 1 1")
         return torch.where(has_elites, moved, probabilities)

@@ -12,6 +12,7 @@ import torch
 NUM_DURATIONS = 32  # durations of a part that count
 QUANTILE = 0.9  # of these durations, the expected one
 PATIENCE = 10  # refusals in a row after which the fastest duration is expected
+ENOUGH = 4  # durations among which one that is usual is expected to be
 ROUNDING = 1.0 + 1e-9  # factor by which a sum of durations may exceed the budget, because sums are rounded
 
 
@@ -20,7 +21,7 @@ class Pace:
 
     The expected duration of a part is the 0.9 quantile of its last 32 durations, and 0 without any. The first duration
     never counts, because it includes lazy initialisation. After 10 refusals in a row the fastest duration is expected,
-    so that one slow search does not exclude a part for ever.
+    and 0 while fewer than four are known, so that one slow search does not exclude a part for ever.
 
     A copy starts without durations, because the copy may run on another machine.
     """
@@ -28,13 +29,14 @@ class Pace:
     def __init__(self) -> None:
         self._durations: dict[Hashable, _Durations] = {}
 
-    def expected(self, key: Hashable) -> float:
-        """Returns the expected duration of a part in seconds, 0 if none is known."""
-        durations = self._durations.get(key)
-        if durations is None or not durations.recent:
+    def expected(self, *keys: Hashable) -> float:
+        """Returns the expected duration of a part in seconds, by the first key of which one is known, 0 without any."""
+        known = [self._durations[key] for key in keys if key in self._durations and self._durations[key].recent]
+        if not known:
             return 0.0
+        durations = known[0]
         if durations.num_refusals >= PATIENCE:
-            return durations.fastest
+            return durations.fastest if len(durations.recent) >= ENOUGH else 0.0
         return sorted(durations.recent)[math.ceil(QUANTILE * (len(durations.recent) - 1))]
 
     def record(self, key: Hashable, seconds: float) -> None:
@@ -60,6 +62,7 @@ class Budget:
     Args:
         pace: Durations of earlier searches; this search adds its own.
         size: Problem size of this search; durations of other sizes are not used.
+        kind: What the search computes; durations of other kinds are used as long as this kind has none.
         clock: Returns the time in seconds.
         started: Time at which the search began.
         seconds: Duration that is allowed; None sets no limit.
@@ -70,12 +73,13 @@ class Budget:
         self,
         pace: Pace,
         size: Hashable,
+        kind: Hashable,
         clock: Callable[[], float],
         started: float,
         seconds: float | None,
         device: torch.device,
     ) -> None:
-        self._pace, self._size, self._clock = pace, size, clock
+        self._pace, self._size, self._kind, self._clock = pace, size, kind, clock
         self._started, self._seconds = started, seconds
         self._is_asynchronous = device.type == "cuda"
         self._device = device
@@ -86,11 +90,11 @@ class Budget:
         if self._seconds is None:
             return True
         elapsed = self._now() - self._started
-        expected = sum(self._pace.expected((part, self._size)) for part in parts)
+        expected = sum(self._pace.expected(*self._keys(part)) for part in parts)
         if elapsed < self._seconds and elapsed + expected <= self._seconds * ROUNDING:
             return True
-        for part in parts:
-            self._pace.refuse((part, self._size))
+        for key in (key for part in parts for key in self._keys(part)):
+            self._pace.refuse(key)
         return False
 
     def lap(self, part: str | None = None) -> None:
@@ -99,8 +103,12 @@ class Budget:
             return  # without a limit no duration is needed, and measuring one would wait for the device
         now = self._now()
         if part is not None:
-            self._pace.record((part, self._size), now - self._lap_started)
+            for key in self._keys(part):
+                self._pace.record(key, now - self._lap_started)
         self._lap_started = now
+
+    def _keys(self, part: str) -> tuple[Hashable, Hashable]:
+        return (part, self._size, self._kind), (part, self._size)
 
     def _now(self) -> float:
         if self._is_asynchronous:

@@ -197,9 +197,12 @@ def _spread(exponents: Tensor) -> Tensor:
     is_finite = torch.isfinite(exponents)
     num = is_finite.sum(dim=1, keepdim=True).clamp_min(1)
     known = exponents.masked_fill(~is_finite, 0.0)
+    tiny = torch.finfo(exponents.dtype).tiny
+    largest = known.abs().amax(dim=1, keepdim=True).clamp_min(tiny)
+    known = known / largest  # whose squares cannot overflow
     mean = known.sum(dim=1, keepdim=True) / num
     var = (known - mean).masked_fill(~is_finite, 0.0).square().sum(dim=1, keepdim=True) / num
-    return var.sqrt().clamp_min(torch.finfo(exponents.dtype).tiny)
+    return (var.sqrt() * largest).clamp_min(tiny)
 
 
 def _weight_exponents(returns: Tensor, violations: Tensor) -> Tensor:

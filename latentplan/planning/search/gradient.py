@@ -120,9 +120,9 @@ def _measure(scorer: Scorer, rows: State, actions: Tensor, scale: Tensor) -> tup
     leaf = actions.detach().requires_grad_()
     scores = scorer.score(rows, leaf[:, None])
     returns = scores.returns[:, 0]
-    if not returns.requires_grad:
+    gradient = torch.autograd.grad(returns.sum(), leaf, allow_unused=True)[0] if returns.requires_grad else None
+    if gradient is None:  # weights that require gradients may be all that the return depends on
         raise ValueError("gradient_steps above 0 needs a model that is differentiable in the action")
-    (gradient,) = torch.autograd.grad(returns.sum(), leaf)
     gradient = torch.nan_to_num(gradient, posinf=0.0, neginf=0.0) * scale  # a row that is not finite is not moved
     slope = gradient / gradient.abs().amax(dim=(1, 2), keepdim=True).clamp_min(torch.finfo(gradient.dtype).tiny)
     violation = torch.zeros_like(returns) if scores.violations is None else scores.violations[:, 0]

@@ -112,9 +112,11 @@ class Search:
     def budget(self, pace: Pace, clock: Callable[[], float], started: float, seconds: float | None) -> Budget:
         """Returns the time that this search may take; see `Budget`."""
         # The speed of a wrapper such as `compile_rollout` depends on the model inside, so both types are in the key.
-        kind = type(self.model), type(getattr(self.model, "model", None))
-        size = (kind, self.batch, self.horizon, self.scorer.num_particles, self.dtype, self.device)
-        return Budget(pace, size, clock, started, seconds, self.device)
+        inner = getattr(self.model, "_model", None) or getattr(self.model, "model", None)
+        models = type(self.model), type(inner)
+        size = (models, self.batch, self.horizon, self.scorer.num_particles, self.dtype, self.device)
+        kind = (*self.scorer.kind, self.view.keep == "states")
+        return Budget(pace, size, kind, clock, started, seconds, self.device)
 
     def run(self, budget: Budget) -> Plan:
         """Returns the plan; the environments in which the previous plan is still valid start from it.
@@ -151,8 +153,8 @@ class Search:
         if progress.elites is not None and options.num_kept:
             kept = space.carry(progress.elites.actions[:, : options.num_kept])
         ones = torch.ones(self.batch, dtype=torch.long)
-        var = space.decode_var(progress.var)
-        return Plan(actions, mean, var, expected, info, kept, ones.bool(), ones, candidates=tuple(iterations))
+        var, is_warm = space.decode_var(progress.var), start.is_warm | progress.has_elites.cpu()
+        return Plan(actions, mean, var, expected, info, kept, is_warm, ones, candidates=tuple(iterations))
 
     def _choose(self, progress: Progress, mean: Tensor, proposals: Tensor | None) -> Choice:
         assert progress.elites is not None

@@ -80,6 +80,25 @@ def split_limits(constraints: Sequence[Constraint]) -> tuple[list[Tensor], list[
     return limits, others
 
 
+def find_max_change(limits: Sequence[Tensor], bounds: Bounds) -> Tensor:
+    """Returns the largest change of an action per step under rate limits, (action,).
+
+    Args:
+        limits: Rate limits, each (1,) or (action,).
+        bounds: Bounds of the actions.
+
+    Raises:
+        ValueError: A limit has another number of dimensions than the actions.
+    """
+    for limit in limits:
+        if len(limit) not in (1, bounds.action_dim):
+            raise ValueError(f"rate_limit is for {len(limit)} dimensions, an action has {bounds.action_dim}")
+    largest = torch.stack([limit.expand(bounds.action_dim) for limit in limits]).amin(dim=0).to(bounds.low)
+    if bounds.choices is None:
+        return largest
+    return largest.index_fill(0, bounds.choices.dims, float("inf"))  # a value is taken or not, so it has no rate
+
+
 def make_space(
     options: SearchOptions,
     bounds: Bounds,
@@ -98,9 +117,7 @@ def make_space(
     """
     max_change = last_action = None
     if limits:
-        max_change = torch.stack([limit.expand(bounds.action_dim) for limit in limits]).amin(dim=0).to(bounds.low)
-        if bounds.choices is not None:  # a value is taken or not, so it has no rate
-            max_change = max_change.index_fill(0, bounds.choices.dims, float("inf"))
+        max_change = find_max_change(limits, bounds)
         last_action = None if find_last_action is None else find_last_action()
     return Space(
         bounds,

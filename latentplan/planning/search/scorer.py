@@ -23,7 +23,15 @@ from latentplan.planning.model import (
     supports,
     take_step,
 )
-from latentplan.planning.objectives import Constraint, Objective, Rollout, Term, as_objective, predicted_return
+from latentplan.planning.objectives import (
+    Constraint,
+    Objective,
+    Rollout,
+    Term,
+    as_objective,
+    name_term,
+    predicted_return,
+)
 from latentplan.planning.search.elites import Scores
 from latentplan.planning.search.space import Bounds
 
@@ -79,6 +87,12 @@ class Scorer:
             term.check(model)
         streams = (generator, find_last_action)
         return cls(model, maximised, violations, discounts, use_continues, penalty, *streams)
+
+    @property
+    def kind(self) -> tuple[str, ...]:
+        """What is computed for each candidate, by name: searches of one kind and size take about as long."""
+        path = "steps" if self._needs_states or self.use_continues else "rollout"
+        return (path, *(name_term(term) for term in (self.objective, *self.constraints)))
 
     @property
     def num_particles(self) -> int:

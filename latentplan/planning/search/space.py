@@ -79,8 +79,8 @@ class Bounds:
     def fit_step(self, actions: Tensor, step: int, num: int = 1) -> Tensor:
         """Returns actions (rows, action) of one step that are allowed, for `num` rows per environment, batch-major."""
         low, high = self.at(step)
-        if num > 1 and len(low) > 1:
-            low, high = (bound.repeat_interleave(num, dim=0) for bound in (low, high))
+        if num > 1:
+            low, high = (bound.repeat_interleave(num, dim=0) if len(bound) > 1 else bound for bound in (low, high))
         fitted = torch.clamp(actions.to(low.dtype), low, high)
         return fitted if self.choices is None else self.choices.snap(fitted)
 
@@ -190,7 +190,8 @@ class Space:
             return actions if self.is_plain else self.clean(actions)
         points = contract("kh,...ha->...ka", self._inverse, actions)
         if self.choices is not None:  # a mean of choices is no choice
-            points = self.choices.join(points, actions[..., self._steps, :])
+            first_held = self._hold.argmax(dim=0)  # the first step of each knot's value
+            points = self.choices.join(points, actions[..., first_held, :])
         return self.clean(points)
 
     def at_points(self, value: Tensor) -> Tensor:

@@ -11,7 +11,13 @@ from latentplan.models.fast import CpuBackend, GpuBackend, accelerate, library, 
 
 ROWS, TIME, ACTION = 70, 4, 3  # three blocks of the compiled rollout, the last one of six rows
 SIZES = ModelConfig(
-    deter_dim=64, hidden_dim=96, latent_dim=32, num_bins=31, encoder_channels=(8, 8, 12), decoder_channels=2
+    deter_dim=64,
+    hidden_dim=96,
+    decoder_width=48,
+    latent_dim=32,
+    num_bins=31,
+    encoder_channels=(8, 8, 12),
+    decoder_channels=2,
 )
 
 FRAME_SEQUENCES = torch.arange(3 * 2 * 64 * 64 * 3).reshape(3, 2, 64, 64, 3).remainder(251).to(torch.uint8)

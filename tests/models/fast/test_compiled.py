@@ -11,7 +11,7 @@ from latentplan.models.fast.rollout import imagine, propose
 from latentplan.models.world_model import WorldModel
 
 ROWS, TIME, ACTION = 70, 4, 3  # three blocks, the last one of six rows
-SIZES = ModelConfig(deter_dim=64, hidden_dim=96, latent_dim=32, num_bins=31)
+SIZES = ModelConfig(deter_dim=64, hidden_dim=96, decoder_width=48, latent_dim=32, num_bins=31)
 
 
 def build(config=SIZES):
@@ -120,7 +120,7 @@ def test_compiled_rollout_accepts_views_and_bfloat16_actions(weights):
 
 
 def test_pack_returns_none_for_other_sizes_and_precisions(weights):
-    odd = ModelConfig(deter_dim=64, hidden_dim=40, latent_dim=32, num_bins=31)
+    odd = ModelConfig(deter_dim=64, hidden_dim=40, decoder_width=20, latent_dim=32, num_bins=31)
     assert weights_of(build(odd)).packed is None
     other = weights._replace(gates=weights.gates.double())
     assert compiled.pack(other, (weights.head, weights.logits, weights.logits_shift)) is None

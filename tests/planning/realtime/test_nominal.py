@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from latentplan.planning import CEMPlanner, FunctionModel, PlanScheduler
+from latentplan.planning import CEMPlanner, FunctionModel, PlanScheduler, rate_limit
 from latentplan.planning.realtime.scheduler import NominalTrajectory
 from tests.planning.realtime.integrator import dynamics, reward
 
@@ -92,3 +92,38 @@ def test_policy_correction_keeps_a_pushed_body_nearer_to_its_goal():
     held, actions = drive(FunctionModel(dynamics, reward, policy=towards_zero), push=0.2)
     assert held < 0.85 * alone
     assert actions.abs().max() <= 1.0
+
+
+def decide(model, planner, states, ticks=6, **settings):
+    """Actions, (tick, batch, action), of a scheduler that plans from the second tick on."""
+    scheduler = PlanScheduler(planner, model, OnePlan(planner, model))
+    if settings:
+        scheduler.executor.set_objective = lambda objective, constraints: None
+        scheduler.set_objective(**settings)
+    return torch.stack([scheduler.decide(states).action for _ in range(ticks)])
+
+
+@pytest.mark.parametrize("bounds", [("low",), ("low", "high")])
+def test_corrected_actions_keep_the_bounds_of_each_environment(bounds):
+    low, high = torch.tensor([-0.2, -0.4])[:, None, None], torch.tensor([0.1, 0.3])[:, None, None]
+    options = {"action_low": low} | ({"action_high": high} if "high" in bounds else {})
+    planner = CEMPlanner(action_dim=1, horizon=4, num_samples=32, num_elites=4, **options)
+    actions = decide(FunctionModel(dynamics, reward, policy=linear), planner, START)
+    assert (actions >= low[:, 0] - 1e-6).all() and (actions <= (high if "high" in bounds else low + 9)[:, 0]).all()
+
+
+def test_rate_limit_holds_between_policy_plans_and_corrections():
+    """The state never becomes what the model predicts, so that the policy corrects every action."""
+    planner = CEMPlanner(action_dim=1, horizon=4, num_samples=32, num_elites=4)
+    model = FunctionModel(dynamics, reward, policy=linear)
+    actions = decide(model, planner, START, objective=None, constraints=[rate_limit(0.1)])
+    assert (actions.diff(dim=0).abs() <= 0.1 + 1e-6).all()
+    assert (decide(model, planner, START).diff(dim=0).abs() > 0.1 + 1e-6).any()
+
+
+def test_scheduler_steps_a_model_that_requires_a_generator():
+    def noisy(state, action, generator):
+        return state + action + 0.01 * torch.randn(state.shape, generator=generator)
+
+    planner = CEMPlanner(action_dim=1, horizon=4, num_samples=32, num_elites=4)
+    assert torch.isfinite(decide(FunctionModel(noisy, reward, policy=linear), planner, START)).all()

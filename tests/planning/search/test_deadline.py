@@ -124,7 +124,7 @@ def test_fallback_plan_has_every_diagnostic(warm, model, state):
     planner, _ = warm
     constraints = [lambda rollout: rollout.actions[:, 0, 0]]
     full = planner.plan(model, state, constraints=constraints)
-    none = planner.plan(model, state, constraints=constraints, deadline_ms=1)
+    none = planner.plan(model, state, constraints=constraints, deadline_ms=0)
     assert none.info.keys() == full.info.keys()
     assert none.info["elite_return"].shape == (2, 0) and none.info["violation"].isnan().all()
 
@@ -188,6 +188,29 @@ def test_pace_tries_again_after_a_single_slow_iteration(make, model, state):
     iterations = [int(planner.plan(model, state, deadline_ms=15).info["iterations"][0]) for _ in range(400)]
     assert iterations[0] == 0 and 1 in iterations[:12]
     assert all(iterations[-50:])
+
+
+def test_pace_tries_again_when_every_known_duration_of_a_part_was_slow(make, model, state):
+    planner = make(num_iterations=4, final="better")  # which part ends a search is recorded once for each search
+    for rollout_ms in (1.0, 100.0):
+        model.rollout_ms = rollout_ms
+        planner.plan(model, state, deadline_ms=20)
+    model.rollout_ms = 1.0
+    iterations = [int(planner.plan(model, state, deadline_ms=20).info["iterations"][0]) for _ in range(300)]
+    assert iterations[0] == 0 and all(iterations[-50:])
+
+
+def test_pace_keeps_durations_by_objective(make, model, state, clock):
+    def slow_goal(rollout):
+        clock.seconds += 0.04
+        return rollout.rewards.sum(dim=1)
+
+    planner = make()
+    for objective in (None, None, slow_goal, slow_goal):
+        planner.plan(model, state, objective=objective)
+    assert planner.plan(model, state, deadline_ms=60).info["iterations"].tolist() == [6, 6]
+    spent, plan = spent_ms(clock, lambda: planner.plan(model, state, objective=slow_goal, deadline_ms=100))
+    assert spent <= 100 and plan.info["iterations"].tolist() == [2, 2]
 
 
 def test_deadline_counts_from_the_call(warm, make, model, state, clock):

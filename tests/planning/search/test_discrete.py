@@ -28,6 +28,17 @@ def test_search_finds_the_best_value_of_every_step(make_planner, seeded, options
     torch.testing.assert_close(plan.info["probabilities"].sum(dim=-1), torch.ones(3, 6, 1))
 
 
+@pytest.mark.parametrize("num_values", [5, 50, 1000])
+def test_probability_gathers_at_the_best_of_many_values(make_planner, seeded, num_values):
+    """The best value is 0.7; neighbours are almost as good, so that the search can come closer step by step."""
+    values = torch.linspace(0.0, 1.0, num_values).tolist()
+    model = still(lambda state, action: -(action[:, 0] - 0.7).abs())
+    planner = make_planner(action_dim=1, horizon=1, action_choices=values, num_samples=256, num_iterations=10)
+    plan = planner.plan(model, torch.zeros(1, 1), generator=seeded())
+    near = (torch.tensor(values) - 0.7).abs() <= 0.06
+    assert plan.info["probabilities"][0, 0, 0][near].sum() > 0.7
+
+
 @pytest.mark.parametrize(
     "options",
     [

@@ -6,7 +6,14 @@ import pickle
 import pytest
 import torch
 
-from latentplan.planning import BackgroundPlanner, CEMPlanner, FunctionModel, ModelPredictiveController, check_model
+from latentplan.planning import (
+    BackgroundPlanner,
+    CEMPlanner,
+    FunctionModel,
+    ModelPredictiveController,
+    check_model,
+    compile_rollout,
+)
 from latentplan.planning.search.purity import FirstSearches
 
 
@@ -103,6 +110,37 @@ def test_rollout_that_samples_takes_the_generator_too(make_planner, seeded):
 
     plans = [make_planner().plan(Rollout(), torch.zeros(2, 1), generator=seeded()) for _ in range(2)]
     assert torch.equal(plans[0].actions, plans[1].actions)
+
+
+class NoisyNetwork(torch.nn.Module):
+    def forward(self, state, action, generator=None):
+        return noisy_step(state, action, generator)
+
+
+def test_module_that_samples_is_given_the_generator(states, make_planner, seeded):
+    model = FunctionModel(NoisyNetwork(), lambda state, action: -state.square().sum(dim=1))
+    plans = [make_planner().plan(model, states[:, :2], generator=seeded()) for _ in range(2)]
+    assert torch.equal(plans[0].actions, plans[1].actions)
+
+
+def test_compile_rollout_refuses_a_model_that_samples():
+    with pytest.raises(ValueError, match="a model that does not sample"):
+        compile_rollout(FunctionModel(noisy_step, lambda state, action: -state.square().sum(dim=1)))
+
+
+def test_search_after_one_that_found_nothing_finite_is_as_long_as_a_cold_one(states, make_planner, seeded):
+    is_broken = [True]
+
+    def reward(state, action):
+        return -state.square().sum(dim=1) * (float("nan") if is_broken else 1.0)
+
+    planner = dataclasses.replace(make_planner(num_iterations=6), warm_start_iterations=2)
+    model = FunctionModel(lambda state, action: state + 0.1 * action, reward)
+    plan = planner.plan(model, states[:, :2], generator=seeded())
+    assert plan.info["is_fallback"].all() and not plan.is_warm.any()
+    is_broken.clear()
+    plan = planner.plan(model, states[:, :2], plan, generator=seeded())
+    assert plan.info["iterations"].tolist() == [6] * 5 and plan.is_warm.all()
 
 
 @dataclasses.dataclass

@@ -327,6 +327,17 @@ def test_actions_stay_within_bounds_when_rounded(seeded):
         assert plan.actions.min() >= torch.tensor(1.2) and plan.actions.max() <= torch.tensor(1.7)
 
 
+def test_gradient_steps_refuse_a_return_that_the_action_does_not_reach(make_planner):
+    embedding = torch.nn.Embedding(3, 1)
+
+    def reward(state, action):
+        return embedding(action[:, 0].long().clamp(0, 2))[:, 0]
+
+    model = FunctionModel(lambda state, action: state, reward)
+    with pytest.raises(ValueError, match="differentiable in the action"):
+        make_planner(gradient_steps=2).plan(model, torch.zeros(2, 1))
+
+
 def test_gradient_steps_keep_the_result_when_refinement_is_nan(seeded):
     model = FunctionModel(
         lambda state, action: state,

@@ -53,6 +53,15 @@ def test_refit_keeps_the_distribution_when_no_return_is_finite(temperature):
     torch.testing.assert_close(var, VAR)
 
 
+@pytest.mark.parametrize("low", [-1e15, -1e25, -1e38])
+def test_refit_weighs_returns_whose_squares_overflow(low):
+    """Where dynamics diverge, one return may be lower than the others by many powers of ten."""
+    returns = torch.tensor([1.0, 2.0, low, float("nan")])
+    candidates, mean, var = CANDIDATES.float(), MEAN.float(), VAR.float()
+    new_mean, _ = refit(candidates, returns, mean, var, num_elites=4, smoothing=1.0, temperature=0.1)
+    torch.testing.assert_close(new_mean, candidates[:2].mean(dim=0))
+
+
 def test_refit_ignores_a_nan_action_without_finite_return():
     candidates = CANDIDATES.clone()
     candidates[3] = float("nan")

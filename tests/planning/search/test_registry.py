@@ -61,7 +61,9 @@ def shooting(monkeypatch):
 def make_agent(**settings):
     torch.manual_seed(0)
     config = Config(
-        model=ModelConfig(deter_dim=24, hidden_dim=32, num_bins=11, encoder_channels=(8, 8), decoder_channels=4),
+        model=ModelConfig(
+            deter_dim=24, hidden_dim=32, decoder_width=16, num_bins=11, encoder_channels=(8, 8), decoder_channels=4
+        ),
         planner=PlannerConfig(**SIZES | settings),
     )
     return PlanningAgent(WorldModel(config.model, action_dim=2).eval(), config, discount=0.99, seed=0)

@@ -14,6 +14,8 @@ from latentplan.planning import (
     rate_limit,
     smoothness_penalty,
 )
+from latentplan.planning.plan import shift_plan
+from latentplan.planning.search.choices import Choices
 from latentplan.planning.search.space import Bounds, Space
 
 
@@ -95,6 +97,17 @@ def test_bounds_per_environment_give_each_the_plan_it_has_alone(point, states, m
         torch.testing.assert_close(together.actions[row], alone.actions[0], atol=1e-4, rtol=0)
 
 
+@pytest.mark.parametrize("bounds", [("low",), ("high",), ("low", "high")])
+def test_bounds_per_environment_hold_for_a_policy_too(point, states, make_planner, seeded, bounds):
+    given = {"low": torch.linspace(-1.0, -0.2, 5)[:, None, None], "high": torch.linspace(0.1, 1.0, 5)[:, None, None]}
+    options = {f"action_{name}": given[name].expand(5, 1, 2) for name in bounds}
+    planner = make_planner(num_policy_samples=4, tail="policy", **options)
+    plan = planner.plan(point, states, generator=seeded())
+    plan = planner.plan(point, states, plan, generator=seeded())
+    low, high = (options.get(f"action_{name}", torch.tensor(limit)) for name, limit in (("low", -1.0), ("high", 1.0)))
+    assert (plan.actions >= low - 1e-6).all() and (plan.actions <= high + 1e-6).all()
+
+
 def test_bounds_are_refused_when_they_do_not_fit(recorder, make_planner):
     with pytest.raises(ValueError, match="low is for 2 environments and 1 steps, the plan for 3 and 6"):
         make_planner(action_low=torch.full((2, 1, 2), -1.0)).plan(recorder, torch.zeros(3, 1))
@@ -125,6 +138,27 @@ def test_spline_decodes_what_it_encodes_and_holds_a_constant(spline):
         torch.testing.assert_close(space.encode(actions), knots, atol=1e-4, rtol=0)
     constant = torch.full((1, 10, 2), 0.7)
     torch.testing.assert_close(space.decode(space.encode(constant)), constant, atol=1e-5, rtol=0)
+
+
+@pytest.mark.parametrize(("horizon", "num_knots"), [(5, 4), (7, 5), (10, 7), (15, 11), (6, 6), (12, 3)])
+def test_spline_of_choices_decodes_what_it_encodes(horizon, num_knots):
+    choices = Choices({0: (0.0, 1.0, 2.0)}, torch.float32, torch.device("cpu"))
+    bounds = Bounds(torch.zeros(1, 1, 1), torch.full((1, 1, 1), 2.0), choices)
+    space = Space(bounds, horizon, spline="linear", num_knots=num_knots)
+    knots = torch.randint(3, (4, 6, num_knots, 1), generator=torch.Generator().manual_seed(0)).float()
+    torch.testing.assert_close(space.encode(space.decode(knots)), knots)
+
+
+def test_plan_on_another_device_is_moved_to_the_search():
+    rest = torch.empty(1, 4, 2, device="meta")
+    same = {"fit": lambda given: given, "policy_tail": lambda given, _: given}
+    shifted = shift_plan(Plan.around(torch.zeros(4, 2)), rest=rest, tail="hold", **same)
+    assert shifted.mean.device.type == "meta" and shifted.mean.shape == (1, 4, 2)
+
+
+def test_rate_limit_of_another_number_of_dimensions_is_refused(recorder, make_planner):
+    with pytest.raises(ValueError, match="rate_limit is for 3 dimensions, an action has 2"):
+        make_planner().plan(recorder, torch.zeros(3, 1), constraints=[rate_limit([0.1, 0.2, 0.3])])
 
 
 def test_linear_spline_bends_at_its_knots_only_and_zero_spline_jumps_there(recorder, make_planner, seeded):
