@@ -143,12 +143,7 @@ class Search:
             stopped = "deadline" if is_late else stopped
         actions, expected, violation = choice
         info = {**progress.describe(history, stopped), "is_policy": torch.zeros_like(progress.has_elites)}
-        if violation is not None:
-            info["violation"] = violation
-        if pause is not None:
-            info |= {"gradient_pause": pause.length, "gradient_wait": pause.left}
-        if progress.probabilities is not None:
-            info["probabilities"] = progress.probabilities
+        info |= _describe_rest(progress, violation, pause)
         kept = None
         if progress.elites is not None and options.num_kept:
             kept = space.carry(progress.elites.actions[:, : options.num_kept])
@@ -188,9 +183,10 @@ class Search:
         if not self.space.is_plain:
             actions = self.space.decode(self.space.encode(actions))
         progress = self._begin(self._encode(shifted))
+        unknown = torch.full_like(progress.expected_return, float("nan")) if self.scorer.constraints else None
+        pause = self._pause() if self.options.gradient_steps else None
         info = {**progress.describe([], "deadline"), "is_policy": is_policy}
-        if self.scorer.constraints:
-            info["violation"] = torch.full_like(progress.expected_return, float("nan"))
+        info |= _describe_rest(progress, unknown, pause)
         ones = torch.ones(self.batch, dtype=torch.long)
         elites, is_warm = shifted.elites, shifted.is_warm
         mean, var = self.space.decode(progress.mean), self.space.decode_var(progress.var)
@@ -434,6 +430,18 @@ class Search:
 
     def _per_step(self, value: Tensor, name: str) -> Tensor:
         return fit_steps(value, name, self.batch, self.horizon).to(dtype=self.dtype, device=self.device)
+
+
+def _describe_rest(progress: Progress, violation: Tensor | None, pause: Pause | None) -> dict[str, Tensor]:
+    """Returns the diagnostics that a plan has only with constraints, gradient steps or discrete actions."""
+    info: dict[str, Tensor] = {}
+    if violation is not None:
+        info["violation"] = violation
+    if pause is not None:
+        info |= {"gradient_pause": pause.length, "gradient_wait": pause.left}
+    if progress.probabilities is not None:
+        info["probabilities"] = progress.probabilities
+    return info
 
 
 def _ignore_nan_actions(candidates: Tensor, scores: Scores) -> Scores:

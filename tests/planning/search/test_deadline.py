@@ -129,6 +129,16 @@ def test_fallback_plan_has_every_diagnostic(warm, model, state):
     assert none.info["elite_return"].shape == (2, 0) and none.info["violation"].isnan().all()
 
 
+@pytest.mark.parametrize("options", [{"gradient_steps": 2}, {"action_choices": 3}])
+def test_fallback_plan_has_the_diagnostics_of_its_options(make, model, state, options):
+    planner = make(**options)
+    full = planner.plan(model, state)
+    none = planner.plan(model, state, full, deadline_ms=0)
+    assert none.info.keys() == full.info.keys()
+    if "gradient_steps" in options:
+        assert torch.equal(none.info["gradient_wait"], full.info["gradient_wait"])
+
+
 def test_fallback_plan_keeps_warm_and_cold_environments_apart(warm, model, state):
     planner, last = warm
     plan = planner.plan(model, state, last.forget(torch.tensor([True, False])), deadline_ms=1)
