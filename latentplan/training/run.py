@@ -27,7 +27,8 @@ from latentplan.config.env_id import as_file_name, repeat_flag
 from latentplan.config.files import dump_config, read_config
 from latentplan.config.origin import present_facts
 from latentplan.config.run_folder import RUN_FILE, SAVES_FOLDER, lock_folder, read_run_config, run_saves
-from latentplan.config.run_results import METRICS_FILE, note_state, read_facts
+from latentplan.config.run_results import FINAL_FILE, METRICS_FILE, note_state, read_facts
+from latentplan.config.writing import write_whole
 from latentplan.envs import default_task
 from latentplan.models import WorldModel
 from latentplan.models.fast import accelerate
@@ -408,7 +409,7 @@ class _Run:
         returns, page = self.ranks.lead(lambda: self._evaluate_last(film))
         summary = {mode: float(np.mean(values)) for mode, values in returns.items()}
         info = clocks | {"final_evaluation": returns}
-        self.ranks.lead(lambda: (self.folder / "final.json").write_text(json.dumps(info | summary, indent=1)))
+        self.ranks.lead(lambda: write_whole(self.folder / FINAL_FILE, json.dumps(info | summary, indent=1)))
         save.save_agent("last", self.learner.averaged, info)
         done = f"{clocks['env_frames']:,} frames" if clocks["env_frames"] else f"{clocks['updates']:,} updates"
         self.console.console.print(

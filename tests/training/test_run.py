@@ -1,7 +1,9 @@
 """Whole tiny runs: results, files, repeatability and errors."""
 
+import errno
 import shutil
 import warnings
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -10,7 +12,7 @@ import torch
 from latentplan.agents.checkpoint import load_agent, read_info
 from latentplan.config import UserError
 from latentplan.config.run_folder import lock_folder
-from latentplan.config.run_results import find_state, read_facts
+from latentplan.config.run_results import find_state, read_evaluations, read_facts
 from latentplan.training import resume, train
 from latentplan.training.callbacks import COLUMNS
 from tests.training.run_folder import list_saves, read_epochs, read_rows, read_state, seal
@@ -110,6 +112,22 @@ def test_train_refuses_folders_in_use(finished, tiny, dot, tmp_path):
     with lock_folder(tmp_path), pytest.raises(UserError, match="another process learns"):
         train(tiny(tmp_path), dot)
     assert not (tmp_path / "config.yaml").exists()
+
+
+def test_final_results_are_written_as_a_whole_or_not_at_all(tiny, dot, tmp_path, monkeypatch):
+    write = Path.write_text
+
+    def fill_the_disk(path, text, *rest, **options):
+        if "final.json" in path.name:
+            write(path, text[:20], *rest, **options)
+            raise OSError(errno.ENOSPC, "No space left on device", str(path))
+        return write(path, text, *rest, **options)
+
+    monkeypatch.setattr(Path, "write_text", fill_the_disk)
+    with pytest.raises(UserError, match="has stopped: No space left on device"):
+        train(tiny(tmp_path / "run"), dot)
+    assert not list((tmp_path / "run").glob("*final.json*"))
+    assert read_evaluations(tmp_path / "run")
 
 
 def test_train_refuses_a_run_without_budget(tiny, dot, tmp_path):
