@@ -38,7 +38,7 @@ from latentplan.replay.disk import Counts, ReplayFiles, count_saved
 from latentplan.training.callbacks import Collect, Record, agree_on_signals, copy_weights
 from latentplan.training.checks import check_folder, check_settings
 from latentplan.training.collection.collector import Description, EnvFactory
-from latentplan.training.collection.crew import Worker, make_worker
+from latentplan.training.collection.crew import Worker, check_memory, make_worker
 from latentplan.training.collection.episodes import Stopped, to_arrays
 from latentplan.training.collection.keeping import refuse_used_folder
 from latentplan.training.collection.process import WorkerEnded
@@ -320,6 +320,7 @@ class _Run:
         self.curriculum = Curriculum(config, model.labels, self.state)
         self.learner = make_learner(model, config, self.description.discount, self.replay, self.curriculum, ranks)
         if save is not None and saved is not None:
+            check_memory(saved.memory, config, self.folder)
             self.files.read(save) if dealt is None else dealt.fill(self.replay)
             restore_learner(self.learner, saved.learner, self.folder)
             if ranks.is_first:

@@ -168,6 +168,16 @@ def test_resume_names_damaged_files_in_one_line(damage, message, finished, dot, 
     assert "\n" not in str(caught.value)
 
 
+def test_resume_refuses_other_environments_than_those_of_the_running_episodes(finished, dot, tmp_path):
+    folder = shutil.copytree(finished.run_dir, tmp_path / "run")
+    text = (folder / "config.yaml").read_text()
+    (folder / "config.yaml").write_text(text.replace("num_envs: 1", "num_envs: 2"))
+    with pytest.warns(RuntimeWarning, match="num_envs from 1 to 2"):
+        with pytest.raises(UserError, match=r"env\.num_envs in .*config\.yaml no longer fit") as caught:
+            resume(folder, make_env=dot)
+    assert "\n" not in str(caught.value)
+
+
 def test_resume_asks_for_the_users_environment(finished):
     with pytest.raises(UserError, match="with make_env"):
         resume(finished.run_dir)
