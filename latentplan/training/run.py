@@ -297,7 +297,8 @@ class _Run:
             model = WorldModel(config.model, facts.action_dim, facts.labels, spaces=facts.spaces).to(self.device)
         accelerate(model)
         replay_device = self.device if config.replay.on_device else torch.device("cpu")
-        saved_rows, dealt = Counts(0, 0, count_rows(self.demonstrations, ranks.rank, ranks.size)), None
+        recorded = count_rows(self.demonstrations, config.learning.sequence_length, ranks.rank, ranks.size)
+        saved_rows, dealt = Counts(0, 0, recorded), None
         if save is not None:
             if (before := count_ranks(save)) != ranks.size:
                 dealt = DealtRows(save, ranks.rank, ranks.size)
