@@ -132,8 +132,9 @@ class ReplayConfig:
     """The replay buffer.
 
     Attributes:
-        capacity: Collected decisions kept; None keeps the whole run where its length in frames is known, else 200,000
-            decisions, and never fewer than a resumed run already holds.
+        capacity: Collected decisions kept; None keeps the whole run where its length in frames is known and its
+            episodes have 20 decisions or more on average (where they are shorter, the oldest decisions are dropped),
+            else 200,000 decisions, and never fewer than a resumed run already holds.
         on_device: Whether frames are stored on the training device instead of in main memory.
         demonstrations: Recorded episodes that a new run starts with: files and folders of `collection.keep_episodes`,
             folders of Minari datasets and of LeRobot datasets (v3). They stay in replay for the whole run, beside
