@@ -91,7 +91,12 @@ class Request(ComputeRequest):
             if self.mode != "gated":
                 raise UserError(f"--planning-budget has no effect in mode {self.mode}; use --mode gated")
         if self.keep_episodes is not None:
-            for flag, value in {"--control-hz": self.control_hz, "--objective": self.objective}.items():
+            changes = {
+                "--control-hz": self.control_hz,
+                "--objective": self.objective,
+                "--constraint": self.constraint,
+            }
+            for flag, value in changes.items():
                 if value is not None:
                     raise UserError(
                         f"--keep-episodes cannot be given with {flag}, which changes its actions or rewards"

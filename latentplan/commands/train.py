@@ -106,5 +106,7 @@ def resolve(request: Request) -> Config:
         changes = dict.fromkeys(BUDGETS) | changes
     try:
         return replace(saved, run=replace(saved.run, **changes))
+    except UserError:  # of settings that contradict each other, which it names in full
+        raise
     except ValueError as error:
         raise UserError(f"run.{error}") from None

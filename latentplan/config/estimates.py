@@ -19,7 +19,6 @@ DEVICE_FLOATS_PER_S = 2e15  # operations of a graphics processor in a second
 STEP_S = 1e-6  # one step of a rollout of any size
 LONGEST_DECISION_S = 60.0
 MEMORY_SHARE = 0.9
-_PATCHES = 256  # of a frame of 64 x 64 pixels
 _FLOAT = 4  # bytes
 
 

@@ -132,8 +132,9 @@ class ReplayConfig:
     """The replay buffer.
 
     Attributes:
-        capacity: Collected decisions kept; None keeps the whole run where its length in frames is known, else 200,000
-            decisions, and never fewer than a resumed run already holds.
+        capacity: Collected decisions kept; None keeps the whole run where its length in frames is known and its
+            episodes have 20 decisions or more on average (where they are shorter, the oldest decisions are dropped),
+            else 200,000 decisions, and never fewer than a resumed run already holds.
         on_device: Whether frames are stored on the training device instead of in main memory.
         demonstrations: Recorded episodes that a new run starts with: files and folders of `collection.keep_episodes`,
             folders of Minari datasets and of LeRobot datasets (v3). They stay in replay for the whole run, beside
@@ -182,7 +183,8 @@ class RunConfig:
         seed: Seed of every random stream of the run.
         device: Device to learn on; `auto` takes CUDA where it is usable.
         threads: CPU threads for each half of an update (model and behaviour learn in parallel), in [1, 1024]; None
-            divides all cores but one between the halves and leaves one to collection.
+            leaves one core to each collection process that works beside the updates, and divides the others between
+            the halves of all learning processes of the machine.
         run_dir: Folder of the run; None makes `runs/<domain>-<task>-seed<seed>-<date>`.
         logger: Trackers that get scalars and films: tensorboard, csv, wandb, trackio, mlflow.
         devices: Learning processes of a node: one for each GPU or, on a CPU, as many as you like. They share each

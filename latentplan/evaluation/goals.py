@@ -113,10 +113,17 @@ class ScoredEnv(gymnasium.Wrapper[Any, Any, Any, Any]):
             on_objective: Called with the present objective when an episode begins and when the objective changes.
 
         Raises:
-            UserError: The environment does not report true quantities.
+            UserError: The environment does not report true quantities, or a goal image cannot be compared with its
+                frames, which show several cameras.
         """
         if not hasattr(env, "record_quantities"):
             raise UserError("goals are scored by true quantities, which this environment does not report")
+        images = [path for phase in goals.phases for path in _goal_image_paths(phase.objective)]
+        if images and env.spaces.cameras > 1:
+            raise UserError(
+                f"a goal image shows one camera, and the frames of this environment show {env.spaces.cameras}: name "
+                "quantities instead"
+            )
         super().__init__(env)
         self._suite_env, self.substeps_per_decision = env, env.substeps_per_decision
         env.record_quantities = True
@@ -125,9 +132,7 @@ class ScoredEnv(gymnasium.Wrapper[Any, Any, Any, Any]):
         self.clauses: list[tuple[str, bool]] = []
         self._on_objective = on_objective
         self._names = tuple(scales(env.domain))
-        self._pictures = {
-            path: read_goal_image(path) for phase in goals.phases for path in _goal_image_paths(phase.objective)
-        }
+        self._pictures = {path: read_goal_image(path, env.spaces.frame_size) for path in images}
         self._reported_phase: Phase | None = None
         self._num_frames = self._num_violated = 0
         self._totals = np.zeros(len(self._names))
@@ -230,7 +235,8 @@ def score_env(env: SuiteEnv, goals: Goals, planner: Any | None) -> ScoredEnv:
         planner: A planning agent, which then pursues the goals; None for an agent that does not plan.
 
     Raises:
-        UserError: The environment does not report true quantities, or the agent does not predict a quantity of a goal.
+        UserError: The environment does not report true quantities, the agent does not predict a quantity of a goal, or
+            a goal image cannot be compared with the frames.
     """
     if planner is None:
         return ScoredEnv(env, goals)

@@ -78,6 +78,8 @@ def filming(
 ) -> Iterator[Callable[[Moment], None]]:
     """Films the first episode inside the `with` block, in real time if the environment tells its frame rate.
 
+    An episode that is played again, after a fault of the environment, is filmed anew.
+
     Args:
         path: Path of the film, `.mp4` or `.webm`; the file is created when the block ends without an error.
         env: The environment of the episode; its method `render_large`, where it exists, renders the pictures.
@@ -95,6 +97,9 @@ def filming(
         def film(moment: Moment) -> None:
             if moment.episode > 0 or (moment.decision % every and moment.action is not None):
                 return
+            if moment.decision == 0 and films:  # the episode is played again, after a fault
+                stack.pop_all()  # the writer is not to finish its film
+                films.pop().discard()
             picture = _compose(moment, env, planner, goals)
             if not films:
                 fps = float(env.unwrapped.metadata.get("render_fps") or DEFAULT_FPS)

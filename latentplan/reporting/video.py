@@ -75,6 +75,11 @@ class VideoWriter:
         finally:
             self._partial.unlink(missing_ok=True)
 
+    def discard(self) -> None:
+        """Gives the film up, and deletes what was written of it."""
+        self._writer.release()
+        self._partial.unlink(missing_ok=True)
+
     def write(self, frame: Frame) -> None:
         """Appends one RGB frame, uint8 (height, width, 3).
 

@@ -21,6 +21,9 @@ UPDATE_S = 1e-3  # of the smallest update
 def count_replay_rows(config: Config, num_saved: int = 0) -> int:
     """Rows of the replay for collection: `replay.capacity`, or else enough for everything that the run collects.
 
+    Everything fits where episodes have 20 decisions or more on average, or `collection.episode_decisions` if these are
+    fewer: each episode takes one row more than it has decisions.
+
     Of several learning processes, each has a replay for its share. A run that collects nothing has one row for each
     environment, so that it may collect when it resumes.
 

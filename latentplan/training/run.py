@@ -27,7 +27,8 @@ from latentplan.config.env_id import as_file_name, repeat_flag
 from latentplan.config.files import dump_config, read_config
 from latentplan.config.origin import present_facts
 from latentplan.config.run_folder import RUN_FILE, SAVES_FOLDER, lock_folder, read_run_config, run_saves
-from latentplan.config.run_results import METRICS_FILE, note_state, read_facts
+from latentplan.config.run_results import FINAL_FILE, METRICS_FILE, note_state, read_facts
+from latentplan.config.writing import write_whole
 from latentplan.envs import default_task
 from latentplan.models import WorldModel
 from latentplan.models.fast import accelerate
@@ -37,7 +38,7 @@ from latentplan.replay.disk import Counts, ReplayFiles, count_saved
 from latentplan.training.callbacks import Collect, Record, agree_on_signals, copy_weights
 from latentplan.training.checks import check_folder, check_settings
 from latentplan.training.collection.collector import Description, EnvFactory
-from latentplan.training.collection.crew import Worker, make_worker
+from latentplan.training.collection.crew import Worker, check_memory, make_worker
 from latentplan.training.collection.episodes import Stopped, to_arrays
 from latentplan.training.collection.keeping import refuse_used_folder
 from latentplan.training.collection.process import WorkerEnded
@@ -296,7 +297,8 @@ class _Run:
             model = WorldModel(config.model, facts.action_dim, facts.labels, spaces=facts.spaces).to(self.device)
         accelerate(model)
         replay_device = self.device if config.replay.on_device else torch.device("cpu")
-        saved_rows, dealt = Counts(0, 0, count_rows(self.demonstrations, ranks.rank, ranks.size)), None
+        recorded = count_rows(self.demonstrations, config.learning.sequence_length, ranks.rank, ranks.size)
+        saved_rows, dealt = Counts(0, 0, recorded), None
         if save is not None:
             if (before := count_ranks(save)) != ranks.size:
                 dealt = DealtRows(save, ranks.rank, ranks.size)
@@ -319,6 +321,7 @@ class _Run:
         self.curriculum = Curriculum(config, model.labels, self.state)
         self.learner = make_learner(model, config, self.description.discount, self.replay, self.curriculum, ranks)
         if save is not None and saved is not None:
+            check_memory(saved.memory, config, self.folder)
             self.files.read(save) if dealt is None else dealt.fill(self.replay)
             restore_learner(self.learner, saved.learner, self.folder)
             if ranks.is_first:
@@ -408,7 +411,7 @@ class _Run:
         returns, page = self.ranks.lead(lambda: self._evaluate_last(film))
         summary = {mode: float(np.mean(values)) for mode, values in returns.items()}
         info = clocks | {"final_evaluation": returns}
-        self.ranks.lead(lambda: (self.folder / "final.json").write_text(json.dumps(info | summary, indent=1)))
+        self.ranks.lead(lambda: write_whole(self.folder / FINAL_FILE, json.dumps(info | summary, indent=1)))
         save.save_agent("last", self.learner.averaged, info)
         done = f"{clocks['env_frames']:,} frames" if clocks["env_frames"] else f"{clocks['updates']:,} updates"
         self.console.console.print(

@@ -71,6 +71,8 @@ def run(request: Request) -> int:
 
     device = torch.device(device_name)
     model, config, discount = _load_model(request, composed, device)
+    if model.spaces.vector_dim:
+        raise UserError(f"decide shows random pictures alone, and {request.checkpoint} was trained with env.vectors")
     arms = {
         name: measure_decisions(agent, batch, decisions) for name, agent in _agents(model, config, discount).items()
     }
@@ -105,7 +107,8 @@ def measure_decisions(agent: Agent, batch: int, decisions: int) -> dict[str, Any
 
     from latentplan.evaluation.statistics import latency_percentiles
 
-    shape = (64, 64, 3) if batch == 1 else (batch, 64, 64, 3)
+    shape: tuple[int, ...] = agent.model.spaces.frame_shape  # type: ignore[attr-defined]
+    shape = shape if batch == 1 else (batch, *shape)
     rng, milliseconds = np.random.default_rng(0), []
     agent.reset()
     for index in range(WARM_UP_DECISIONS + decisions):
@@ -159,7 +162,7 @@ class ExportedActor:
         self._past: tuple[torch.Tensor, ...] | None = None
 
     def act(self, frame: Any) -> np.ndarray:
-        """The action for frames uint8 (64, 64, 3) or (batch, 64, 64, 3)."""
+        """The action for frames uint8 (height, width, 3 * camera), or (batch, ...) of them."""
         import torch
 
         frames = torch.from_numpy(frame).view(-1, *frame.shape[-3:])

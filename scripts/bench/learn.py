@@ -206,6 +206,10 @@ def _train(run: TrainingRun) -> None:
     previous = signal.signal(signal.SIGINT, signal.SIG_IGN)  # the run gets Ctrl-C too, and saves its state
     try:
         code = training.wait()
+    except BaseException:  # such as the exit that a SIGTERM causes
+        training.terminate()  # the run saves its state
+        training.wait()
+        raise
     finally:
         signal.signal(signal.SIGINT, previous)
     if code == 130:

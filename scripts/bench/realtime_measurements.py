@@ -113,17 +113,18 @@ def measure_error(trial: Trial) -> Iterator[Row]:
 
 def _record_episode(agent: Any, env: SuiteEnv, seed: int) -> tuple[list[Any], list[np.ndarray], list[float]]:
     """Beliefs of an episode, the action at each belief, and the reward that followed the action."""
+    from latentplan.evaluation.episodes import see
     from latentplan.models.symmetry import first_turn
 
     beliefs, actions, rewards = [], [], []
     agent.reset()
-    frame, _ = env.reset(seed=seed)
-    is_over = False
+    seen, is_over = see(*env.reset(seed=seed)), False
     while not is_over:
-        action = agent.act(frame)
+        action = agent.act(seen)
         beliefs.append(first_turn(agent.state))
         actions.append(action)
-        frame, reward, terminated, truncated, _ = env.step(action)
+        frame, reward, terminated, truncated, info = env.step(action)
+        seen = see(frame, info)
         rewards.append(reward)
         is_over = terminated or truncated
     return beliefs, actions, rewards

@@ -91,8 +91,8 @@ def time_saves(config: Config, request: Request, folder: Path) -> dict[str, Any]
     rng = np.random.default_rng(0)
 
     def add(count: int) -> None:
-        for _ in range(-(-count // 500)):
-            size = min(count, 500)
+        for start in range(0, count, 500):
+            size = min(count - start, 500)
             replay.add(
                 0,
                 Rows(
@@ -137,7 +137,7 @@ def time_guards(config: Config, request: Request) -> dict[str, Any]:
     rng, size = np.random.default_rng(0), config.learning
     guarded = Learner._descend
 
-    def unguarded(learner: Learner, half: int, loss: Tensor, rows: Tensor) -> Tensor:
+    def unguarded(learner: Learner, half: int, loss: Tensor, parts: dict[str, Tensor], rows: Tensor) -> Tensor:
         optimizer = learner._optimizers()[half]
         optimizer.found_inf = None  # type: ignore[attr-defined]
         norm = clipped_gradient(optimizer, loss, size.max_grad_norm)

@@ -20,9 +20,7 @@ from latentplan.config.checks import above_zero, at_least
 from latentplan.config.parsing import option, raise_unknown
 
 if TYPE_CHECKING:
-    import numpy as np
-
-    from latentplan.agents.base import Agent
+    from latentplan.agents.base import Agent, Seen
 
 MODES = ("actor", "gated", "background", "planner")
 IDLE = "no-op"
@@ -52,7 +50,7 @@ class Tally:
 class IdleAgent:
     """Does nothing; misses deadlines only because of the machine."""
 
-    def act(self, frame: np.ndarray) -> None:
+    def act(self, frame: Seen) -> None:
         """Does nothing."""
 
     def reset(self) -> None:
@@ -125,7 +123,7 @@ def run(request: Request) -> int:
 
 def take_turns(
     agents: Mapping[str, Any],
-    frames: Sequence[np.ndarray],
+    frames: Sequence[Seen],
     control_hz: float,
     decisions: int,
     block: int,
@@ -135,7 +133,7 @@ def take_turns(
 
     Args:
         agents: Agents by name.
-        frames: Frames uint8 (64, 64, 3), repeated in a cycle.
+        frames: What agents see, as `Agent.act` takes it, repeated in a cycle.
         control_hz: Decisions per second.
         decisions: Number of due decisions of each agent.
         block: Number of due decisions of one agent before the next agent takes over.
@@ -150,9 +148,7 @@ def take_turns(
             time.sleep(PAUSE_SECONDS)
 
 
-def play_block(
-    agent: Agent | IdleAgent, frames: Sequence[np.ndarray], control_hz: float, due: int, tally: Tally
-) -> None:
+def play_block(agent: Agent | IdleAgent, frames: Sequence[Seen], control_hz: float, due: int, tally: Tally) -> None:
     """Decides at the period boundaries of the wall clock; a boundary is missed if the agent is still busy."""
     period = 1.0 / control_hz
     began = time.perf_counter() + period
@@ -212,20 +208,20 @@ def soak_table(rows: Mapping[str, dict[str, Any]]) -> str:
     return format_table(header, lines)
 
 
-def _record_frames(checkpoint: Path, device: str) -> list[np.ndarray]:
-    """Frames of an episode of the actor, uint8 (64, 64, 3) each."""
+def _record_frames(checkpoint: Path, device: str) -> list[Seen]:
+    """What the actor sees in an episode: frames uint8 (height, width, 3 * camera), with vectors where it sees some."""
     from latentplan.agents.checkpoint import load_agent, load_model
     from latentplan.envs import make_env
+    from latentplan.evaluation.episodes import see
 
     _, config, _ = load_model(checkpoint)
     agent = load_agent(checkpoint, mode="actor", device=device)
     env = make_env(config.env)
     try:
-        frame, _ = env.reset(seed=0)
-        frames, over = [frame], False
+        frames, over = [see(*env.reset(seed=0))], False
         while len(frames) < NUM_FRAMES and not over:
-            frame, _, terminated, truncated, _ = env.step(agent.act(frame))
-            frames.append(frame)
+            frame, _, terminated, truncated, info = env.step(agent.act(frames[-1]))
+            frames.append(see(frame, info))
             over = terminated or truncated
         return frames
     finally:

@@ -120,6 +120,16 @@ def test_eval_refuses_bad_flags_in_one_line(assert_refused, checkpoint, flags, w
     assert_refused(["eval", "--checkpoint", checkpoint, *flags], *words)
 
 
+@pytest.mark.parametrize(
+    "flags", [("--constraint", "cart < 0.5"), ("--objective", "cart -> 0.5"), ("--control-hz", "20")]
+)
+def test_eval_keeps_no_episodes_of_another_world_or_aim(assert_refused, checkpoint, tmp_path, flags):
+    kept = tmp_path / "kept"
+    words = f"--keep-episodes cannot be given with {flags[0]}"
+    assert_refused(["eval", "--checkpoint", checkpoint, "--keep-episodes", kept, *flags], words)
+    assert not kept.exists()
+
+
 def test_eval_refuses_a_missing_checkpoint(assert_refused, checkpoint):
     assert_refused(["eval", "--episodes", "1"], "flag --checkpoint is missing; give the folder of a trained agent")
     assert_refused(["eval", "--checkpoint", checkpoint.with_name("bets")], "bets", checkpoint)

@@ -1,10 +1,12 @@
 """The command line of a training run: its settings, the changes that a resumed run accepts, and errors."""
 
+from dataclasses import replace
+
 import pytest
 
 from latentplan.commands.flags import read_request
 from latentplan.commands.train import SHORT_FLAGS, Request, resolve
-from latentplan.config import Config
+from latentplan.config import CollectionConfig, Config, ReplayConfig, RunConfig, UserError
 from latentplan.config.files import compose, dump_config
 from latentplan.config.run_folder import RUN_FILE, run_saves
 
@@ -109,6 +111,19 @@ def test_train_refuses_bad_files_in_one_line(text, expected, assert_refused, tmp
     path = tmp_path / "mine.yaml"
     path.write_text(text)
     assert_refused(["train", "--config", path], expected.replace("{path}", str(path)))
+
+
+def test_resume_names_a_setting_once_when_settings_contradict_each_other(assert_refused, tmp_path):
+    offline = replace(
+        Config(),
+        collection=CollectionConfig(enabled=False),
+        replay=ReplayConfig(demonstrations=("episodes",)),
+        run=RunConfig(updates=9),
+    )
+    save_settings(offline, tmp_path)
+    with pytest.raises(UserError, match=r"^run\.frames counts"):
+        resolve(read_request(Request, ["--resume", str(tmp_path), "--frames", "100"]))
+    assert_refused(["train", "--resume", tmp_path, "--frames", "100"], "error: run.frames counts")
 
 
 def test_resume_refuses_bad_changes(assert_refused, tmp_path):

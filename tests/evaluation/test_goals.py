@@ -1,7 +1,9 @@
 """Goals given after training: scores come from the simulator, and planning agents pursue the goals."""
 
+import contextlib
 import functools
 import json
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -151,6 +153,29 @@ def test_scored_env_scores_goal_images_by_the_cameras_frame(env, tmp_path):
     other.reset(seed=3)
     other.step(np.zeros(1))
     assert max(other.objective_scores) < min(scored.objective_scores)
+
+
+def make_picture(path):
+    cv2.imwrite(str(path), np.full((64, 64, 3), 90, np.uint8))
+    return f"goal:{path}"
+
+
+@pytest.mark.parametrize("size", [84, 128])
+def test_scored_env_reads_a_goal_image_at_the_size_of_the_frames(tmp_path, size):
+    goals = read_goals(make_picture(tmp_path / "goal.png"), None, "cartpole")
+    with contextlib.closing(make_env(replace(ENV, frame_size=size))) as env:
+        scored = ScoredEnv(env, goals)
+        scored.reset(seed=3)
+        scored.step(np.zeros(1))
+    assert len(scored.objective_scores) == 100 and 0.0 < min(scored.objective_scores) <= 1.0
+
+
+def test_scored_env_refuses_a_goal_image_where_frames_hold_several_cameras(tmp_path):
+    image = make_picture(tmp_path / "goal.png")
+    with contextlib.closing(make_env(replace(ENV, cameras=("0", "1")))) as env:
+        with pytest.raises(UserError, match="goal image shows one camera, and the frames of this environment show 2"):
+            ScoredEnv(env, read_goals(f"cart > 0; 500: {image}", None, "cartpole"))
+        ScoredEnv(env, read_goals("cart > 0", None, "cartpole"))
 
 
 @pytest.mark.parametrize("mode", ["planner", "gated", "background", "actor", "random"])

@@ -12,6 +12,7 @@ import pytest
 import yaml
 
 from latentplan.config import Config, EnvConfig, EvaluationConfig, PlannerConfig, from_dict, to_dict
+from latentplan.config.earlier import ADDED
 from latentplan.config.spaces import Spaces
 from latentplan.evaluation.statistics import confidence_interval
 from latentplan.reporting.card import (
@@ -119,6 +120,13 @@ def test_planner_of_another_search_is_left_out():
     info = INFO | {"distilled": distilled | {"planner": to_dict(PlannerConfig(horizon=3))}}
     assert means(info) == {"actor": 2.0}
     assert means(info, replace(CONFIG, planner=PlannerConfig(horizon=3))) == {"planner": 3.0, "actor": 2.0}
+
+
+def test_planner_of_a_search_that_an_earlier_version_saved_is_that_of_its_agent():
+    """An earlier version knew no later settings, neither of the agent nor of the search that labelled."""
+    earlier = {name: value for name, value in to_dict(CONFIG.planner).items() if name not in ADDED["planner"]}
+    distilled = {"kept_round": None, "returns_after": [2.0], "returns_planner": [3.0], "planner": earlier}
+    assert means(INFO | {"distilled": distilled}, from_dict({"planner": earlier})) == {"planner": 3.0, "actor": 2.0}
 
 
 @pytest.mark.parametrize("damaged", [[], [1.0, "2"], [math.nan], [10**400], [[1.0]], "10", {"a": 1}, None, 3.0])

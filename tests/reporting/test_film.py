@@ -53,6 +53,15 @@ def test_filming_films_the_first_episode_only(tmp_path):
     assert len(frames) == 3
 
 
+@pytest.mark.parametrize("every", [1, 2])
+def test_filming_begins_anew_when_the_first_episode_is_played_again(tmp_path, every):
+    played = [moment(0), moment(1), moment(2), moment(3, action=None)]
+    aborted = [[moment(0), moment(1)], [moment(0)]]  # by faults of the environment
+    _, frames = film_of(tmp_path / "film.mp4", SharpEnv(), None, [*sum(aborted, []), *played], every)
+    _, expected = film_of(tmp_path / "whole.mp4", SharpEnv(), None, played, every)
+    assert len(frames) == len(expected) and {path.name for path in tmp_path.iterdir()} == {"film.mp4", "whole.mp4"}
+
+
 def test_filming_uses_the_frame_rate_of_the_environment(tmp_path):
     capture, _ = film_of(tmp_path / "film.mp4", SharpEnv(), None, [moment(0)])
     assert round(capture.get(cv2.CAP_PROP_FPS), 2) == 12.5

@@ -13,6 +13,7 @@ from latentplan import envs
 from latentplan.agents.checkpoint import save_checkpoint
 from latentplan.config import Config, EnvConfig, LearningConfig, ModelConfig, PlannerConfig
 from latentplan.config.quantities import scales
+from latentplan.config.spaces import Spaces
 from latentplan.models import WorldModel
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "scripts"))
@@ -77,11 +78,11 @@ def config():
 
 @pytest.fixture(scope="session")
 def save_agent(config):
-    """A function that saves an untrained agent, with changes of its environment, and returns the folder."""
+    """A function that saves an untrained agent, with its spaces and changes of its environment; returns the folder."""
 
-    def save(folder, **changes):
+    def save(folder, spaces=None, **changes):
         torch.manual_seed(0)
-        model = WorldModel(config.model, 1, scales("cartpole"))
+        model = WorldModel(config.model, 1, scales("cartpole"), spaces=spaces or Spaces())
         info = {"domain": "cartpole", "task": "swingup", "env_frames": 1234, "discount": 0.9, "metrics": {}}
         save_checkpoint(folder, model, replace(config, env=replace(config.env, **changes)), info)
         return folder

@@ -23,6 +23,7 @@ from latentplan.agents.actor import ActorAgent
 from latentplan.agents.planning import PlanningAgent
 from latentplan.commands.flags import list_flags
 from latentplan.config import PlannerConfig, UserError
+from latentplan.config.spaces import Spaces
 from latentplan.models import WorldModel
 
 CPU = torch.device("cpu")
@@ -198,6 +199,20 @@ def test_measure_decisions_counts_the_model_steps_of_a_warm_search(config):
     assert steps == 3 * (2 * (8 - 2) + 2 + 2)
     assert measure_decisions(PlanningAgent(model, config, 0.9), batch=3, decisions=1)["model_steps"] == steps
     assert measure_decisions(ActorAgent(model, config), batch=1, decisions=2)["model_steps"] == 0
+
+
+@pytest.mark.parametrize("batch", [1, 3])
+def test_measure_decisions_shows_frames_of_the_agents_own_shape(config, batch):
+    model = WorldModel(config.model, action_dim=1, spaces=Spaces(frame_size=84, cameras=2))
+    for agent in (actor := ActorAgent(model, config), ExportedActor(actor)):
+        assert measure_decisions(agent, batch, decisions=1)["decision_ms"]["p50"] > 0.0
+
+
+def test_decide_refuses_an_agent_that_sees_vectors_in_one_line(save_agent, tmp_path, capsys):
+    save_agent(tmp_path, Spaces(vector_dim=2), vectors=("velocity",))
+    assert benchmark.main(["decide", "--checkpoint", str(tmp_path), "--device", "cpu"]) == 2
+    error = capsys.readouterr().err
+    assert error.startswith("error: ") and error.count("\n") == 1 and "decide shows random pictures" in error
 
 
 def test_compile_times_each_model_stepped_and_compiled(tmp_path, monkeypatch, capsys):

@@ -2,6 +2,7 @@
 
 import csv
 import json
+import signal
 from dataclasses import replace
 
 import benchmark
@@ -9,9 +10,9 @@ import numpy as np
 import pytest
 from bench.anchors import TASK_GROUPS
 from bench.estimates import interquartile_estimate, mean_estimate
-from bench.learn import compare, first_reaching, read_run, run_facts
+from bench.learn import _train, compare, first_reaching, read_run, run_facts
 from bench.learn_plot import MARKERS, Curve, Point
-from bench.runs import check_same
+from bench.runs import TrainingRun, check_same
 
 from latentplan.config import Config, EnvConfig, PlannerConfig, RunConfig, UserError
 from latentplan.config.files import dump_config
@@ -75,6 +76,31 @@ def test_learn_collects_finished_runs_without_repeating_them(tmp_path, capsys):
     assert (tmp_path / "curves.png").stat().st_size > 0
     printed = capsys.readouterr().out
     assert "not repeated" in printed and "EfficientZero V2" in printed
+
+
+@pytest.mark.parametrize("ending", [SystemExit(143), RuntimeError()])
+def test_learn_leaves_no_run_behind_when_it_ends(tmp_path, monkeypatch, ending):
+    """SIGTERM ends a command by SystemExit; the run gets a SIGTERM too, and saves itself before the command ends."""
+    calls = []
+
+    class Training:
+        def __init__(self, command):
+            self.endings = [ending]
+
+        def wait(self):
+            calls.append("wait")
+            if self.endings:
+                raise self.endings.pop()
+            return 143
+
+        def terminate(self):
+            calls.append("terminate")
+
+    monkeypatch.setattr("bench.learn.subprocess.Popen", Training)
+    before = signal.getsignal(signal.SIGINT)
+    with pytest.raises(type(ending)):
+        _train(TrainingRun("walker-walk", 0, tmp_path, ("--frames", "100")))
+    assert calls == ["wait", "terminate", "wait"] and signal.getsignal(signal.SIGINT) == before
 
 
 def test_check_same_refuses_a_folder_with_other_settings(tmp_path):

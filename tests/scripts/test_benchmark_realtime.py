@@ -10,6 +10,8 @@ from bench.realtime import PARTS, part_table
 from bench.realtime_measurements import AGENTS, ITERATIONS, REPLAN_EVERY
 from bench.soak import IDLE, IdleAgent, Tally, play_block, soak_rows, soak_table, take_turns
 
+from latentplan.config.spaces import Spaces
+
 FRAMES = [np.zeros((64, 64, 3), np.uint8)] * 10
 
 
@@ -84,6 +86,15 @@ def test_realtime_measures_the_chosen_parts_only(tmp_path, checkpoint):
     flags = ["--parts", "error", "--episodes", "1", "--device", "cpu", "--json", str(path)]
     assert benchmark.main(["realtime", "--checkpoint", str(checkpoint), *flags]) == 0
     assert set(PARTS) & json.loads(path.read_text()).keys() == {"error"}
+
+
+def test_soak_and_realtime_show_an_agent_the_vectors_that_it_has_learned_to_see(save_agent, tmp_path, monkeypatch):
+    monkeypatch.setattr("bench.soak.PAUSE_SECONDS", 0.0)
+    agent = save_agent(tmp_path / "agent", Spaces(vector_dim=2), vectors=("velocity",))
+    where = ["--checkpoint", str(agent), "--device", "cpu"]
+    soak = ["--mode", "actor", "--control-hz", "200", "--decisions", "4", "--block", "2"]
+    assert benchmark.main(["soak", *where, *soak]) == 0
+    assert benchmark.main(["realtime", *where, "--parts", "error", "--episodes", "1"]) == 0
 
 
 def test_soak_counts_every_agent_beside_an_idle_one(tmp_path, checkpoint, capsys, monkeypatch):

@@ -1,7 +1,9 @@
 """Whole tiny runs: results, files, repeatability and errors."""
 
+import errno
 import shutil
 import warnings
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -10,7 +12,7 @@ import torch
 from latentplan.agents.checkpoint import load_agent, read_info
 from latentplan.config import UserError
 from latentplan.config.run_folder import lock_folder
-from latentplan.config.run_results import find_state, read_facts
+from latentplan.config.run_results import find_state, read_evaluations, read_facts
 from latentplan.training import resume, train
 from latentplan.training.callbacks import COLUMNS
 from tests.training.run_folder import list_saves, read_epochs, read_rows, read_state, seal
@@ -112,6 +114,22 @@ def test_train_refuses_folders_in_use(finished, tiny, dot, tmp_path):
     assert not (tmp_path / "config.yaml").exists()
 
 
+def test_final_results_are_written_as_a_whole_or_not_at_all(tiny, dot, tmp_path, monkeypatch):
+    write = Path.write_text
+
+    def fill_the_disk(path, text, *rest, **options):
+        if "final.json" in path.name:
+            write(path, text[:20], *rest, **options)
+            raise OSError(errno.ENOSPC, "No space left on device", str(path))
+        return write(path, text, *rest, **options)
+
+    monkeypatch.setattr(Path, "write_text", fill_the_disk)
+    with pytest.raises(UserError, match="has stopped: No space left on device"):
+        train(tiny(tmp_path / "run"), dot)
+    assert not list((tmp_path / "run").glob("*final.json*"))
+    assert read_evaluations(tmp_path / "run")
+
+
 def test_train_refuses_a_run_without_budget(tiny, dot, tmp_path):
     with pytest.raises(UserError, match="give --frames, --minutes or --updates"):
         train(tiny(tmp_path / "endless", run={"frames": None}), dot)
@@ -146,6 +164,16 @@ def test_resume_names_damaged_files_in_one_line(damage, message, finished, dot, 
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         with pytest.raises(UserError, match=message) as caught:
+            resume(folder, make_env=dot)
+    assert "\n" not in str(caught.value)
+
+
+def test_resume_refuses_other_environments_than_those_of_the_running_episodes(finished, dot, tmp_path):
+    folder = shutil.copytree(finished.run_dir, tmp_path / "run")
+    text = (folder / "config.yaml").read_text()
+    (folder / "config.yaml").write_text(text.replace("num_envs: 1", "num_envs: 2"))
+    with pytest.warns(RuntimeWarning, match="num_envs from 1 to 2"):
+        with pytest.raises(UserError, match=r"env\.num_envs in .*config\.yaml no longer fit") as caught:
             resume(folder, make_env=dot)
     assert "\n" not in str(caught.value)
 

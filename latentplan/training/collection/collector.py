@@ -56,8 +56,8 @@ class Collected:
         rows: Rows of each environment in the order of time, one entry per lane of the replay.
         env_frames: Simulator control steps taken in this round.
         decisions: Actions chosen in this round, over all environments.
-        episode_returns: Returns of the episodes that ended in this round, without those that were cut short unless all
-            are.
+        episode_returns: Returns of the episodes that ended in this round, without the short ones unless all are short.
+            A short episode that ended before its cut is left out too.
         memory: State of the collector after this round, from which `Collector.restore` continues.
         fault: The fault after which no restart was left, and which ended the round early; None in a whole round.
     """
@@ -419,7 +419,7 @@ class Collector:
         for lane in np.flatnonzero(self._has_ended & ~failed):
             last_frame, last_labels = self._frames[lane].copy(), self._labels[lane].copy()  # a restart overwrites both
             log.finish(int(lane), last_frame, last_labels)
-            if not self._episodes.was_cut[lane] or self.config.collection.short_share == 1.0:
+            if not self._episodes.is_short[lane] or self.config.collection.short_share == 1.0:
                 log.returns.append(float(self._returns[lane]))
 
 

@@ -14,7 +14,8 @@ from typing import Any
 import numpy as np
 import torch
 
-from latentplan.config import CollectionConfig, Config, EnvironmentFault
+from latentplan.config import CollectionConfig, Config, EnvironmentFault, UserError
+from latentplan.config.run_folder import RUN_FILE
 from latentplan.replay.buffer import Rows
 from latentplan.training.cluster import join_cluster
 from latentplan.training.collection.collector import Collected, EnvFactory
@@ -332,7 +333,7 @@ def make_worker(
         kind = LocalWorker if config.run.num_ranks == 1 else PatientWorker
         return kind(config, make_user_env, str(device), should_stop)
     threads = choose_collector_threads(device, collection.workers)
-    if collection.backend == "process" and collection.workers == 1:
+    if _is_alone(collection):
         return RemoteWorker(config, make_user_env, threads, should_stop)
     if collection.backend == "ray":
         join_cluster(config.run.ray_address, collection.workers)
@@ -348,10 +349,39 @@ def make_worker(
     return Crew(workers, collection, should_stop)
 
 
+def check_memory(memory: dict[str, Any] | None, config: Config, folder: Path) -> None:
+    """Refuses running episodes of other workers or environments than the settings have.
+
+    Args:
+        memory: `Collected.memory` of the last save; None before the first round.
+        config: Settings of the run, which a user may have edited since.
+        folder: Folder of the run, for the error message.
+
+    Raises:
+        UserError: The episodes cannot go on with these settings.
+    """
+    if memory is None:
+        return
+    is_crew, settings = "members" in memory, config.collection
+    members = memory["members"] if is_crew else [memory]
+    sizes = {len(member["episodes"]) for member in members if member is not None}
+    is_same_kind = is_crew == (settings.overlap and not _is_alone(settings))
+    if not is_same_kind or len(members) != settings.workers or not sizes <= {config.env.num_envs}:
+        raise UserError(
+            f"collection.workers, collection.backend and env.num_envs in {folder / RUN_FILE} no longer fit the running "
+            "episodes of the last save: give them the values that they had there, or start a new run"
+        )
+
+
 def end_episodes(memory: dict[str, Any]) -> dict[str, Any]:
     """The state of a collector as `Collected.memory` holds it, without its running episodes."""
     records = [record | {"actions": record["actions"][:0]} for record in memory["episodes"]]
     return memory | {"episodes": records, "has_ended": np.ones_like(memory["has_ended"])}
+
+
+def _is_alone(settings: CollectionConfig) -> bool:
+    """Whether one process on this machine collects, which needs no crew."""
+    return settings.backend == "process" and settings.workers == 1
 
 
 def _concatenate(parts: Sequence[Rows]) -> Rows:

@@ -43,8 +43,7 @@ class Episodes:
     ) -> None:
         self.envs, self.seed, self.keeper = envs, seed, keeper
         self._cut, self._short_share = cut, short_share
-        self.was_cut = np.zeros(envs.num_envs, dtype=bool)  # by the latest step
-        self._is_short = np.zeros(envs.num_envs, dtype=bool)
+        self.is_short = np.zeros(envs.num_envs, dtype=bool)  # of the latest episode of each environment
         self._played = np.zeros((envs.num_envs, 2), dtype=np.int64)  # decisions of whole and of short episodes
         self._begun = [0] * envs.num_envs  # episodes so far, of each environment
         self._actions: list[list[np.ndarray]] = [[] for _ in range(envs.num_envs)]
@@ -64,7 +63,7 @@ class Episodes:
             self._begun[lane] += 1
             self._actions[lane].clear()
             whole, short = self._played[lane]
-            self._is_short[lane] = short < self._short_share * (whole + short) or self._short_share == 1.0
+            self.is_short[lane] = short < self._short_share * (whole + short) or self._short_share == 1.0
         return self._reset(where)
 
     def step(self, actions: np.ndarray) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
@@ -72,10 +71,9 @@ class Episodes:
         for record, action in zip(self._actions, actions, strict=True):
             record.append(np.array(action))
         frames, rewards, terminated, truncated, info = self._step(actions)
-        self._played[np.arange(len(self._played)), self._is_short.astype(int)] += 1
+        self._played[np.arange(len(self._played)), self.is_short.astype(int)] += 1
         is_long = np.array([len(record) >= self._cut for record in self._actions])
-        self.was_cut = self._is_short & is_long & ~(terminated | truncated)
-        truncated = truncated | self.was_cut
+        truncated = truncated | (self.is_short & is_long & ~terminated)
         if self.keeper is not None:
             for lane in np.flatnonzero((terminated | truncated) & ~info["failed"]).tolist():
                 self.keeper.write(lane, self._begun[lane])
@@ -98,7 +96,7 @@ class Episodes:
                 "frame": zlib.crc32(frame.tobytes()),
             }
             for begun, is_short, played, record, frame, over in zip(
-                self._begun, self._is_short.tolist(), self._played, self._actions, frames, has_ended, strict=True
+                self._begun, self.is_short.tolist(), self._played, self._actions, frames, has_ended, strict=True
             )
         ]
 
@@ -113,7 +111,7 @@ class Episodes:
             environment has repeated its episode, bool (env,).
         """
         self._begun = [record["begun"] for record in records]
-        self._is_short = np.array([record.get("is_short", False) for record in records])  # earlier saves have none
+        self.is_short = np.array([record.get("is_short", False) for record in records])  # earlier saves have none
         self._played = np.array([record["played"].tolist() if "played" in record else (0, 0) for record in records])
         actions = [record["actions"].numpy() for record in records]
         lengths = np.array([len(taken) for taken in actions])

@@ -10,6 +10,7 @@ from latentplan.config import UserError
 
 FLAG = "--replay.demonstrations"
 SUFFIX = ".hdf5"  # of this project's episode files
+BELOW = ("", "worker-*/", "rank-*/", "rank-*/worker-*/")  # folders of one run's workers and processes
 METADATA = "metadata.json"  # of a Minari dataset
 SIGNATURE = b"\x89HDF\r\n\x1a\n"  # of an HDF5 file
 INFO = "meta/info.json"  # of a LeRobot dataset
@@ -40,8 +41,8 @@ def find_recordings(names: Iterable[str]) -> list[Recorded]:
 
 
 def list_episode_files(folder: Path) -> list[Path]:
-    """The episode files of a folder, in the order of their names."""
-    return sorted(folder.glob(f"*{SUFFIX}"))
+    """The episode files of a folder in the order of their names, then those of other workers and processes below it."""
+    return [path for below in BELOW for path in sorted(folder.glob(f"{below}*{SUFFIX}"))]
 
 
 def _find(path: Path) -> Recorded:

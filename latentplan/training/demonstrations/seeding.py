@@ -46,29 +46,42 @@ def read_demonstrations(config: Config, make_user_env: EnvFactory | None) -> lis
     return fit_all(recordings, target, config.learning.sequence_length)
 
 
-def count_rows(recordings: Sequence[FittedRecording], rank: int = 0, size: int = 1) -> int:
+def count_rows(recordings: Sequence[FittedRecording], sequence_length: int, rank: int = 0, size: int = 1) -> int:
     """Rows of the episodes that one of several learning processes gets: one for each frame.
 
+    Args:
+        recordings: The recordings.
+        sequence_length: Decisions of a training sequence, which every process has to find in an episode of its own.
+        rank: Number of the process.
+        size: Number of processes.
+
     Raises:
-        UserError: There are fewer episodes than processes.
+        UserError: There are fewer episodes of that length than processes.
     """
-    lengths = [length for recording in recordings for length in recording.lengths if length > 0]
-    if lengths and len(lengths) < size:
+    lengths = [length for recording in recordings for length in recording.lengths]
+    num_long = sum(length >= sequence_length for length in lengths)
+    if recordings and num_long < size:
         raise UserError(
-            f"replay.demonstrations hold {len(lengths)} episodes that are long enough, fewer than the {size} processes "
-            "of run.devices x run.nodes, of which each gets its own"
+            f"replay.demonstrations hold {num_long} episodes of at least learning.sequence_length ({sequence_length}) "
+            f"decisions, fewer than the {size} processes of run.devices x run.nodes, of which each gets its own"
         )
-    return sum(length + 1 for length in lengths[rank::size])
+    return sum(recording.lengths[index] + 1 for recording, index in _deal(recordings, rank, size))
 
 
 def seed_replay(replay: Replay, recordings: Sequence[FittedRecording], rank: int = 0, size: int = 1) -> None:
-    """Adds all episodes to the replay's lane of recorded rows, in order; of several processes, each gets every size-th.
+    """Adds all episodes to the replay's lane of recorded rows, in order; of several processes, each gets its share.
 
     Raises:
         UserError: An episode is damaged.
     """
+    for recording, index in _deal(recordings, rank, size):
+        replay.add(replay.num_lanes - 1, recording.read(index))
+
+
+def _deal(recordings: Sequence[FittedRecording], rank: int, size: int) -> list[tuple[FittedRecording, int]]:
+    """The episodes of one process, in order: every size-th from the longest on, so that each process gets long ones."""
     episodes = [
         (recording, index) for recording in recordings for index, length in enumerate(recording.lengths) if length > 0
     ]
-    for recording, index in episodes[rank::size]:
-        replay.add(replay.num_lanes - 1, recording.read(index))
+    by_length = sorted(range(len(episodes)), key=lambda place: -episodes[place][0].lengths[episodes[place][1]])
+    return [episodes[place] for place in sorted(by_length[rank::size])]

@@ -29,7 +29,7 @@ from latentplan.agents.checkpoint import load_model, read_info, resolve_checkpoi
 from latentplan.agents.planning import PlanningAgent
 from latentplan.config import USER_DOMAIN, DistillConfig, PlannerConfig, UserError, derive_seed, to_dict
 from latentplan.config.commit import Saves
-from latentplan.config.earlier import drop_removed
+from latentplan.config.earlier import saved_planner
 from latentplan.config.env_id import choose_env, repeat_flag
 from latentplan.config.run_folder import SAVES_FOLDER, lock_folder, require_saves
 from latentplan.envs import make_env, make_from
@@ -114,7 +114,7 @@ def resume_distillation(
         raise UserError(f"{saved['source']} is not the agent from which the distillation in {folder} started")
     settings = DistillConfig(**saved["settings"])
     settings = replace(settings, rounds=rounds or settings.rounds, minutes=minutes or settings.minutes)
-    planner = PlannerConfig(**drop_removed("planner", saved["planner"]))
+    planner = saved_planner(saved["planner"])
     run = _Distillation(Path(saved["source"]), Path(folder), settings, planner, device, make_env, env)
     run.load(saved)
     return run.run()

@@ -153,8 +153,7 @@ def _learn(run: Path, folder: Path, settings: GoalsConfig, device: str, saved: d
     """
     source = resolve_checkpoint(run)
     model, config, info = load_model(source, device)
-    if not model.goal_names:
-        raise UserError(f"the agent of {run} was trained without named quantities, so there are no goals to learn")
+    _refuse_agent(run, model)
     model.requires_grad_(False)
     line, signals = StatusLine(), Signals(raise_interrupt)
     try:
@@ -201,6 +200,22 @@ def _learn(run: Path, folder: Path, settings: GoalsConfig, device: str, saved: d
             return Result(folder, exit_code(signals.received), {})
         line.print(f"agent: {folder}")
     return Result(folder, 0, {"worth": worth})
+
+
+def _refuse_agent(run: Path, model: WorldModel) -> None:
+    """Raises UserError for an agent that cannot learn goals."""
+    if not model.goal_names:
+        raise UserError(f"the agent of {run} was trained without named quantities, so there are no goals to learn")
+    if model.has_choices:
+        raise UserError(
+            f"{run} has discrete actions, and goals are learned for continuous actions only: let the planner pursue "
+            "them (--objective)"
+        )
+    if model.spaces.vector_dim:
+        raise UserError(
+            f"{run} was trained with env.vectors, and goals are learned from pictures alone, without env.vectors: let "
+            "the planner pursue them (--objective)"
+        )
 
 
 def _make_learner(

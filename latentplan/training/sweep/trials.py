@@ -19,7 +19,7 @@ from latentplan.config import Config, UserError, make_folder
 from latentplan.config.extras import MissingExtra, import_extra
 from latentplan.config.files import Layer, compose, dump_config
 from latentplan.config.run_folder import run_saves
-from latentplan.config.run_results import FINAL_FILE, Evaluation, find_state, is_locked, read_evaluations
+from latentplan.config.run_results import Evaluation, find_state, is_locked, read_evaluations
 from latentplan.config.writing import write_whole
 from latentplan.training.child_run import ChildRun, last_line
 from latentplan.training.cluster import join_cluster
@@ -237,7 +237,7 @@ def run_trial(values: dict[str, Any], sweep: Sweep) -> None:
             for each in found[max(0, reported) :]:
                 spent = min(each.env_frames, budget - 1)  # a trial with its whole budget ends by itself
                 tune.report({"planner": each.planner, "env_frames": each.env_frames, "spent": spent})
-            reported = len(found)
+            reported = max(reported, len(found))  # a file that cannot be read now hides those that were reported
             if code is not None:
                 break
             time.sleep(POLL_S)
@@ -250,7 +250,7 @@ def _training(sweep: Sweep, folder: Path, settings: Path) -> Iterator[ChildRun |
     """The process of a run, which saves itself and ends with the context; None where the run has ended before."""
     while is_locked(folder):  # by a process of an earlier start that still saves itself
         time.sleep(POLL_S)
-    if (folder / FINAL_FILE).exists():
+    if find_state(folder)[0] == "finished":
         yield None
         return
     words = ["--config", str(settings), "--run-dir", str(folder)]

@@ -40,7 +40,7 @@ def read_places(frames):
 
 
 def test_collector_returns_rows_that_obey_the_dynamics_of_the_environment(make_collector):
-    collected = make_collector().collect(None, "random", 45, 0)
+    collected = make_collector(collection={"short_share": 0.0}).collect(None, "random", 45, 0)
     (rows,) = collected.rows
     assert len(rows.frames) == 47  # each frame once; the last frames of two episodes have no action
     assert (collected.decisions, collected.env_frames, len(collected.episode_returns)) == (45, 45, 2)
@@ -98,6 +98,19 @@ def test_collector_cuts_episodes_for_a_share_of_the_decisions(make_collector, sh
     assert short.sum() == num_short and lengths[short].sum() / lengths.sum() == pytest.approx(share, abs=0.06)
     num_returns = sum(len(collected.episode_returns) for collected in rounds)
     assert num_returns - (~short).sum() in (0, 1)  # the last one may be whole and just over
+
+
+def test_collector_reports_returns_by_the_kind_of_an_episode_not_by_its_outcome(make_collector, dot):
+    """An episode that ends before its cut counts no more than one that lives to be cut, or the mean would be lower."""
+
+    class Ending(dot):
+        def step(self, action):
+            picture, reward, _, truncated, info = super().step(action)
+            return picture, reward, self.steps == 3, truncated, info
+
+    for share, num_counted in ((0.0, 16), (0.5, 8), (1.0, 16)):
+        collector = make_collector(Ending, collection={"episode_decisions": 8, "short_share": share})
+        assert len(collector.collect(None, "random", 48, 0).episode_returns) == num_counted
 
 
 def test_restored_collector_cuts_the_same_episodes(make_collector):

@@ -1,9 +1,11 @@
 """Several workers share a run: the same results with every kind of worker, after kills, and after a resumption."""
 
+import contextlib
 import os
 import signal
 import time
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,7 +13,7 @@ import torch
 
 from latentplan.config import CollectionConfig, Config, RunConfig, UserError
 from latentplan.training import resume, saving, train
-from latentplan.training.collection.crew import Crew, end_episodes
+from latentplan.training.collection.crew import Crew, check_memory, end_episodes
 from latentplan.training.collection.process import LocalWorker, RemoteWorker
 from tests.training.dot import Dot
 from tests.training.run_folder import fingerprint, read_rows, read_state
@@ -65,6 +67,35 @@ def test_crew_continues_from_the_memory_of_another(pair, tiny, dot):
     assert other.result() is None
     assert_same(collect(other, 1), pair[1][1])
     other.close()
+
+
+@pytest.mark.parametrize(
+    ("collection", "num_envs", "fits"),
+    [
+        ({"workers": 2}, 1, True),
+        ({"workers": 2, "backend": "ray"}, 1, True),
+        ({"workers": 3}, 1, False),
+        ({"workers": 2}, 2, False),
+        ({}, 2, False),  # as many environments, but of one worker
+        ({"overlap": False}, 2, False),
+    ],
+)
+def test_memory_of_a_crew_fits_the_settings_of_the_same_workers_alone(pair, tiny, collection, num_envs, fits):
+    config = tiny("", collection={"overlap": True, **collection}, env={"num_envs": num_envs})
+    with contextlib.nullcontext() if fits else pytest.raises(UserError, match=r"collection\.workers.* no longer fit"):
+        check_memory(pair[1][0].memory, config, Path("run"))
+
+
+def test_memory_of_one_worker_fits_any_process_that_collects_alone(tiny, dot):
+    alone = LocalWorker(tiny(""), dot, "cpu")
+    memory = collect(alone, 0).memory
+    alone.close()
+    for collection in ({"overlap": True}, {"overlap": False}):
+        check_memory(memory, tiny("", collection=collection), Path("run"))
+    for collection in ({"overlap": True, "workers": 2}, {"overlap": True, "backend": "ray"}):
+        with pytest.raises(UserError, match="no longer fit"):
+            check_memory(memory, tiny("", collection=collection), Path("run"))
+    check_memory(None, tiny("", env={"num_envs": 3}), Path("run"))
 
 
 def test_crew_evaluates_as_one_worker_does(pair, tiny, dot):

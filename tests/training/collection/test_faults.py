@@ -44,7 +44,7 @@ def collect(tiny, faulty):
 
 
 def test_replay_holds_no_transition_of_a_step_that_failed(collect):
-    _, collected = collect("nan reward")
+    _, collected = collect("nan reward", short_share=0.0)
     (rows,) = collected.rows
     # Two steps, the frame before the third; then an episode of ten steps and its last frame, then seven steps.
     assert np.flatnonzero(rows.is_first).tolist() == [0, 3, 14] and len(rows.frames) == 21

@@ -86,6 +86,25 @@ def test_environment_of_the_suite_keeps_cameras_quantities_and_the_range_of_its_
     assert recording.origin == "dm_control-cartpole-balance" and recording.lengths == [10]
 
 
+def test_episodes_of_all_workers_and_processes_of_a_run_are_read(folder):
+    """Worker k > 0 and process r > 0 keep theirs in folders below; the order does not depend on the disk."""
+    below = ("worker-1", "worker-2", "rank-1", "rank-1/worker-1")
+    for name in below[::-1]:
+        (folder / name).mkdir(parents=True, exist_ok=True)
+        for file in folder.glob("*.hdf5"):
+            (folder / name / file.name).write_bytes(file.read_bytes())
+    (folder / "other").mkdir()
+    (folder / "episode-000-000001.hdf5").rename(folder / "other" / "episode-000-000001.hdf5")
+    first, second = (f"episode-000-{number:06d}.hdf5" for number in (1, 2))
+    expected = [second, *(f"{name}/{file}" for name in below for file in (first, second))]
+    found = open_recordings([str(folder)])
+    assert [str(recording.path.relative_to(folder)) for recording in found] == expected
+    (folder / second).unlink()
+    assert [str(recording.path.relative_to(folder)) for recording in open_recordings([str(folder)])] == expected[1:]
+    with pytest.raises(UserError, match="already holds recorded episodes"):
+        KeepingEnv(wrap_user_env(Dot()), folder, CONFIG)
+
+
 def test_write_that_fails_leaves_the_file_before(folder, monkeypatch):
     path = folder / "episode-000-000001.hdf5"
     before, episode = path.read_bytes(), EpisodeFile(path).read(0)

@@ -10,12 +10,15 @@ import torch
 from latentplan.agents.checkpoint import load_agent, load_model, read_info, save_checkpoint
 from latentplan.agents.planning import PlanningAgent
 from latentplan.config import DistillConfig, PlannerConfig, UserError
+from latentplan.config.commit import Saves
+from latentplan.config.earlier import ADDED
 from latentplan.config.run_folder import lock_folder
 from latentplan.models import Gaussian, State, WorldModel
 from latentplan.training import distill, resume_distillation
 from latentplan.training.distillation.labels import Demonstrations, plan_actions
-from latentplan.training.distillation.run import Comparison
+from latentplan.training.distillation.run import FORMAT, KIND, Comparison
 from latentplan.training.distillation.student import Student
+from latentplan.training.state import save_values
 from tests.training.run_folder import list_saves, read_state
 
 INFO = {"domain": "user", "task": "push", "env_frames": 7, "discount": 0.9, "metrics": [{"planner": 1.0}]}
@@ -183,6 +186,16 @@ def test_resume_distillation_adds_rounds(spent, push, tmp_path):
     folder = shutil.copytree(spent.run_dir, tmp_path / "out")
     resume_distillation(folder, rounds=2, minutes=60.0, make_env=push)
     assert read_info(folder)["distilled"]["rounds"] == 2
+
+
+def test_resume_distillation_searches_as_the_earlier_version_that_saved_it(spent, push, tmp_path):
+    folder = shutil.copytree(spent.run_dir, tmp_path / "out")
+    saved = read_state(folder)
+    saved["planner"] = {name: value for name, value in saved["planner"].items() if name not in ADDED["planner"]}
+    save_values(Saves(folder / "resume", KIND, FORMAT), saved, {})
+    resume_distillation(folder, make_env=push)
+    searched = read_info(folder)["distilled"]["planner"]
+    assert {name: searched[name] for name in ADDED["planner"]} == ADDED["planner"]
 
 
 def test_resume_distillation_goes_back_to_the_save_before_a_damaged_one(finished, push, tmp_path):

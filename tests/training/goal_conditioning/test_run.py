@@ -17,6 +17,7 @@ from latentplan.config.commit import Saves
 from latentplan.config.files import dump_config
 from latentplan.config.quantities import QUANTITIES
 from latentplan.config.run_folder import lock_folder, run_saves
+from latentplan.config.spaces import Spaces
 from latentplan.models import State, WorldModel
 from latentplan.objectives.box import box_degree, box_of
 from latentplan.objectives.parser import parse_objective
@@ -222,6 +223,18 @@ def test_learn_goals_refuses_folders_and_agents_it_cannot_use(run, finished, tin
     save_checkpoint(other / "checkpoints" / "last", model, config, INFO)
     refused(lambda: resume_goals(tmp_path / "c"), "not the agent")
     assert "goals" in read_info(tmp_path / "c")
+
+
+@pytest.mark.parametrize(
+    ("spaces", "words"),
+    [(Spaces(vector_dim=2), "from pictures alone, without env.vectors"), (Spaces((3,)), "continuous actions only")],
+)
+def test_learn_goals_refuses_an_agent_that_cannot_learn_goals_before_it_plays(cartpole, tmp_path, spaces, words):
+    config, labels = cartpole
+    save_checkpoint(tmp_path / "agent", WorldModel(config.model, 1, labels, spaces=spaces), config, INFO)
+    with pytest.raises(UserError, match=words):
+        learn_goals(tmp_path / "agent", tmp_path / "out", SETTINGS)
+    assert not (tmp_path / "out" / "replay").exists()
 
 
 @pytest.fixture
