@@ -249,11 +249,11 @@ def test_background_planner_refuses_a_model_that_cannot_be_pickled_and_an_unknow
 
 
 def test_state_that_is_refused_leaves_the_planner_idle_and_keeps_the_objective():
-    planner = CEMPlanner(action_dim=1, horizon=3, num_samples=16, num_elites=4)
+    planner = CEMPlanner(action_dim=1, horizon=3, num_samples=256, num_elites=16)
     with BackgroundPlanner(planner, FunctionModel(dynamics, reward), worker="thread") as background:
         background.set_objective(lambda rollout: rollout.actions[:, 0, 0])
         with pytest.raises(ValueError, match="the same rows"):
             background.request({"a": torch.zeros(2, 1), "b": torch.zeros(3, 1)}, 0)
-        assert background.is_idle and background.request(torch.zeros(2, 1), 1)
+        assert background.is_idle and background.request(torch.zeros(2, 1), 1, seed=0)
         _, plan = wait_for_plan(background)
         assert (plan.actions[:, 0] > 0.5).all()
