@@ -11,7 +11,6 @@ from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 from latentplan.config.checks import UserError, shown
-from latentplan.config.planner import PlannerConfig
 
 
 class Removed(NamedTuple):
@@ -63,14 +62,3 @@ def drop_removed(section: str, fields: Mapping[Any, Any]) -> dict[Any, Any]:
         elif value != removed.accepted:
             raise UserError(f"{section}.{name} no longer exists, got {shown(value)}: {removed.advice}")
     return kept
-
-
-def saved_planner(fields: Mapping[Any, Any]) -> PlannerConfig:
-    """The settings of a search that a program saved, with what they meant in its version.
-
-    Raises:
-        UserError: A removed setting has another value than the one that is still accepted.
-        TypeError: A setting is unknown.
-        ValueError: A value is not allowed.
-    """
-    return PlannerConfig(**as_saved("planner", drop_removed("planner", fields)))

@@ -179,7 +179,8 @@ class Plan:
 
     def warn_of_failures(self) -> None:
         """Warns if no candidate of some environment had a finite return, so that the caller's policy acts there."""
-        if bool((self.failures() & (self.info["num_nonfinite"] > 0).cpu()).any()):
+        failed = self.info["is_fallback"] & ~self.info["is_policy"] & (self.info["num_nonfinite"] > 0)
+        if bool(failed.any()):
             warnings.warn(
                 "a search found nothing finite; the last plan or the policy acts", RuntimeWarning, stacklevel=2
             )

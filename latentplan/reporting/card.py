@@ -14,9 +14,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from latentplan.config import USER_DOMAIN, Config, PlannerConfig, to_dict
+from latentplan.config import USER_DOMAIN, Config, PlannerConfig, from_dict, to_dict
 from latentplan.config.checks import LONGEST_WORD
-from latentplan.config.earlier import saved_planner
 from latentplan.config.env_id import as_file_name, is_by_id, repeat_flag
 from latentplan.config.files import to_yaml
 from latentplan.config.run_results import read_log
@@ -158,7 +157,7 @@ def name_task(config: Config, info: Mapping[str, Any]) -> str:
 def _planner_after(distilled: Mapping[str, Any], planner: PlannerConfig) -> Any:
     """The planner's returns with the actor that a distillation kept; None if they are unknown or of another search."""
     try:
-        searched = saved_planner(distilled["planner"])
+        searched = from_dict({"planner": distilled["planner"]}).planner
     except (AttributeError, KeyError, TypeError, ValueError):
         return None
     if searched != planner:

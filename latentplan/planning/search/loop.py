@@ -112,7 +112,7 @@ class Search:
     def budget(self, pace: Pace, clock: Callable[[], float], started: float, seconds: float | None) -> Budget:
         """Returns the time that this search may take; see `Budget`."""
         # The speed of a wrapper such as `compile_rollout` depends on the model inside, so both types are in the key.
-        inner = getattr(self.model, "_model", None) or getattr(self.model, "model", None)
+        inner = getattr(self.model, "_model", getattr(self.model, "model", None))
         models = type(self.model), type(inner)
         size = (models, self.batch, self.horizon, self.scorer.num_particles, self.dtype, self.device)
         kind = (*self.scorer.kind, self.view.keep == "states")
@@ -148,7 +148,9 @@ class Search:
         if progress.elites is not None and options.num_kept:
             kept = space.carry(progress.elites.actions[:, : options.num_kept])
         ones = torch.ones(self.batch, dtype=torch.long)
-        var, is_warm = space.decode_var(progress.var), start.is_warm | progress.has_elites.cpu()
+        var, is_warm = space.decode_var(progress.var), start.is_warm
+        if not bool(is_warm.all()):  # only then, because reading from a graphics processor waits for it
+            is_warm = is_warm | progress.has_elites.cpu()
         return Plan(actions, mean, var, expected, info, kept, is_warm, ones, candidates=tuple(iterations))
 
     def _choose(self, progress: Progress, mean: Tensor, proposals: Tensor | None) -> Choice:

@@ -27,9 +27,8 @@ from latentplan.agents.actor import ActorAgent
 from latentplan.agents.base import ModelAgent
 from latentplan.agents.checkpoint import load_model, read_info, resolve_checkpoint, save_checkpoint
 from latentplan.agents.planning import PlanningAgent
-from latentplan.config import USER_DOMAIN, DistillConfig, PlannerConfig, UserError, derive_seed, to_dict
+from latentplan.config import USER_DOMAIN, DistillConfig, PlannerConfig, UserError, derive_seed, from_dict, to_dict
 from latentplan.config.commit import Saves
-from latentplan.config.earlier import saved_planner
 from latentplan.config.env_id import choose_env, repeat_flag
 from latentplan.config.run_folder import SAVES_FOLDER, lock_folder, require_saves
 from latentplan.envs import make_env, make_from
@@ -114,7 +113,7 @@ def resume_distillation(
         raise UserError(f"{saved['source']} is not the agent from which the distillation in {folder} started")
     settings = DistillConfig(**saved["settings"])
     settings = replace(settings, rounds=rounds or settings.rounds, minutes=minutes or settings.minutes)
-    planner = saved_planner(saved["planner"])
+    planner = from_dict({"planner": saved["planner"]}).planner
     run = _Distillation(Path(saved["source"]), Path(folder), settings, planner, device, make_env, env)
     run.load(saved)
     return run.run()
