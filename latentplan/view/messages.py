@@ -41,16 +41,25 @@ def obey(session: Session, text: str) -> list[dict[str, Any]]:
     for name in request:
         if name not in (*TEXTS, *SEARCH, "push", "reset", "picture"):
             raise_unknown("request", name, (*TEXTS, *SEARCH, "push", "reset", "picture"))
+    force = _read_number("push", request["push"]) if "push" in request else None
+    if force is not None:
+        session.check_push(force)
+    given = {name: value for name, value in request.items() if name in (*TEXTS, *SEARCH)}
+    wanted = _changed(session, given) if given else None
     answers: list[dict[str, Any]] = []
     if "picture" in request:
         name = session.pictures.add(_read_picture(session, request["picture"]))
         answers.append(describe_picture(name, session.pictures.contents[name]))
-    given = {name: value for name, value in request.items() if name in (*TEXTS, *SEARCH)}
-    if given:
-        session.change(_changed(session, given))
+    if wanted is not None:
+        try:
+            session.change(wanted)
+        except UserError:
+            if "picture" in request:
+                session.pictures.drop_last()
+            raise
         answers.append(describe_settings(session))
-    if "push" in request:
-        session.push(_read_number("push", request["push"]))
+    if force is not None:
+        session.push(force)
     if request.get("reset"):
         session.restart()
     return answers

@@ -59,6 +59,11 @@ class GoalPictures:
         self.contents[name], self._paths[name] = content, str(path)
         return name
 
+    def drop_last(self) -> None:
+        """Forgets the picture that was added last."""
+        name, _ = self.contents.popitem()
+        Path(self._paths.pop(name)).unlink()
+
     def resolve(self, objective: str | None) -> str | None:
         """The objective with the files of its pictures in place of their names.
 

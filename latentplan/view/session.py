@@ -215,13 +215,21 @@ class Session:
         Raises:
             UserError: The environment cannot push the body, or the force is too large.
         """
+        self.check_push(force)
+        self.env.unwrapped.push((force, 0.0, 0.0))
+        self._push_left = max(1, round(PUSH_S / self.period_s))
+
+    def check_push(self, force: float) -> None:
+        """Checks that the body can be pushed with a force in newtons.
+
+        Raises:
+            UserError: The environment cannot push the body, or the force is too large.
+        """
         if self.weight is None:
             raise UserError("this environment cannot push its body")
         most = MOST_WEIGHTS * self.weight
         if not abs(force) <= most:
             raise UserError(f"a push must be within {-most:.0f} and {most:.0f} N, ten times the weight, got {force}")
-        self.env.unwrapped.push((force, 0.0, 0.0))
-        self._push_left = max(1, round(PUSH_S / self.period_s))
 
     def restart(self) -> None:
         """Begins the next episode with the next decision."""

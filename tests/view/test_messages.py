@@ -48,6 +48,9 @@ def test_push_reset_and_picture_are_obeyed(session):
 @pytest.mark.parametrize(
     ("text", "words"),
     [
+        ('{"picture": "camera", "objective": "goal:picture-2.png"}', "there is no goal picture"),
+        ('{"picture": "camera", "horizon": "long"}', "horizon"),
+        ('{"objective": "cart -> 0.8", "picture": "camera", "push": 1e9}', "ten times the weight"),
         ("", "JSON object"),
         ("[1]", "JSON object"),
         ("{", "JSON object"),
@@ -77,6 +80,7 @@ def test_request_that_cannot_be_followed_is_refused_in_one_line(session, text, w
         obey(session, text)
     assert words in str(error.value) and "\n" not in str(error.value)
     assert session.settings == before and session.agent is agent
+    assert not session.pictures.contents and not session.env.physics.data.xfrc_applied.any()
     assert session.decide().decision == 1
 
 
