@@ -130,6 +130,10 @@ class BackgroundPlanner:
         constraints: See `CEMPlanner.plan`.
         worker: `process` or `thread`.
 
+    Attributes:
+        objective: The objective of the next request.
+        constraints: The constraints of the next request.
+
     Raises:
         ValueError: `worker` has another value.
         TypeError: Planner, model, objective or constraints cannot be pickled.
@@ -146,7 +150,8 @@ class BackgroundPlanner:
     ) -> None:
         if worker not in WORKERS:
             raise ValueError(f"worker must be one of {', '.join(WORKERS)}, got {worker!r}")
-        problem = (planner, model, objective, tuple(constraints))
+        self.objective, self.constraints = objective, tuple(constraints)
+        problem = (planner, model, self.objective, self.constraints)
         self._goals: Goals | bytes | None = None  # sent with the next request
         self._is_idle, self._is_closed = True, False
         self._ready = threading.Event()
@@ -177,6 +182,9 @@ class BackgroundPlanner:
     def set_objective(self, objective: Term | None = None, constraints: Sequence[Constraint] = ()) -> None:
         """Changes objective and constraints, from the next request on.
 
+        A `PlanScheduler` that uses this planner does not notice the call: change both by
+        `PlanScheduler.set_objective`.
+
         Args:
             objective: See `CEMPlanner.plan`.
             constraints: See `CEMPlanner.plan`.
@@ -186,6 +194,7 @@ class BackgroundPlanner:
         """
         goals = (objective, tuple(constraints))
         self._goals = goals if self.process is None else dump(goals)
+        self.objective, self.constraints = goals
 
     def request(self, state: State, tick: int, previous: Plan | None = None, seed: int | None = None) -> bool:
         """Starts the search of a plan whose first action is due at `tick`; see `PlanExecutor.request`."""
