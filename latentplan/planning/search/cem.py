@@ -97,7 +97,7 @@ class CEMPlanner(SearchOptions):
 
     @cached_property
     def first_searches(self) -> FirstSearches:
-        """The models that this planner has searched in; the first search in each watches the model."""
+        """The models that this planner has searched in; the first candidates in each are watched."""
         return FirstSearches()
 
     @cached_property
@@ -158,10 +158,9 @@ class CEMPlanner(SearchOptions):
         with torch.inference_mode(False), torch.no_grad():
             low, high = self.bounds if bounds is None else self._read_bounds(*bounds)
             last = None if last_action is None else torch.as_tensor(last_action)
-            is_new = self.first_searches.add(model)
             start, spread, discount = self._init_mean, self._init_std, self.discount
-            goals = (objective, constraints)
-            problem = Problem(model, state, *goals, low, high, start, spread, discount, self.choices, last, is_new)
+            goals, seen = (objective, constraints), self.first_searches
+            problem = Problem(model, state, *goals, low, high, start, spread, discount, self.choices, last, seen)
             search = Search(self, problem, generator, previous, View(keep, callback))
             seconds = None if deadline_ms is None else deadline_ms / 1000
             return search.run(search.budget(self.pace, clock, started, seconds))

@@ -80,6 +80,7 @@ class Search:
         self.batch, self.device = count_rows(self.state), state_device(self.state)
         self.dtype = action_dtype(self.state)
         self.problem, self.previous = problem, previous
+        self.is_new = problem.first_searches.is_new(problem.model)
         self.horizon = options.horizon if objective is None else options.goal_horizon or options.horizon
         low, high = (self._per_step(value, name) for name, value in (("low", problem.low), ("high", problem.high)))
         choices = Choices(problem.choices, self.dtype, self.device) if problem.choices else None
@@ -223,7 +224,7 @@ class Search:
                 fresh = fresh if proposals is None else torch.cat([fresh, self.space.encode(proposals)], dim=1)
             if iteration <= 1:  # later iterations have as many candidates as the second, which has no new proposals
                 rows = self.scorer.start_rows(self.state, fresh.shape[1])
-            scores, states = self._score(rows, fresh, is_new=is_first and self.problem.is_new)
+            scores, states = self._score(rows, fresh, is_watched=is_first and self.is_new)
             if is_first:
                 scores = _ignore_nan_actions(fresh, scores)
             updated = self._refit(progress, [(fresh, scores), *known, *self._keep(progress, known)], scores.returns)
@@ -239,22 +240,23 @@ class Search:
             budget.lap("iteration")
         return progress, kept, history, stopped
 
-    def _score(self, rows: State, points: Tensor, *, is_new: bool) -> tuple[Scores, State]:
+    def _score(self, rows: State, points: Tensor, *, is_watched: bool) -> tuple[Scores, State]:
         """Returns the scores of points, and the states of their rollouts if the caller keeps them, else None."""
         actions = self.space.decode(points)
-        watch = Watch(rows, actions) if is_new else None
+        watch = Watch(rows, actions) if is_watched else None
         with_states = self.view.keep == "states"
         try:
             rollout = self.scorer.imagine(rows, actions, with_states=with_states)
             scores = self.scorer.score_rollout(rollout)
         except Exception as error:
-            if is_new and "single memory location" in str(error):  # rows of one environment share their memory
+            if is_watched and "single memory location" in str(error):  # rows of one environment share their memory
                 raise ValueError(describe_writing(self.model, "state")) from error
-            if is_new:
+            if is_watched:
                 error.add_note("check_model(model, state, planner=planner) lists everything that a planner needs")
             raise
         if watch is not None:
             watch.check(self.model)
+            self.problem.first_searches.add(self.problem.model)
         return scores, self.scorer.arrange_states(rollout) if with_states else None
 
     def _show(

@@ -13,6 +13,7 @@ from latentplan.config.planner import SearchOptions
 from latentplan.planning.model import Model, State
 from latentplan.planning.objectives import Constraint, Objective, Term
 from latentplan.planning.plan import Iteration
+from latentplan.planning.search.purity import FirstSearches
 from latentplan.planning.search.space import Bounds, Space
 
 
@@ -34,7 +35,8 @@ class Problem:
         discount: Discount per model step, in (0, 1].
         choices: By dimension, the values of discrete actions.
         last_action: The action executed last, (batch, action); None takes it from the previous plan.
-        is_new: Whether this is the first search in the model, so that the model is watched for changes of its inputs.
+        first_searches: The models that were watched for changes of their inputs; the search watches a new model, and adds
+            it once it has changed none.
     """
 
     model: Model
@@ -48,7 +50,7 @@ class Problem:
     discount: float
     choices: Mapping[int, Sequence[float]]
     last_action: Tensor | None
-    is_new: bool
+    first_searches: FirstSearches
 
 
 @dataclass(frozen=True)

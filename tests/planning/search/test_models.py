@@ -1,5 +1,6 @@
 """Models as people write them: in-place steps, sampling steps, dataclass states, proposals without a policy."""
 
+import contextlib
 import dataclasses
 import pickle
 
@@ -70,6 +71,15 @@ def test_models_are_watched_once_per_planner(point, states, make_planner, monkey
     planner.plan(FunctionModel(point.dynamics, point.reward), states)
     dataclasses.replace(planner, horizon=3).plan(point, states)
     assert len(copies) == 3
+
+
+@pytest.mark.parametrize("options", [{"objective": lambda rollout: 1 / 0}, {"deadline_ms": 0.0}])
+def test_model_that_writes_into_its_state_is_named_when_the_first_call_scored_nothing(make_planner, options):
+    planner, model = make_planner(), InPlace()
+    with contextlib.suppress(ZeroDivisionError):
+        planner.plan(model, torch.ones(2, 2), **options)
+    with pytest.raises(ValueError, match="InPlace writes into the state"):
+        planner.plan(model, torch.ones(2, 2))
 
 
 def test_first_searches_keep_no_model_alive_and_know_no_later_one():
