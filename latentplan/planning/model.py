@@ -286,12 +286,29 @@ def per_step(value: Bound, action_dim: int, name: str) -> Tensor:
     return numbers[None] if numbers.ndim == 2 else numbers
 
 
-def check_shape(name: str, tensor: Tensor, shape: Sequence[int]) -> None:
-    """Refuses a tensor, returned by a user's model or objective, that has another shape.
+def check_tensor(name: str, value: Any, shape: Sequence[int]) -> None:
+    """Refuses a value, given by the user or returned by a user's function, that is not a tensor.
+
+    Args:
+        name: Name for errors.
+        value: The value.
+        shape: The shape that the tensor should have; only the message names it.
 
     Raises:
+        TypeError: The value is not a tensor.
+    """
+    if not isinstance(value, Tensor):
+        raise TypeError(f"{name} must be a tensor of shape {tuple(shape)}, got {type(value).__name__}")
+
+
+def check_shape(name: str, tensor: Any, shape: Sequence[int]) -> None:
+    """Refuses a value, given by the user or returned by a user's function, that is no tensor of a shape.
+
+    Raises:
+        TypeError: The value is not a tensor.
         ValueError: The shapes differ; the message has both.
     """
+    check_tensor(name, tensor, shape)
     if tensor.shape != torch.Size(shape):
         raise ValueError(f"{name} must have shape {tuple(shape)}, got {tuple(tensor.shape)}")
 

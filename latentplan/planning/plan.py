@@ -12,6 +12,8 @@ from einops import rearrange
 from torch import Tensor
 from torch.utils._pytree import tree_map
 
+from latentplan.planning.model import check_shape
+
 # Attributes of a `Plan` that are tensors with the environment as dim 0; the last three are always on the CPU.
 ON_CPU = ("is_warm", "elapsed", "is_followed")
 TENSORS = ("actions", "mean", "var", "expected_return", "elites", *ON_CPU)
@@ -121,14 +123,16 @@ class Plan:
                 an array or a sequence. The first action is the one that is due now.
 
         Raises:
-            ValueError: The actions have another shape.
+            ValueError: The actions have another shape, or there is no action.
         """
         sequence = torch.as_tensor(actions)
         sequence = sequence if sequence.is_floating_point() else sequence.float()
         sequence = sequence[None] if sequence.ndim == 2 else sequence
-        if sequence.ndim != 3:
-            shape = tuple(sequence.shape)
-            raise ValueError(f"a trajectory has shape (horizon, action) or (batch, horizon, action), got {shape}")
+        if sequence.ndim != 3 or sequence.numel() == 0:
+            raise ValueError(
+                "a trajectory has shape (horizon, action) or (batch, horizon, action), with one action or more, got "
+                f"{tuple(sequence.shape)}"
+            )
         batch = len(sequence)
         unknown = sequence.new_full((batch,), torch.nan)
         none, zeros = torch.zeros(batch, dtype=torch.bool), torch.zeros(batch, dtype=torch.long)
@@ -186,7 +190,13 @@ class Plan:
             )
 
     def forget(self, mask: Tensor) -> Plan:
-        """Returns this plan, except that the environments in mask (batch,) bool start their next search cold."""
+        """Returns this plan, except that the environments in mask (batch,) bool start their next search cold.
+
+        Raises:
+            TypeError: The mask is not a tensor.
+            ValueError: The mask does not have one value for each environment.
+        """
+        check_shape("mask", mask, self.is_warm.shape)
         return replace(self, is_warm=self.is_warm & ~mask.to("cpu", torch.bool))
 
     def executed(self, elapsed: Tensor) -> Plan:

@@ -409,6 +409,8 @@ def test_plan_around_a_trajectory_starts_the_search_there(recorder, make_planner
     assert Plan.around(trajectory.numpy()).source == "plan"
     with pytest.raises(ValueError, match="a trajectory has shape"):
         Plan.around(trajectory.flatten())
+    with pytest.raises(ValueError, match=r"with one action or more, got \(2, 0, 2\)"):
+        Plan.around(torch.zeros(2, 0, 2))
 
 
 def test_scheduler_without_plan_and_policy_acts_in_the_middle_of_the_bounds(point, make_planner):
