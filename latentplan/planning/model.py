@@ -57,7 +57,7 @@ class FunctionModel:
     """A model made of functions.
 
     Args:
-        dynamics: `dynamics(state, action) -> next_state`; dynamics that sample take `generator` as a third argument.
+        dynamics: `dynamics(state, action) -> next_state`; dynamics that sample take an argument `generator` too.
         reward: `reward(state, action) -> (rows,)`, of the state before the step.
         value: `value(state) -> (rows,)`, the expected return from the last state of a plan on.
         policy: `policy(state, generator) -> (rows, action)`; the mode if the generator is None.
@@ -98,7 +98,7 @@ class FunctionModel:
     def _sample_step(
         self, state: State, action: Tensor, generator: torch.Generator | None = None
     ) -> tuple[State, Tensor]:
-        return self.dynamics(state, action, generator), self.reward(state, action)  # type: ignore[call-arg]
+        return call_with(self.dynamics, generator, state, action), self.reward(state, action)
 
 
 def supports(model: object, method: str) -> bool:

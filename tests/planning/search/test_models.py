@@ -133,6 +133,16 @@ def test_module_that_samples_is_given_the_generator(states, make_planner, seeded
     assert torch.equal(plans[0].actions, plans[1].actions)
 
 
+def keyword_step(state, action, *, generator):
+    return noisy_step(state, action, generator)
+
+
+def test_dynamics_may_take_the_generator_by_name_only(states, make_planner, seeded):
+    models = [FunctionModel(step, lambda state, action: -state.square().sum(dim=1)) for step in (noisy_step, keyword_step)]
+    plans = [make_planner().plan(model, states[:, :2], generator=seeded()) for model in models]
+    assert torch.equal(plans[0].actions, plans[1].actions)
+
+
 def test_compile_rollout_refuses_a_model_that_samples():
     with pytest.raises(ValueError, match="a model that does not sample"):
         compile_rollout(FunctionModel(noisy_step, lambda state, action: -state.square().sum(dim=1)))
