@@ -69,13 +69,17 @@ def build_goals(
         encode_goal: See `build_objective`.
 
     Raises:
-        UserError: A text is not an expression, or names a quantity that this model does not predict.
+        UserError: A text is not an expression, or names a quantity that this model does not predict; or an argument is
+            something else than text and functions.
     """
     known = model.labels or scales(env.domain)
     if objective is not None and not isinstance(objective, str | Expression) and not callable(objective):
         raise UserError(f"an objective must be an expression or a function of rollouts, got {objective!r}")
-    if not isinstance(constraints, str) and any(isinstance(constraint, str) for constraint in constraints):
-        raise UserError("constraints must be one text, with inequalities separated by ';', or functions of rollouts")
+    is_list = isinstance(constraints, Sequence) and all(map(callable, constraints))
+    if not isinstance(constraints, str) and not is_list:
+        raise UserError(
+            "constraints must be one text, with inequalities separated by ';', or a list of functions of rollouts"
+        )
     if isinstance(objective, str):
         objective = parse_objective(objective, known)
     if isinstance(objective, Expression):

@@ -202,7 +202,10 @@ def test_build_objective_can_be_added_to_the_learned_return():
     assert isinstance(mixed, Objective) and mixed.needs_states
 
 
-@pytest.mark.parametrize(("objective", "constraints"), [(5, ()), (None, ["cart < 0.5"]), (None, ("cart < 0.5", "a"))])
+@pytest.mark.parametrize(
+    ("objective", "constraints"),
+    [(5, ()), (None, ["cart < 0.5"]), (None, ("cart < 0.5", "a")), (None, learned_return())],
+)
 def test_build_goals_refuses_values_that_are_not_text_or_functions(objective, constraints):
     model = Cart()
     model.labels = SCALES

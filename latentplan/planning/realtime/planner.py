@@ -15,7 +15,7 @@ from torch import Tensor
 from torch.utils._pytree import tree_map
 
 from latentplan.planning.model import Model, State, count_rows
-from latentplan.planning.objectives import Constraint, Term
+from latentplan.planning.objectives import Constraint, Term, check_constraints
 from latentplan.planning.plan import Plan
 from latentplan.planning.realtime.worker import (
     CLOSING_SECONDS,
@@ -136,7 +136,8 @@ class BackgroundPlanner:
 
     Raises:
         ValueError: `worker` has another value.
-        TypeError: Planner, model, objective or constraints cannot be pickled.
+        TypeError: Planner, model, objective or constraints cannot be pickled, or the constraints are no sequence of
+            functions.
     """
 
     def __init__(
@@ -150,6 +151,7 @@ class BackgroundPlanner:
     ) -> None:
         if worker not in WORKERS:
             raise ValueError(f"worker must be one of {', '.join(WORKERS)}, got {worker!r}")
+        check_constraints(constraints)
         self.objective, self.constraints = objective, tuple(constraints)
         problem = (planner, model, self.objective, self.constraints)
         self._goals: Goals | bytes | None = None  # sent with the next request
@@ -190,8 +192,10 @@ class BackgroundPlanner:
             constraints: See `CEMPlanner.plan`.
 
         Raises:
-            TypeError: The objective or a constraint cannot be pickled; the old ones stay.
+            TypeError: The objective or a constraint cannot be pickled, or the constraints are no sequence of functions;
+                the old ones stay.
         """
+        check_constraints(constraints)
         goals = (objective, tuple(constraints))
         self._goals = goals if self.process is None else dump(goals)
         self.objective, self.constraints = goals

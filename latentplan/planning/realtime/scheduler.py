@@ -189,7 +189,7 @@ class PlanScheduler:
     def _follow(self, objective: Term | None, constraints: Sequence[Constraint]) -> None:
         """Finds the rate limits of the next decisions, and the model or view whose policy acts."""
         self._limits, _ = split_limits(constraints)  # each (1,) or (action,)
-        self._acting, _ = apply_view(self.model, objective)
+        self._acting: Any = apply_view(self.model, objective)[0]
 
     def _collect(self) -> None:
         """Puts a finished plan, if there is one, into the buffer."""

@@ -133,7 +133,7 @@ def read_choices(given: Any, action_dim: int) -> dict[int, tuple[float, ...]]:
     by_dimension = given if isinstance(given, Mapping) else dict.fromkeys(range(action_dim), given)
     choices: dict[int, tuple[float, ...]] = {}
     for dim, some in by_dimension.items():
-        if isinstance(dim, bool) or not isinstance(dim, Integral) or not 0 <= dim < action_dim:
+        if isinstance(dim, bool) or not isinstance(dim, Integral) or not 0 <= int(dim) < action_dim:
             raise ValueError(f"action_choices names dimension {dim!r}; dimensions are 0 to {action_dim - 1}")
         values = tuple(map(float, range(int(some)) if isinstance(some, Integral) else some))
         is_finite = bool(torch.isfinite(torch.tensor(values)).all())

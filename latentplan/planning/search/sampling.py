@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import lru_cache
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -38,7 +37,7 @@ class Streams:
 
     def __init__(self, generator: Generators, batch: int, device: torch.device) -> None:
         is_shared = generator is None or isinstance(generator, torch.Generator)
-        sources = [generator] if is_shared else _as_list(generator)
+        sources = _as_list(generator)
         if not is_shared and len(sources) != batch:
             raise ValueError(f"a list of generators needs one for each of {batch} environments, got {len(sources)}")
         seeds = [_draw_seeds(source) for source in sources]
@@ -88,7 +87,9 @@ class Streams:
         return torch.Generator(self._device).manual_seed(seed)
 
 
-def _as_list(generators: Any) -> list[torch.Generator | None]:
+def _as_list(generators: Generators) -> list[torch.Generator | None]:
+    if generators is None or isinstance(generators, torch.Generator):
+        return [generators]
     if not isinstance(generators, Sequence) or not all(isinstance(each, torch.Generator) for each in generators):
         raise TypeError(
             f"generator must be a torch.Generator or a list with one for each environment, got {shown(generators)}"
