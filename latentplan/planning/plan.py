@@ -65,9 +65,9 @@ class Plan:
     - `elite_return`: mean return of the elites after each refit, (batch, iteration);
     - `std`: mean standard deviation of the samples after each refit, (batch, iteration);
     - `iterations`: number of refits, (batch,);
-    - `num_nonfinite`: number of candidates whose return was not finite, (batch,);
-    - `is_fallback`: whether no candidate had a finite return or no iteration fitted the deadline, so that the actions
-      are the tail of the previous plan, zeros, or the policy's, (batch,);
+    - `num_nonfinite`: number of candidates whose return or violation was not finite, (batch,);
+    - `is_fallback`: whether no candidate had a finite return and violation, or no iteration fitted the deadline, so
+      that the actions are the tail of the previous plan, the start of a cold search, or the policy's, (batch,);
     - `is_policy`: whether no iteration fitted the deadline and the actions are the policy's, (batch,); false unless the
       policy makes proposals, and false with constraints or an objective for which the policy was not trained;
     - `violation`: violation of the chosen sequence, only with constraints, (batch,);
@@ -87,7 +87,7 @@ class Plan:
         expected_return: Predicted return of the chosen sequence, (batch,); with the option `final` `mean`, and
             without `policy_margin` and gradient steps, it is the mean return of the last elites, which may be higher
             than the return of their mean.
-            NaN where no candidate had a finite return.
+            NaN where no candidate had a finite return and violation.
         info: Diagnostics by name, see above.
         elites: Kept elites, (batch, kept, horizon, action), if the planner keeps some; with the option `overshoot` they
             may lie outside of the bounds.
@@ -161,7 +161,7 @@ class Plan:
             min_std: Floor of the returned std.
 
         Returns:
-            Mean and std; NaN where no candidate had a finite return.
+            Mean and std; NaN where `is_fallback` is true.
         """
         failed = self.info["is_fallback"][:, None]
         std = self.var[:, 0].sqrt().clamp_min(min_std)
@@ -177,12 +177,13 @@ class Plan:
     def failures(self) -> Tensor:
         """Returns where the actions come neither from a search nor from a policy, (batch,) bool on the CPU.
 
-        These actions are the tail of the previous plan, or zeros; a caller with a policy should execute the policy.
+        These actions are the tail of the previous plan, or the start of a cold search; a caller with a policy should
+        execute the policy.
         """
         return (self.info["is_fallback"] & ~self.info["is_policy"]).cpu()
 
     def warn_of_failures(self) -> None:
-        """Warns if no candidate of some environment had a finite return, so that the caller's policy acts there."""
+        """Warns if all candidates of an environment failed (NaN or infinity), so that the caller's policy acts there."""
         failed = self.info["is_fallback"] & ~self.info["is_policy"] & (self.info["num_nonfinite"] > 0)
         if bool(failed.any()):
             warnings.warn(

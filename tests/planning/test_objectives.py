@@ -246,6 +246,18 @@ def test_candidate_is_infeasible_when_its_violation_is_nan(walk, make_planner, s
     assert (plan.action[:, 0] <= 0).all()
 
 
+@pytest.mark.parametrize("penalty", [None, 1.0])
+def test_search_counts_and_warns_of_violations_that_are_nan(walk, make_planner, seeded, penalty):
+    constraint = at_every_state(lambda state: torch.where(state[:, 1] > 5, state[:, 0] * float("nan"), 0.0))
+    plan = make_planner(constraint_penalty=penalty).plan(
+        walk, torch.tensor([[0.0, 0.0], [0.0, 99.0]]), constraints=[constraint], generator=seeded(), keep="candidates"
+    )
+    assert plan.info["num_nonfinite"].tolist() == [0, 3 * 64] and plan.info["is_fallback"].tolist() == [False, True]
+    assert not any(iteration.is_feasible[1].any() for iteration in plan.candidates)
+    with pytest.warns(RuntimeWarning, match="nothing finite"):
+        plan.warn_of_failures()
+
+
 def test_at_every_state_sums_the_excess_over_the_steps(walk, actions):
     constraint = at_every_state(lambda state: state[:, 0] - 0.5)
     excess = (actions.cumsum(dim=2)[..., 0] - 0.5).clamp_min(0).sum(dim=2)

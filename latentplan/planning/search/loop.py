@@ -227,7 +227,7 @@ class Search:
             scores, states = self._score(rows, fresh, is_watched=is_first and self.is_new)
             if is_first:
                 scores = _ignore_nan_actions(fresh, scores)
-            updated = self._refit(progress, [(fresh, scores), *known, *self._keep(progress, known)], scores.returns)
+            updated = self._refit(progress, [(fresh, scores), *known, *self._keep(progress, known)], scores)
             if is_first:  # the policy's proposals and the shifted previous plan stay candidates, with their scores
                 known = [(fresh[:, num_fresh:], scores.rest(num_fresh)), (fresh[:, :1], scores.first(1))]
             elif iteration >= num_common:  # environments that have used up their iterations stay as they are
@@ -326,7 +326,7 @@ class Search:
         is_known = (actions[:, :, None] == others[:, None]).flatten(3).all(dim=3).any(dim=2)
         return [(actions, scores._replace(returns=scores.returns.masked_fill(is_known, float("nan"))))]
 
-    def _refit(self, progress: Progress, candidates: list[Candidates], fresh_returns: Tensor) -> Progress:
+    def _refit(self, progress: Progress, candidates: list[Candidates], fresh: Scores) -> Progress:
         options = self.options
         elites = select_elites(
             torch.cat([actions for actions, _ in candidates], dim=1),
@@ -348,7 +348,7 @@ class Search:
             probabilities,
             elites,
             torch.where(has_elites, mean_return(elites), progress.expected_return),
-            progress.num_nonfinite + (~torch.isfinite(fresh_returns)).sum(dim=1),
+            progress.num_nonfinite + (~fresh.is_finite).sum(dim=1),
             progress.iterations + 1,
             progress.has_elites | has_elites,
         )
