@@ -70,7 +70,9 @@ class Plan:
       that the actions are the tail of the previous plan, the start of a cold search, or the policy's, (batch,);
     - `is_policy`: whether no iteration fitted the deadline and the actions are the policy's, (batch,); false unless the
       policy makes proposals, and false with constraints or an objective for which the policy was not trained;
-    - `violation`: violation of the chosen sequence, only with constraints, (batch,);
+    - `violation`: violation of the chosen sequence, only with constraints, (batch,); a rate limit counts by the part
+      of each change beyond the limit, which is 0 except where the bounds prevail; NaN where other constraints were not
+      scored because no iteration fitted the deadline;
     - `stopped`: the reason the search ended, "iterations" or "deadline";
     - `gradient_pause`: number of searches that the last pause of gradient steps takes, (batch,), only with gradient
       steps;

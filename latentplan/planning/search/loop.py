@@ -144,7 +144,7 @@ class Search:
             stopped = "deadline" if is_late else stopped
         actions, expected, violation = choice
         info = {**progress.describe(history, stopped), "is_policy": torch.zeros_like(progress.has_elites)}
-        info |= _describe_rest(progress, violation, pause)
+        info |= _describe_rest(progress, self._add_excess(violation, actions), pause)
         kept = None
         if progress.elites is not None and options.num_kept:
             kept = space.carry(progress.elites.actions[:, : options.num_kept])
@@ -189,7 +189,7 @@ class Search:
         unknown = torch.full_like(progress.expected_return, float("nan")) if self.scorer.constraints else None
         pause = self._pause() if self.options.gradient_steps else None
         info = {**progress.describe([], "deadline"), "is_policy": is_policy}
-        info |= _describe_rest(progress, unknown, pause)
+        info |= _describe_rest(progress, self._add_excess(unknown, actions), pause)
         ones = torch.ones(self.batch, dtype=torch.long)
         elites, is_warm = shifted.elites, shifted.is_warm
         mean, var = self.space.decode(progress.mean), self.space.decode_var(progress.var)
@@ -263,15 +263,16 @@ class Search:
         self, index: int, points: Tensor, scores: Scores, states: State, progress: Progress, kept: list[Iteration]
     ) -> None:
         """Describes an iteration to the callback and among the kept ones."""
-        is_feasible = torch.isfinite(scores.returns)
-        if scores.violations is not None:
-            is_feasible = is_feasible & (scores.violations == 0)
+        actions, is_feasible = self.space.decode(points), torch.isfinite(scores.returns)
+        violations = self._add_excess(scores.violations, actions)
+        if violations is not None:
+            is_feasible = is_feasible & (violations == 0)
         described = Iteration(
             index,
-            self.space.decode(points),
+            actions,
             scores.returns,
             is_feasible,
-            scores.violations,
+            violations,
             states,
             self.space.decode(self.space.clean(progress.mean)),
             self.space.decode_var(progress.var).sqrt(),
@@ -281,6 +282,13 @@ class Search:
             kept.append(described)
         if self.view.callback is not None:
             self.view.callback(described)
+
+    def _add_excess(self, violation: Tensor | None, actions: Tensor) -> Tensor | None:
+        """Returns the violation of all constraints, given that of those other than rate limits; None without any."""
+        excess = self.space.excess_change(actions)
+        if violation is None or excess is None:
+            return excess if violation is None else violation
+        return violation + excess
 
     def _begin(self, start: WarmStart) -> Progress:
         """Returns the progress before the first refit."""
