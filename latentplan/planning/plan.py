@@ -86,10 +86,11 @@ class Plan:
         actions: The chosen sequence within the bounds, (batch, horizon, action).
         mean: Mean of the search distribution, (batch, horizon, action).
         var: Variance of the search distribution, (batch, horizon, action).
-        expected_return: Predicted return of the chosen sequence, (batch,); with the option `final` `mean`, and
-            without `policy_margin` and gradient steps, it is the mean return of the last elites, which may be higher
-            than the return of their mean.
-            NaN where no candidate had a finite return and violation.
+        expected_return: Predicted return of the chosen sequence, (batch,). With the option `final` `mean` it is the
+            mean return of the last elites, which may be higher than the return of their mean, unless the search scores
+            the mean: for constraints other than rate limits, to compare it with the policy's sequence
+            (`policy_margin`), or by gradient steps. Gradient steps score nothing while they pause, or where they do not
+            fit the deadline. NaN where no candidate had a finite return and violation.
         info: Diagnostics by name, see above.
         elites: Kept elites, (batch, kept, horizon, action), if the planner keeps some; with the option `overshoot` they
             may lie outside of the bounds.
@@ -185,7 +186,7 @@ class Plan:
         return (self.info["is_fallback"] & ~self.info["is_policy"]).cpu()
 
     def warn_of_failures(self) -> None:
-        """Warns if all candidates of an environment failed (NaN or infinity), so that the caller's policy acts there."""
+        """Warns if no candidate of an environment had a finite return and violation; a caller's policy acts there."""
         failed = self.info["is_fallback"] & ~self.info["is_policy"] & (self.info["num_nonfinite"] > 0)
         if bool(failed.any()):
             warnings.warn(
