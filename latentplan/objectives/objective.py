@@ -62,7 +62,8 @@ def build_goals(
     Args:
         objective: Text, or a parsed expression. A function of rollouts, or None for the objective of the training, is
             returned unchanged.
-        constraints: Inequalities separated by `;`. Functions of rollouts are returned unchanged.
+        constraints: Inequalities separated by `;`; blank text sets no constraint. Functions of rollouts are returned
+            unchanged.
         model: The world model, with `labels` and `label_names`.
         env: Settings of the environment.
         planner: The planner; its horizon, its discount and its use of the terminal value set the weight of the guide.
@@ -87,7 +88,7 @@ def build_goals(
     if isinstance(constraints, str):
         clauses = parse_constraints(constraints, known)
         require_labels(clauses, model.label_names)
-        constraints = [build_constraint(clauses)]
+        constraints = [build_constraint(clauses)] if clauses else ()
     return objective, constraints
 
 

@@ -220,6 +220,13 @@ def test_build_goals_refuses_values_that_are_not_text_or_functions(objective, co
         )
 
 
+def test_blank_text_sets_no_constraint():
+    model = Cart()
+    model.labels = SCALES
+    parts = {"env": EnvConfig(domain="cartpole"), "planner": CEMPlanner(action_dim=1), "encode_goal": None}
+    assert build_goals(None, " ; ", model=model, **parts) == (None, ())
+
+
 @pytest.mark.parametrize(
     ("name", "reason"), [("nothing.png", "does not exist"), ("", "is a folder"), ("a" * 300 + ".png", "cannot be read")]
 )
