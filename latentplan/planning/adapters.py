@@ -84,7 +84,7 @@ class CEMTrajectoryOptimizer:
         Args:
             initial_state: Passed to `rollout_fn` unchanged.
             rollout_fn: `rollout_fn(initial_state, sequence (horizon, action)) -> return`, maximised.
-            warm_start_mean: Mean at the start of the search, (horizon, action); None starts at the middle of the bounds.
+            warm_start_mean: Mean at the start of the search, (horizon, action); None takes the middle of the bounds.
         """
         model = _RolloutModel(initial_state, rollout_fn)
         previous = None if warm_start_mean is None else _make_plan(warm_start_mean)

@@ -361,16 +361,16 @@ def test_violation_is_zero_where_a_rate_limit_holds(make_planner, seeded, option
 def test_violation_of_a_rate_limit_is_the_excess_that_the_bounds_enforce(make_planner, seeded):
     """The bounds allow 0.5 to 1, so that the first action is at least 0.3 beyond the limit in both dimensions."""
     planner, last = make_planner(action_low=0.5, final="best"), torch.tensor([[0.0, 0.0], [0.5, 0.5]])
-    others = [lambda rollout: torch.ones(len(rollout.actions))]
+    others, start = [lambda rollout: torch.ones(len(rollout.actions))], -torch.ones(2, 2)
     for constraints, other in (([rate_limit(0.2)], 0.0), ([rate_limit(0.2), *others], 1.0)):
         plan = planner.plan(
-            greedy(), -torch.ones(2, 2), constraints=constraints, last_action=last, generator=seeded(), keep="candidates"
+            greedy(), start, constraints=constraints, last_action=last, generator=seeded(), keep="candidates"
         )
         torch.testing.assert_close(plan.info["violation"], torch.tensor([0.6 + other, other]))
         for iteration in plan.candidates:
             assert (iteration.violations[0] >= 0.6 + other - 1e-6).all()
             assert iteration.is_feasible[1].all() == (not other) and not iteration.is_feasible[0].any()
-    late = planner.plan(greedy(), torch.ones(2, 2), constraints=others, last_action=last, deadline_ms=0.0)
+    late = planner.plan(greedy(), start, constraints=others, last_action=last, deadline_ms=0.0)
     assert late.info["violation"].isnan().all()
 
 
