@@ -78,16 +78,16 @@ def goal_env(config: EnvConfig) -> EnvConfig:
 
 
 def read_goals(objective: str | None, constraint: str | None, domain: str) -> Goals | None:
-    """Parses the texts of `--objective` and `--constraint`; None if both are None.
+    """Parses the texts of `--objective` and `--constraint`; None if they name neither an objective nor a constraint.
 
     Raises:
         UserError: A text is no expression over the domain's quantities, or a goal image cannot be read.
     """
-    if objective is None and constraint is None:
-        return None
     known = scales(domain)
     phases = () if objective is None else parse_schedule(objective, known)
     constraints = () if constraint is None else parse_constraints(constraint, known)
+    if not phases and not constraints:
+        return None
     for path in {path for phase in phases for path in _goal_image_paths(phase.objective)}:
         read_goal_image(path)
     return Goals(phases, constraints, objective, constraint)

@@ -62,20 +62,25 @@ def build_goals(
     Args:
         objective: Text, or a parsed expression. A function of rollouts, or None for the objective of the training, is
             returned unchanged.
-        constraints: Inequalities separated by `;`. Functions of rollouts are returned unchanged.
+        constraints: Inequalities separated by `;`; blank text sets no constraint. Functions of rollouts are returned
+            unchanged.
         model: The world model, with `labels` and `label_names`.
         env: Settings of the environment.
         planner: The planner; its horizon, its discount and its use of the terminal value set the weight of the guide.
         encode_goal: See `build_objective`.
 
     Raises:
-        UserError: A text is not an expression, or names a quantity that this model does not predict.
+        UserError: A text is not an expression, or names a quantity that this model does not predict; or an argument is
+            something else than text and functions.
     """
     known = model.labels or scales(env.domain)
     if objective is not None and not isinstance(objective, str | Expression) and not callable(objective):
         raise UserError(f"an objective must be an expression or a function of rollouts, got {objective!r}")
-    if not isinstance(constraints, str) and any(isinstance(constraint, str) for constraint in constraints):
-        raise UserError("constraints must be one text, with inequalities separated by ';', or functions of rollouts")
+    is_list = isinstance(constraints, Sequence) and all(map(callable, constraints))
+    if not isinstance(constraints, str) and not is_list:
+        raise UserError(
+            "constraints must be one text, with inequalities separated by ';', or a list of functions of rollouts"
+        )
     if isinstance(objective, str):
         objective = parse_objective(objective, known)
     if isinstance(objective, Expression):
@@ -83,7 +88,7 @@ def build_goals(
     if isinstance(constraints, str):
         clauses = parse_constraints(constraints, known)
         require_labels(clauses, model.label_names)
-        constraints = [build_constraint(clauses)]
+        constraints = [build_constraint(clauses)] if clauses else ()
     return objective, constraints
 
 

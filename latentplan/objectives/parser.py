@@ -17,7 +17,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from typing import NamedTuple, NoReturn
 
 from latentplan.config import UserError
@@ -50,31 +50,34 @@ _MAX_TOKENS = 200
 _MAX_DEPTH = 50
 _MAX_SHOWN = 60  # characters of a text in an error message
 _MAX_LENGTH = 10_000  # characters of a text; far more than 200 tokens need
-_SWITCH = re.compile(r"\s*(?P<start>[0-9]{1,15})\s*:(?P<text>.*)", re.DOTALL)
+_SWITCH = re.compile(r"(?P<frame>[0-9]{1,15})\s*:")
 
 
 def parse_schedule(text: str, scales: Mapping[str, float]) -> tuple[Phase, ...]:
     """Parses objectives with the env frames at which they begin, such as `height > 1.2; 500: speed -> 1.0`.
 
     Args:
-        text: Objectives separated by `;`; each, except the first, begins with its first env frame.
+        text: Objectives separated by `;`; each, except the first, begins with its first env frame. Blank parts are
+            skipped.
         scales: Scale of every quantity that an objective may name.
 
     Raises:
         UserError: The text is no schedule; the message names the position and the nearest name.
     """
     _check_length(text)
+    text = text.strip()
     phases: list[Phase] = []
-    for part in split_outside_quotes(text, ";"):
-        match = _SWITCH.fullmatch(part)
+    for start, end in list(_find_parts(text)) or [(0, len(text))]:
+        match = _SWITCH.match(text, start, end)
         if phases and match is None:
             raise UserError(
-                f"{shown(part.strip())} needs the env frame from which it holds, as in '; 500: speed -> 1.0'"
+                f"{shown(text[start:end])} needs the env frame from which it holds, as in '; 500: speed -> 1.0'"
             )
-        start = 0 if match is None else int(match["start"])
-        if start <= phases[-1].start if phases else start > 0:
+        frame = 0 if match is None else int(match["frame"])
+        if frame <= phases[-1].start if phases else frame > 0:
             raise UserError(f"env frames of {shown(text)} must begin with 0 (which may be left out) and increase")
-        phases.append(Phase(start, parse_objective(part if match is None else match["text"], scales)))
+        first = start if match is None else match.end()
+        phases.append(Phase(frame, _Parser(text, scales, first, end).read_expression()))
     return tuple(phases)
 
 
@@ -85,8 +88,8 @@ def parse_objective(text: str, scales: Mapping[str, float]) -> Expression:
         UserError: The text is no objective; the message names the position and the nearest name.
     """
     _check_length(text)
-    parser = _Parser(text, scales)
-    return Expression(parser.text, tuple(parser.split_sum(parser.parse(), 1.0)))
+    text = text.strip()
+    return _Parser(text, scales, 0, len(text)).read_expression()
 
 
 def parse_reward(text: str, scales: Mapping[str, float], setting: str) -> Expression:
@@ -104,16 +107,30 @@ def parse_reward(text: str, scales: Mapping[str, float], setting: str) -> Expres
 def parse_constraints(text: str, scales: Mapping[str, float]) -> tuple[Clause, ...]:
     """Parses inequalities that must hold at every env frame, separated by `;` or joined by `and`.
 
+    Blank parts are skipped, so that blank text gives no clauses.
+
     Raises:
         UserError: The text is no constraint; the message names the position and the nearest name.
     """
     _check_length(text)
-    return tuple(clause for part in text.split(";") for clause in _Parser(part, scales).read_inequalities())
+    text = text.strip()
+    parsers = [_Parser(text, scales, start, end) for start, end in _find_parts(text)]
+    return tuple(clause for parser in parsers for clause in parser.read_inequalities())
 
 
 def split_outside_quotes(text: str, separator: str) -> list[str]:
     """Parts of a text between separators (one character each); separators within double quotes are ignored."""
     return re.split(rf'{re.escape(separator)}(?=(?:[^"]*"[^"]*")*[^"]*$)', text)
+
+
+def _find_parts(text: str) -> Iterator[tuple[int, int]]:
+    """Yields start and end of each part between `;` that is not blank, without the blanks around the part."""
+    position = 0
+    for part in split_outside_quotes(text, ";"):
+        if part.strip():
+            start = position + len(part) - len(part.lstrip())
+            yield start, start + len(part.strip())
+        position += len(part) + 1
 
 
 class _Token(NamedTuple):
@@ -122,7 +139,7 @@ class _Token(NamedTuple):
     Attributes:
         kind: `goal`, `number`, `word`, `sign` or `end`.
         text: The characters of the token; empty at the end.
-        position: Index of the first character.
+        position: Index of the first character in the whole text.
     """
 
     kind: str
@@ -136,20 +153,29 @@ class _Token(NamedTuple):
 
 
 class _Parser:
-    """Reads one text; `positions` maps the identity of each node to the index of the node's first character."""
+    """Reads the part of a text from `start` up to `end`; errors name positions in the whole text.
 
-    def __init__(self, text: str, scales: Mapping[str, float]) -> None:
-        self.text, self.scales = text.strip(), scales
+    `positions` maps the identity of each node to the index of the node's first character.
+    """
+
+    def __init__(self, text: str, scales: Mapping[str, float], start: int, end: int) -> None:
+        self.text, self.scales = text, scales
+        self.start, self.end = start, end
         self.tokens = self._tokenize()
         self.index = self.depth = 0
         self.positions: dict[int, int] = {}
 
     def parse(self) -> Node:
-        """The whole text as one node."""
+        """The part as one node."""
         node = self._conjunction()
         if self._next.kind != "end":
             self._fail(self._next, f"expected an operator or the end, got {self._next.shown!r}")
         return node
+
+    def read_expression(self) -> Expression:
+        """The part as an objective."""
+        written = self.text[self.start : self.end].strip()
+        return Expression(written, tuple(self.split_sum(self.parse(), 1.0)))
 
     def split_sum(self, node: Node, weight: float) -> list[tuple[float, Node]]:
         """Weight and node of each term of a sum; only a whole term may be the learned return or a goal image."""
@@ -182,12 +208,12 @@ class _Parser:
     def _tokenize(self) -> list[_Token]:
         """The tokens of the text, and an `end`."""
         tokens: list[_Token] = []
-        position = 0
-        while position < len(self.text):
+        position = self.start
+        while position < self.end:
             if self.text[position].isspace():
                 position += 1
                 continue
-            match = _TOKEN.match(self.text, position)
+            match = _TOKEN.match(self.text, position, self.end)
             token = _Token(str(match and match.lastgroup), match[0] if match else self.text[position], position)
             if match is None:
                 is_goal = token.text == ":" and tokens and tokens[-1].text == "goal"
@@ -196,7 +222,7 @@ class _Parser:
                 self._fail(token, f"an expression has at most {_MAX_TOKENS} numbers, names and signs")
             tokens.append(token)
             position = match.end()
-        return [*tokens, _Token("end", "", len(self.text))]
+        return [*tokens, _Token("end", "", self.end)]
 
     def _conjunction(self) -> Node:
         node = self._comparison()

@@ -84,7 +84,7 @@ class CEMTrajectoryOptimizer:
         Args:
             initial_state: Passed to `rollout_fn` unchanged.
             rollout_fn: `rollout_fn(initial_state, sequence (horizon, action)) -> return`, maximised.
-            warm_start_mean: Mean at the start of the search, (horizon, action); None starts at zeros.
+            warm_start_mean: Mean at the start of the search, (horizon, action); None takes the middle of the bounds.
         """
         model = _RolloutModel(initial_state, rollout_fn)
         previous = None if warm_start_mean is None else _make_plan(warm_start_mean)
@@ -95,6 +95,17 @@ class CEMTrajectoryOptimizer:
                 "no sequence had a finite return; the plan is the start of the search", RuntimeWarning, stacklevel=2
             )
         return plan.mean[0].numpy(), plan.var[0].numpy()
+
+    def shift(self, mean: np.ndarray) -> np.ndarray:
+        """Returns a plan's mean one step later, (horizon, action); its last action is the middle of the bounds.
+
+        Args:
+            mean: The mean, (horizon, action).
+        """
+        low, high = (bound[0, -1:].numpy() for bound in self._planner.bounds)
+        shifted: np.ndarray = (low + high).repeat(len(mean), axis=0) / 2
+        shifted[:-1] = mean[1:]
+        return shifted
 
     def step_numerical_example(
         self,
@@ -125,11 +136,9 @@ class RolloutController:
         self.warm_start: np.ndarray | None = None
 
     def act(self, current_state: np.ndarray) -> np.ndarray:
-        """Returns the first action (action,) of a new plan; the rest, padded with a zero, starts the next search."""
+        """Returns the first action (action,) of a new plan; the rest starts the next search, see `shift`."""
         mean, _ = self.optimizer.plan(current_state, self.rollout_fn, self.warm_start)
-        self.warm_start = mean.copy()
-        self.warm_start[:-1] = mean[1:]
-        self.warm_start[-1] = 0.0
+        self.warm_start = self.optimizer.shift(mean)
         return mean[0]
 
     def reset(self) -> None:

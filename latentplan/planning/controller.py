@@ -13,7 +13,7 @@ from torch import Tensor
 from torch.utils._pytree import tree_map
 
 from latentplan.planning.adapters import CEMTrajectoryOptimizer, RolloutController
-from latentplan.planning.model import Model, State, count_rows, state_device
+from latentplan.planning.model import Model, State, check_shape, count_rows, state_device
 from latentplan.planning.objectives import Constraint, Term
 from latentplan.planning.plan import Iteration, Plan
 from latentplan.planning.search.registry import Planner
@@ -97,9 +97,11 @@ class ModelPredictiveController:
             Actions of the environments in `where`, in order: (chosen, action).
 
         Raises:
-            ValueError: `where` selects no environment, or the objective or the bounds have one value for each of all
-                environments.
+            TypeError: `where` is not a tensor.
+            ValueError: `where` selects no environment or has another shape, or the objective or the bounds have one
+                value for each of all environments.
         """
+        check_shape("where", where, (count_rows(state),))
         where = where.to("cpu", torch.bool)
         rows = where.nonzero().squeeze(1)
         if len(rows) == 0:
@@ -147,6 +149,10 @@ class ModelPredictiveController:
 
         Args:
             mask: Environments in which an episode begins, (batch,) bool; None is all of them.
+
+        Raises:
+            TypeError: `mask` is not a tensor.
+            ValueError: There is a plan, and `mask` does not have one value for each of its environments.
         """
         if mask is None:
             self.plan = None

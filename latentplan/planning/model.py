@@ -57,7 +57,7 @@ class FunctionModel:
     """A model made of functions.
 
     Args:
-        dynamics: `dynamics(state, action) -> next_state`; dynamics that sample take `generator` as a third argument.
+        dynamics: `dynamics(state, action) -> next_state`; dynamics that sample take an argument `generator` too.
         reward: `reward(state, action) -> (rows,)`, of the state before the step.
         value: `value(state) -> (rows,)`, the expected return from the last state of a plan on.
         policy: `policy(state, generator) -> (rows, action)`; the mode if the generator is None.
@@ -98,7 +98,7 @@ class FunctionModel:
     def _sample_step(
         self, state: State, action: Tensor, generator: torch.Generator | None = None
     ) -> tuple[State, Tensor]:
-        return self.dynamics(state, action, generator), self.reward(state, action)  # type: ignore[call-arg]
+        return call_with(self.dynamics, generator, state, action), self.reward(state, action)
 
 
 def supports(model: object, method: str) -> bool:
@@ -286,12 +286,29 @@ def per_step(value: Bound, action_dim: int, name: str) -> Tensor:
     return numbers[None] if numbers.ndim == 2 else numbers
 
 
-def check_shape(name: str, tensor: Tensor, shape: Sequence[int]) -> None:
-    """Refuses a tensor, returned by a user's model or objective, that has another shape.
+def check_tensor(name: str, value: Any, shape: Sequence[int]) -> None:
+    """Refuses a value, given by the user or returned by a user's function, that is not a tensor.
+
+    Args:
+        name: Name for errors.
+        value: The value.
+        shape: The shape that the tensor should have; only the message names it.
 
     Raises:
+        TypeError: The value is not a tensor.
+    """
+    if not isinstance(value, Tensor):
+        raise TypeError(f"{name} must be a tensor of shape {tuple(shape)}, got {type(value).__name__}")
+
+
+def check_shape(name: str, tensor: Any, shape: Sequence[int]) -> None:
+    """Refuses a value, given by the user or returned by a user's function, that is no tensor of a shape.
+
+    Raises:
+        TypeError: The value is not a tensor.
         ValueError: The shapes differ; the message has both.
     """
+    check_tensor(name, tensor, shape)
     if tensor.shape != torch.Size(shape):
         raise ValueError(f"{name} must have shape {tuple(shape)}, got {tuple(tensor.shape)}")
 

@@ -17,10 +17,11 @@ from functools import partial
 from typing import Any
 
 import torch
-from einops import rearrange, reduce, repeat
+from einops import rearrange, repeat
 from torch import Tensor
 from torch.nn import functional
 
+from latentplan.config.checks import shown
 from latentplan.planning.model import Model, State, call_with, check_shape, require, supports
 
 Term = Callable[["Rollout"], Tensor]  # the value of each row, (rows,), maximised
@@ -132,6 +133,17 @@ def as_objective(term: Term) -> Objective:
     return term if isinstance(term, Objective) else Objective(term, needs_states=True)
 
 
+def check_constraints(constraints: Any) -> None:
+    """Refuses constraints that are no sequence of functions, such as a single function.
+
+    Raises:
+        TypeError: The constraints are something else.
+    """
+    if not isinstance(constraints, Sequence) or not all(map(callable, constraints)):
+        got = "one function" if callable(constraints) else shown(constraints)
+        raise TypeError(f"constraints must be a sequence of functions, such as [rate_limit(0.1)], got {got}")
+
+
 def name_term(term: Term) -> str:
     """Returns the names of the functions of a term, without the numbers and tensors that they were given."""
     if isinstance(term, Objective):
@@ -168,12 +180,13 @@ def goal_term(
         select: `select(state) -> (rows, feature)` returns the features to compare; None for states that are tensors.
 
     Raises:
-        ValueError: `metric` or `over` has another value, or the goal has another rank.
+        ValueError: `metric` or `over` has another value, or the goal is no tensor or has another rank.
     """
     if metric not in ("mse", "cosine") or over not in ("last", "sum", "min"):
         raise ValueError(f"metric must be mse or cosine and over last, sum or min, got {metric!r} and {over!r}")
-    if goal.ndim not in (1, 2):
-        raise ValueError(f"a goal has shape (feature,) or (batch, feature), got {tuple(goal.shape)}")
+    if not isinstance(goal, Tensor) or goal.ndim not in (1, 2):
+        got = tuple(goal.shape) if isinstance(goal, Tensor) else type(goal).__name__
+        raise ValueError(f"a goal is a tensor of shape (feature,) or (batch, feature), got {got}")
 
     return Objective(partial(_closeness, goal, metric, over, select), needs_states=over != "last")
 
@@ -355,6 +368,9 @@ def _distance(
     goal: Tensor, metric: str, select: Callable[[State], Tensor] | None, rollout: Rollout, state: State
 ) -> Tensor:
     features = state if select is None else select(state)
+    if not isinstance(features, Tensor) or features.ndim != 2:
+        got = f"shape {tuple(features.shape)}" if isinstance(features, Tensor) else type(features).__name__
+        raise ValueError(f"goal_term() compares features (rows, feature), which select returns, got {got}")
     target = goal.to(features)
     check_shape("the goal", goal, (rollout.batch, features.shape[-1])[-goal.ndim :])
     if goal.ndim == 2:
@@ -388,14 +404,15 @@ def _first_change(rollout: Rollout) -> Tensor:
 def _uncertainty(rollout: Rollout) -> Tensor:
     before = (rollout.start, *rollout.states[:-1])
     pairs = zip(before, rollout.actions.unbind(dim=1), strict=True)
-    uncertainties = torch.stack([rollout.model.uncertainty(state, action) for state, action in pairs], dim=1)
-    check_shape("uncertainty()", uncertainties, rollout.rewards.shape)
-    return -(rollout.weights[..., :-1] * uncertainties).sum(dim=1)
+    uncertainties = [rollout.model.uncertainty(state, action) for state, action in pairs]
+    return -(rollout.weights[..., :-1] * _stack_steps("uncertainty()", uncertainties, rollout)).sum(dim=1)
 
 
 def _worst(inner: Term, share: float, rollout: Rollout) -> Tensor:
     num_worst = max(1, round(share * rollout.num_particles))  # a model may have more particles than the term needs
-    values = rearrange(inner(rollout), "(row particle) -> row particle", particle=rollout.num_particles)
+    values = inner(rollout)
+    check_shape("the objective of risk()", values, rollout.actions.shape[:1])
+    values = rearrange(values, "(row particle) -> row particle", particle=rollout.num_particles)
     worst = torch.topk(values, num_worst, dim=1, largest=False).values.mean(dim=1)
     # NaN sorts as the largest number, so `topk` never counts a NaN particle among the worst.
     worst = worst.masked_fill(values.isnan().any(dim=1), float("nan"))
@@ -414,5 +431,13 @@ def _conditioned_return(view: View, rollout: Rollout) -> Tensor:
 
 
 def _excess(function: Callable[[State], Tensor], rollout: Rollout) -> Tensor:
-    excess = torch.stack([function(state) for state in rollout.states])
-    return reduce(excess.clamp_min(0.0), "step rows -> rows", "sum")
+    values = [function(state) for state in rollout.states]
+    excess = _stack_steps("the function of at_every_state()", values, rollout).clamp_min(0.0)
+    return excess.sum(dim=1)
+
+
+def _stack_steps(name: str, values: Sequence[Any], rollout: Rollout) -> Tensor:
+    """Returns the values of all steps, (rows, step); `check_shape` refuses a step that is not (rows,)."""
+    for value in values:
+        check_shape(name, value, rollout.actions.shape[:1])
+    return torch.stack(list(values), dim=1)

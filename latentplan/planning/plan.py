@@ -12,6 +12,8 @@ from einops import rearrange
 from torch import Tensor
 from torch.utils._pytree import tree_map
 
+from latentplan.planning.model import check_shape
+
 # Attributes of a `Plan` that are tensors with the environment as dim 0; the last three are always on the CPU.
 ON_CPU = ("is_warm", "elapsed", "is_followed")
 TENSORS = ("actions", "mean", "var", "expected_return", "elites", *ON_CPU)
@@ -63,12 +65,14 @@ class Plan:
     - `elite_return`: mean return of the elites after each refit, (batch, iteration);
     - `std`: mean standard deviation of the samples after each refit, (batch, iteration);
     - `iterations`: number of refits, (batch,);
-    - `num_nonfinite`: number of candidates whose return was not finite, (batch,);
-    - `is_fallback`: whether no candidate had a finite return or no iteration fitted the deadline, so that the actions
-      are the tail of the previous plan, zeros, or the policy's, (batch,);
+    - `num_nonfinite`: number of candidates whose return or violation was not finite, (batch,);
+    - `is_fallback`: whether no candidate had a finite return and violation, or no iteration fitted the deadline, so
+      that the actions are the tail of the previous plan, the start of a cold search, or the policy's, (batch,);
     - `is_policy`: whether no iteration fitted the deadline and the actions are the policy's, (batch,); false unless the
       policy makes proposals, and false with constraints or an objective for which the policy was not trained;
-    - `violation`: violation of the chosen sequence, only with constraints, (batch,);
+    - `violation`: violation of the chosen sequence, only with constraints, (batch,); a rate limit counts by the part
+      of each change beyond the limit, which is 0 except where the bounds prevail; NaN where other constraints were not
+      scored because no iteration fitted the deadline;
     - `stopped`: the reason the search ended, "iterations" or "deadline";
     - `gradient_pause`: number of searches that the last pause of gradient steps takes, (batch,), only with gradient
       steps;
@@ -82,10 +86,11 @@ class Plan:
         actions: The chosen sequence within the bounds, (batch, horizon, action).
         mean: Mean of the search distribution, (batch, horizon, action).
         var: Variance of the search distribution, (batch, horizon, action).
-        expected_return: Predicted return of the chosen sequence, (batch,); with the option `final` `mean`, and
-            without `policy_margin` and gradient steps, it is the mean return of the last elites, which may be higher
-            than the return of their mean.
-            NaN where no candidate had a finite return.
+        expected_return: Predicted return of the chosen sequence, (batch,). With the option `final` `mean` it is the
+            mean return of the last elites, which may be higher than the return of their mean, unless the search scores
+            the mean: for constraints other than rate limits, to compare it with the policy's sequence
+            (`policy_margin`), or by gradient steps. Gradient steps score nothing while they pause, or where they do not
+            fit the deadline. NaN where no candidate had a finite return and violation.
         info: Diagnostics by name, see above.
         elites: Kept elites, (batch, kept, horizon, action), if the planner keeps some; with the option `overshoot` they
             may lie outside of the bounds.
@@ -121,14 +126,16 @@ class Plan:
                 an array or a sequence. The first action is the one that is due now.
 
         Raises:
-            ValueError: The actions have another shape.
+            ValueError: The actions have another shape, or there is no action.
         """
         sequence = torch.as_tensor(actions)
         sequence = sequence if sequence.is_floating_point() else sequence.float()
         sequence = sequence[None] if sequence.ndim == 2 else sequence
-        if sequence.ndim != 3:
-            shape = tuple(sequence.shape)
-            raise ValueError(f"a trajectory has shape (horizon, action) or (batch, horizon, action), got {shape}")
+        if sequence.ndim != 3 or sequence.numel() == 0:
+            raise ValueError(
+                "a trajectory has shape (horizon, action) or (batch, horizon, action), with one action or more, got "
+                f"{tuple(sequence.shape)}"
+            )
         batch = len(sequence)
         unknown = sequence.new_full((batch,), torch.nan)
         none, zeros = torch.zeros(batch, dtype=torch.bool), torch.zeros(batch, dtype=torch.long)
@@ -157,7 +164,7 @@ class Plan:
             min_std: Floor of the returned std.
 
         Returns:
-            Mean and std; NaN where no candidate had a finite return.
+            Mean and std; NaN where `is_fallback` is true.
         """
         failed = self.info["is_fallback"][:, None]
         std = self.var[:, 0].sqrt().clamp_min(min_std)
@@ -173,12 +180,13 @@ class Plan:
     def failures(self) -> Tensor:
         """Returns where the actions come neither from a search nor from a policy, (batch,) bool on the CPU.
 
-        These actions are the tail of the previous plan, or zeros; a caller with a policy should execute the policy.
+        These actions are the tail of the previous plan, or the start of a cold search; a caller with a policy should
+        execute the policy.
         """
         return (self.info["is_fallback"] & ~self.info["is_policy"]).cpu()
 
     def warn_of_failures(self) -> None:
-        """Warns if no candidate of some environment had a finite return, so that the caller's policy acts there."""
+        """Warns if no candidate of an environment had a finite return and violation; a caller's policy acts there."""
         failed = self.info["is_fallback"] & ~self.info["is_policy"] & (self.info["num_nonfinite"] > 0)
         if bool(failed.any()):
             warnings.warn(
@@ -186,7 +194,13 @@ class Plan:
             )
 
     def forget(self, mask: Tensor) -> Plan:
-        """Returns this plan, except that the environments in mask (batch,) bool start their next search cold."""
+        """Returns this plan, except that the environments in mask (batch,) bool start their next search cold.
+
+        Raises:
+            TypeError: The mask is not a tensor.
+            ValueError: The mask does not have one value for each environment.
+        """
+        check_shape("mask", mask, self.is_warm.shape)
         return replace(self, is_warm=self.is_warm & ~mask.to("cpu", torch.bool))
 
     def executed(self, elapsed: Tensor) -> Plan:

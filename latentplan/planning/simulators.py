@@ -17,7 +17,7 @@ from torch import Tensor
 from torch.utils._pytree import TreeSpec, tree_flatten, tree_leaves, tree_structure, tree_unflatten
 
 from latentplan.config.extras import import_extra
-from latentplan.planning.model import State
+from latentplan.planning.model import State, check_shape, check_tensor
 
 if TYPE_CHECKING:
     import mujoco
@@ -123,6 +123,7 @@ class MuJoCoModel:
         before, sensordata, last, is_stable = self._advance(start, controls)
         rows = self._physics(rearrange(before, "row step ... -> (row step) ..."), self._by_name(sensordata))
         costs = self.cost(rows, rearrange(controls, "row step action -> (row step) action"))
+        check_tensor("cost", costs, rows.time.shape)
         if costs.shape != rows.time.shape:
             raise ValueError(f"cost must return shape {tuple(rows.time.shape)}, got {tuple(costs.shape)}")
         rewards = -rearrange(costs, "(row step) -> row step", row=len(start)).masked_fill(~is_stable, float("nan"))
@@ -131,7 +132,9 @@ class MuJoCoModel:
     def _value(self, state: Tensor) -> Tensor:
         """Returns minus the terminal cost of states, (rows,)."""
         assert self.terminal_cost is not None
-        return -self.terminal_cost(self.physics(state.cpu())).to(state)
+        cost = self.terminal_cost(self.physics(state.cpu()))
+        check_shape("terminal_cost", cost, state.shape[:1])
+        return -cost.to(state)
 
     def _advance(self, start: Tensor, controls: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """Simulates the controls (rows, horizon, action).

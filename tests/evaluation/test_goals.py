@@ -246,3 +246,7 @@ def test_evaluate_films_a_taller_picture_when_goals_are_given(tmp_path, checkpoi
         capture = cv2.VideoCapture(str(path))
         shapes.append(capture.read()[1].shape)
     assert shapes[1][0] > shapes[0][0] and shapes[1][1] == shapes[0][1]
+
+
+def test_read_goals_returns_none_when_no_goal_is_named():
+    assert read_goals(None, None, "cartpole") is None and read_goals(None, " ; ", "cartpole") is None

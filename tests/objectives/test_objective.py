@@ -202,7 +202,10 @@ def test_build_objective_can_be_added_to_the_learned_return():
     assert isinstance(mixed, Objective) and mixed.needs_states
 
 
-@pytest.mark.parametrize(("objective", "constraints"), [(5, ()), (None, ["cart < 0.5"]), (None, ("cart < 0.5", "a"))])
+@pytest.mark.parametrize(
+    ("objective", "constraints"),
+    [(5, ()), (None, ["cart < 0.5"]), (None, ("cart < 0.5", "a")), (None, learned_return())],
+)
 def test_build_goals_refuses_values_that_are_not_text_or_functions(objective, constraints):
     model = Cart()
     model.labels = SCALES
@@ -215,6 +218,13 @@ def test_build_goals_refuses_values_that_are_not_text_or_functions(objective, co
             planner=CEMPlanner(action_dim=1, horizon=2),
             encode_goal=lambda path: torch.zeros(1),
         )
+
+
+def test_blank_text_sets_no_constraint():
+    model = Cart()
+    model.labels = SCALES
+    parts = {"env": EnvConfig(domain="cartpole"), "planner": CEMPlanner(action_dim=1), "encode_goal": None}
+    assert build_goals(None, " ; ", model=model, **parts) == (None, ())
 
 
 @pytest.mark.parametrize(

@@ -169,3 +169,33 @@ def test_parse_constraints_returns_one_clause_per_inequality():
 def test_parse_constraints_refuses_text_that_is_not_an_inequality(text):
     with pytest.raises(UserError, match="a constraint is an inequality"):
         parse_constraints(text, WALKER)
+
+
+@pytest.mark.parametrize("text", ["height > 1;", "; height > 1", " height > 1 ; ; ", "height > 1"])
+def test_blank_parts_are_skipped(text):
+    assert [clause.text for clause in parse_constraints(text, WALKER)] == ["height > 1"]
+    assert [(phase.start, phase.objective.text) for phase in parse_schedule(text, WALKER)] == [(0, "height > 1")]
+
+
+@pytest.mark.parametrize("text", ["", "  ", " ; ;"])
+def test_blank_text_gives_no_constraints_and_is_no_objective(text):
+    assert parse_constraints(text, WALKER) == ()
+    with pytest.raises(UserError, match="position 1: "):
+        parse_schedule(text, WALKER)
+
+
+@pytest.mark.parametrize(
+    ("parse", "text", "position"),
+    [
+        (parse_constraints, "height > 1; sped < 2", 13),
+        (parse_constraints, "  height > 1;; upright > 0; speed -> 1", 27),
+        (parse_constraints, "height > 1; speed > ", 20),
+        (parse_constraints, "height > 1; speed > ; upright > 0", 20),
+        (parse_schedule, "height > 1; 500: sped -> 1", 18),
+        (parse_schedule, "height > 1; 500: ; 800: speed", 17),
+    ],
+)
+def test_error_in_a_later_part_names_its_position_in_the_whole_text(parse, text, position):
+    with pytest.raises(UserError) as error:
+        parse(text, WALKER)
+    assert f"expression {text.strip()!r}, position {position}: " in str(error.value)

@@ -92,6 +92,16 @@ def test_rollout_controller_pads_the_shifted_plan_with_zero():
     assert controller.warm_start is None
 
 
+@pytest.mark.parametrize(("low", "high"), [(0.5, 1.0), ([0.5, -3.0], [1.0, -1.0])])
+def test_search_starts_and_ends_in_the_middle_of_the_bounds(low, high):
+    optimizer = CEMTrajectoryOptimizer(3, 2, action_low=low, action_high=high)
+    middle, seen = (np.asarray(low) + np.asarray(high)) / 2, []
+    controller = ModelPredictiveController(optimizer, lambda state, sequence: seen.append(sequence) or 0.0)
+    controller.act(np.zeros(1))
+    np.testing.assert_allclose(seen[0], np.broadcast_to(middle, (3, 2)))
+    np.testing.assert_allclose(controller.warm_start[-1], np.broadcast_to(middle, 2))
+
+
 def test_optimizer_searches_the_whole_action_range():
     optimizer = CEMTrajectoryOptimizer(3, 1, action_low=-100.0, action_high=100.0)
     mean, _ = optimizer.plan(np.zeros(1), lambda state, sequence: -float(((sequence - 50.0) ** 2).sum()))

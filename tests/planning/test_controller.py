@@ -1,5 +1,6 @@
 """Receding-horizon control: the plan that the controller keeps between steps, and the calls that drop it."""
 
+import dataclasses
 import itertools
 
 import pytest
@@ -253,3 +254,33 @@ def test_controller_continues_a_plan_in_another_precision(states, make_controlle
     assert controller.act(states.double()).dtype == torch.float64
     assert controller.act(states).dtype == torch.float32
     assert controller.act(states.double()).dtype == torch.float64
+
+
+@dataclasses.dataclass
+class Body:
+    position: torch.Tensor
+    velocity: torch.Tensor
+
+
+class BodyModel:
+    def step(self, state, action):
+        velocity = state.velocity + 0.3 * action
+        return Body(state.position + velocity, velocity), -state.position.square().sum(dim=1)
+
+
+def test_act_where_takes_a_dataclass_state_at_the_first_call(make_planner, seeded):
+    controller = ModelPredictiveController(make_planner(), BodyModel(), generator=seeded())
+    body = Body(torch.ones(3, 2), torch.zeros(3, 2))
+    assert controller.act_where(body, torch.tensor([True, False, True])).shape == (2, 2)
+
+
+def test_controller_names_masks_of_another_shape(states, make_controller):
+    controller = make_controller()
+    controller.act(states)
+    with pytest.raises(ValueError, match=r"mask must have shape \(5,\), got \(1,\)"):
+        controller.reset(torch.tensor([True]))
+    with pytest.raises(TypeError, match=r"mask must be a tensor of shape \(5,\), got list"):
+        controller.reset([True] * 5)
+    with pytest.raises(ValueError, match=r"where must have shape \(5,\), got \(2,\)"):
+        controller.act_where(states, torch.tensor([True, False]))
+    assert controller.plan.is_warm.all()

@@ -11,6 +11,7 @@ from latentplan.planning import (
     goal_term,
     learned_return,
     mppi_planner,
+    rate_limit,
     risk,
     smoothness_penalty,
     terminal_value,
@@ -245,6 +246,18 @@ def test_candidate_is_infeasible_when_its_violation_is_nan(walk, make_planner, s
     assert (plan.action[:, 0] <= 0).all()
 
 
+@pytest.mark.parametrize("penalty", [None, 1.0])
+def test_search_counts_and_warns_of_violations_that_are_nan(walk, make_planner, seeded, penalty):
+    constraint = at_every_state(lambda state: torch.where(state[:, 1] > 5, state[:, 0] * float("nan"), 0.0))
+    plan = make_planner(constraint_penalty=penalty).plan(
+        walk, torch.tensor([[0.0, 0.0], [0.0, 99.0]]), constraints=[constraint], generator=seeded(), keep="candidates"
+    )
+    assert plan.info["num_nonfinite"].tolist() == [0, 3 * 64] and plan.info["is_fallback"].tolist() == [False, True]
+    assert not any(iteration.is_feasible[1].any() for iteration in plan.candidates)
+    with pytest.warns(RuntimeWarning, match="nothing finite"):
+        plan.warn_of_failures()
+
+
 def test_at_every_state_sums_the_excess_over_the_steps(walk, actions):
     constraint = at_every_state(lambda state: state[:, 0] - 0.5)
     excess = (actions.cumsum(dim=2)[..., 0] - 0.5).clamp_min(0).sum(dim=2)
@@ -261,6 +274,8 @@ def test_goal_term_and_risk_name_a_bad_argument():
         risk(learned_return(), measure="best")
     with pytest.raises(ValueError, match="goal"):
         goal_term(torch.zeros(2, 2, 2))
+    with pytest.raises(ValueError, match=r"a goal is a tensor .*, got list"):
+        goal_term([0.0, 0.0])
 
 
 def test_terms_are_subtracted_from_and_divided_by_numbers(walk, actions):
@@ -278,3 +293,31 @@ def test_constraint_sets_the_number_of_particles(make_planner, seeded):
 
     make_planner().plan(Gamble(), torch.zeros(1, 1), constraints=[risk(watch, num_particles=4)], generator=seeded())
     assert set(seen) == {4}
+
+
+def test_plan_names_terms_of_a_wrong_kind(walk, make_planner):
+    def refuses(message, **goals):
+        with pytest.raises((TypeError, ValueError), match=message):
+            make_planner().plan(walk, torch.zeros(1, 2), **goals)
+
+    refuses("the objective must be a tensor of shape .64,., got float", objective=lambda rollout: 1.0)
+    refuses("the objective must be a tensor of shape .64,., got NoneType", objective=lambda rollout: None)
+    refuses("the objective must be .*, got ndarray", objective=lambda rollout: rollout.rewards.sum(1).numpy())
+    refuses("the objective of risk.. must be .*, got float", objective=risk(lambda rollout: 1.0, num_particles=2))
+    refuses("objective must be a function of rollouts, got 'height > 1'; only an agent's", objective="height > 1")
+    refuses("a constraint must be .*, got int", constraints=[lambda rollout: 0])
+    refuses("constraints must be a sequence of functions.*, got one function", constraints=rate_limit(0.1))
+    refuses("constraints must be a sequence of functions.*, got 'cart < 1'", constraints="cart < 1")
+    refuses("constraints must be a sequence of functions.*, got None", constraints=None)
+    for function, got in ((lambda state: state, ".64, 2."), (torch.max, "..")):
+        refuses(f"at_every_state.. must have shape .64,., got {got}", constraints=[at_every_state(function)])
+    refuses("at_every_state.. must be .*, got float", constraints=[at_every_state(lambda state: 0.0)])
+    for select, got in ((lambda state: state[:, 0], "shape .64,."), (lambda state: (state,), "tuple")):
+        goal = goal_term(torch.zeros(2), select=select)
+        refuses(f"goal_term.. compares features .rows, feature., which select returns, got {got}", objective=goal)
+
+
+def test_uncertainty_of_a_wrong_kind_is_named(walk, make_planner):
+    walk.uncertainty = lambda state, action: 0.0
+    with pytest.raises(TypeError, match="uncertainty.. must be a tensor of shape .64,., got float"):
+        make_planner().plan(walk, torch.zeros(1, 2), objective=uncertainty_penalty())

@@ -149,6 +149,10 @@ def test_mujoco_model_refuses_what_cannot_be_planned(mjmodel, make, message):
 def test_mujoco_model_names_the_shape_of_a_wrong_cost(mjmodel, start):
     with pytest.raises(ValueError, match=r"cost must return shape \(3,\), got \(3, 1\)"):
         MuJoCoModel(mjmodel, lambda physics, action: physics.qpos).rollout(start, torch.zeros(1, 3, 2))
+    with pytest.raises(TypeError, match=r"cost must be a tensor of shape \(3,\), got float"):
+        MuJoCoModel(mjmodel, lambda physics, action: 1.0).rollout(start, torch.zeros(1, 3, 2))
+    with pytest.raises(TypeError, match=r"terminal_cost must be a tensor of shape \(1,\), got float"):
+        MuJoCoModel(mjmodel, cost, lambda physics: 1.0).value(start)
 
 
 @pytest.mark.parametrize("name", ["mujoco", "jax"])

@@ -15,7 +15,7 @@ from torch import Tensor
 from torch.utils._pytree import tree_map
 
 from latentplan.planning.model import Model, State, count_rows
-from latentplan.planning.objectives import Constraint, Term
+from latentplan.planning.objectives import Constraint, Term, check_constraints
 from latentplan.planning.plan import Plan
 from latentplan.planning.realtime.worker import (
     CLOSING_SECONDS,
@@ -130,9 +130,14 @@ class BackgroundPlanner:
         constraints: See `CEMPlanner.plan`.
         worker: `process` or `thread`.
 
+    Attributes:
+        objective: The objective of the next request.
+        constraints: The constraints of the next request.
+
     Raises:
         ValueError: `worker` has another value.
-        TypeError: Planner, model, objective or constraints cannot be pickled.
+        TypeError: Planner, model, objective or constraints cannot be pickled, or the constraints are no sequence of
+            functions.
     """
 
     def __init__(
@@ -146,7 +151,9 @@ class BackgroundPlanner:
     ) -> None:
         if worker not in WORKERS:
             raise ValueError(f"worker must be one of {', '.join(WORKERS)}, got {worker!r}")
-        problem = (planner, model, objective, tuple(constraints))
+        check_constraints(constraints)
+        self.objective, self.constraints = objective, tuple(constraints)
+        problem = (planner, model, self.objective, self.constraints)
         self._goals: Goals | bytes | None = None  # sent with the next request
         self._is_idle, self._is_closed = True, False
         self._ready = threading.Event()
@@ -177,15 +184,21 @@ class BackgroundPlanner:
     def set_objective(self, objective: Term | None = None, constraints: Sequence[Constraint] = ()) -> None:
         """Changes objective and constraints, from the next request on.
 
+        A `PlanScheduler` that uses this planner does not notice the call: change both by
+        `PlanScheduler.set_objective`.
+
         Args:
             objective: See `CEMPlanner.plan`.
             constraints: See `CEMPlanner.plan`.
 
         Raises:
-            TypeError: The objective or a constraint cannot be pickled; the old ones stay.
+            TypeError: The objective or a constraint cannot be pickled, or the constraints are no sequence of functions;
+                the old ones stay.
         """
+        check_constraints(constraints)
         goals = (objective, tuple(constraints))
         self._goals = goals if self.process is None else dump(goals)
+        self.objective, self.constraints = goals
 
     def request(self, state: State, tick: int, previous: Plan | None = None, seed: int | None = None) -> bool:
         """Starts the search of a plan whose first action is due at `tick`; see `PlanExecutor.request`."""

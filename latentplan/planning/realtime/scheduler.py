@@ -105,7 +105,8 @@ class PlanScheduler:
     Args:
         planner: Planner of the executor; only its horizon and action bounds are read.
         model: Predicts states; its `policy`, if any, acts where there is no plan, and corrects planned actions.
-        executor: Computes plans.
+        executor: Computes plans. Where it has the attributes `objective` and `constraints`, the scheduler starts with
+            them, as if `set_objective` had been called with them.
         max_age: See `PlanBuffer`.
         fresh_ticks: See `PlanBuffer`; None follows the predicted latency.
         generator: Draws the seed of each request; None leaves the seed to the executor.
@@ -122,7 +123,6 @@ class PlanScheduler:
         generator: torch.Generator | None = None,
     ) -> None:
         self.planner, self.model, self.executor, self.generator = planner, model, executor, generator
-        self._acting: Any = model  # the model, or the view of a learned goal, with the policy that acts
         self.buffer = PlanBuffer(max_age, 1 if fresh_ticks is None else fresh_ticks)
         self.tick = 0  # of the next decision; never reset, so that a late plan is not mistaken for a newer plan
         self._follows_latency = fresh_ticks is None
@@ -133,8 +133,8 @@ class PlanScheduler:
         self._nominals: dict[int, NominalTrajectory] = {}  # by the tick of the plan's first action
         self._last: tuple[int, Plan] | None = None
         self._batch: int | None = None
-        self._limits: list[Tensor] = []  # rate limits among the constraints, each (1,) or (action,)
         self._action: Tensor | None = None  # of the last tick, (batch, action)
+        self._follow(getattr(executor, "objective", None), getattr(executor, "constraints", ()))
 
     @property
     def latency_ticks(self) -> int:
@@ -178,14 +178,18 @@ class PlanScheduler:
         decision on.
         """
         self.executor.set_objective(objective, constraints)
-        self._limits, _ = split_limits(constraints)
-        self._acting, _ = apply_view(self.model, objective)
+        self._follow(objective, constraints)
 
     def reset(self) -> None:
         """Drops all plans, and the plan of the running request when it arrives."""
         self.buffer.clear()
         self._nominals = {}
         self._requested = self._last = self._action = None
+
+    def _follow(self, objective: Term | None, constraints: Sequence[Constraint]) -> None:
+        """Finds the rate limits of the next decisions, and the model or view whose policy acts."""
+        self._limits, _ = split_limits(constraints)  # each (1,) or (action,)
+        self._acting: Any = apply_view(self.model, objective)[0]
 
     def _collect(self) -> None:
         """Puts a finished plan, if there is one, into the buffer."""

@@ -10,6 +10,7 @@ from typing import Any
 
 import torch
 
+from latentplan.config.checks import shown
 from latentplan.config.planner import WIDEST_STD, SearchOptions, check_whole
 from latentplan.planning.model import Bound, Model, State, per_dimension, per_step
 from latentplan.planning.objectives import Constraint, Term
@@ -97,7 +98,7 @@ class CEMPlanner(SearchOptions):
 
     @cached_property
     def first_searches(self) -> FirstSearches:
-        """The models that this planner has searched in; the first search in each watches the model."""
+        """The models that this planner has searched in; the first candidates in each are watched."""
         return FirstSearches()
 
     @cached_property
@@ -144,8 +145,9 @@ class CEMPlanner(SearchOptions):
             The plan; `Plan` describes the diagnostics in its `info`.
 
         Raises:
-            ValueError: The model lacks a method that an option needs, a method of the model returned a wrong shape, or
-                the deadline is negative.
+            TypeError: An argument, or what the user's functions returned, has a wrong type.
+            ValueError: The model lacks a method that an option needs, a method of the model returned a wrong shape,
+                the bounds are no pair, or the deadline is negative.
         """
         clock = self.clock or time.perf_counter
         started = clock()
@@ -156,12 +158,11 @@ class CEMPlanner(SearchOptions):
             raise ValueError(f"keep must be candidates, states or None, got {keep!r}")
         # In inference mode the plan could not be a training target, and gradient steps would fail.
         with torch.inference_mode(False), torch.no_grad():
-            low, high = self.bounds if bounds is None else self._read_bounds(*bounds)
+            low, high = self.bounds if bounds is None else self._read_bounds(*_as_pair(bounds))
             last = None if last_action is None else torch.as_tensor(last_action)
-            is_new = self.first_searches.add(model)
             start, spread, discount = self._init_mean, self._init_std, self.discount
-            goals = (objective, constraints)
-            problem = Problem(model, state, *goals, low, high, start, spread, discount, self.choices, last, is_new)
+            goals, seen = (objective, constraints), self.first_searches
+            problem = Problem(model, state, *goals, low, high, start, spread, discount, self.choices, last, seen)
             search = Search(self, problem, generator, previous, View(keep, callback))
             seconds = None if deadline_ms is None else deadline_ms / 1000
             return search.run(search.budget(self.pace, clock, started, seconds))
@@ -233,6 +234,19 @@ OWN_OPTIONS: dict[Callable[..., Any], set[str]] = {
     icem_planner: set(ICEM),
     mppi_planner: {*MPPI, "num_elites", "warm_start_iterations"},
 }
+
+
+def _as_pair(bounds: Any) -> tuple[Bound, Bound]:
+    """Returns the lowest and the highest action of a call.
+
+    Raises:
+        ValueError: The bounds are no pair.
+    """
+    try:
+        low, high = bounds
+    except (TypeError, ValueError):
+        raise ValueError(f"bounds must be a pair (lowest action, highest action), got {shown(bounds)}") from None
+    return low, high
 
 
 def _check_problem(planner: CEMPlanner) -> None:

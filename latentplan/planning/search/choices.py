@@ -6,6 +6,7 @@ The elites refit the probability of each value, as they refit mean and variance 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from numbers import Integral
 from typing import Any
 
 import torch
@@ -132,11 +133,11 @@ def read_choices(given: Any, action_dim: int) -> dict[int, tuple[float, ...]]:
     by_dimension = given if isinstance(given, Mapping) else dict.fromkeys(range(action_dim), given)
     choices: dict[int, tuple[float, ...]] = {}
     for dim, some in by_dimension.items():
-        if isinstance(dim, bool) or not isinstance(dim, int) or not 0 <= dim < action_dim:
+        if isinstance(dim, bool) or not isinstance(dim, Integral) or not 0 <= int(dim) < action_dim:
             raise ValueError(f"action_choices names dimension {dim!r}; dimensions are 0 to {action_dim - 1}")
-        values = tuple(map(float, range(some) if isinstance(some, int) else some))
+        values = tuple(map(float, range(int(some)) if isinstance(some, Integral) else some))
         is_finite = bool(torch.isfinite(torch.tensor(values)).all())
         if len(set(values)) < 2 or len(set(values)) != len(values) or not is_finite:
             raise ValueError(f"action_choices needs two different finite values or more, got {some!r} for {dim}")
-        choices[dim] = values
+        choices[int(dim)] = values
     return choices

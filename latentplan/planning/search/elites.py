@@ -24,6 +24,12 @@ class Scores(NamedTuple):
     violations: Tensor | None = None
     is_ranked: bool = True
 
+    @property
+    def is_finite(self) -> Tensor:
+        """Whether return and violation are finite, (batch, sample) bool; other candidates are never elites."""
+        is_finite = torch.isfinite(self.returns)
+        return is_finite if self.violations is None else is_finite & torch.isfinite(self.violations)
+
     def first(self, num: int) -> Scores:
         """Returns the scores of the first `num` candidates."""
         return self._part(slice(num))
@@ -119,9 +125,8 @@ def select_elites(candidates: Tensor, scores: Scores, *, num_elites: int, temper
         temperature: See `refit`.
     """
     returns, violations, is_ranked = scores
-    is_finite = torch.isfinite(returns)
+    is_finite = scores.is_finite
     if violations is not None:
-        is_finite = is_finite & torch.isfinite(violations)
         violations = violations.masked_fill(~is_finite, float("inf"))
     returns = returns.masked_fill(~is_finite, float("-inf"))
     if violations is None or not is_ranked:

@@ -80,6 +80,7 @@ class Search:
         self.batch, self.device = count_rows(self.state), state_device(self.state)
         self.dtype = action_dtype(self.state)
         self.problem, self.previous = problem, previous
+        self.is_new = problem.first_searches.is_new(problem.model)
         self.horizon = options.horizon if objective is None else options.goal_horizon or options.horizon
         low, high = (self._per_step(value, name) for name, value in (("low", problem.low), ("high", problem.high)))
         choices = Choices(problem.choices, self.dtype, self.device) if problem.choices else None
@@ -143,7 +144,7 @@ class Search:
             stopped = "deadline" if is_late else stopped
         actions, expected, violation = choice
         info = {**progress.describe(history, stopped), "is_policy": torch.zeros_like(progress.has_elites)}
-        info |= _describe_rest(progress, violation, pause)
+        info |= _describe_rest(progress, self._add_excess(violation, actions), pause)
         kept = None
         if progress.elites is not None and options.num_kept:
             kept = space.carry(progress.elites.actions[:, : options.num_kept])
@@ -188,7 +189,7 @@ class Search:
         unknown = torch.full_like(progress.expected_return, float("nan")) if self.scorer.constraints else None
         pause = self._pause() if self.options.gradient_steps else None
         info = {**progress.describe([], "deadline"), "is_policy": is_policy}
-        info |= _describe_rest(progress, unknown, pause)
+        info |= _describe_rest(progress, self._add_excess(unknown, actions), pause)
         ones = torch.ones(self.batch, dtype=torch.long)
         elites, is_warm = shifted.elites, shifted.is_warm
         mean, var = self.space.decode(progress.mean), self.space.decode_var(progress.var)
@@ -223,10 +224,10 @@ class Search:
                 fresh = fresh if proposals is None else torch.cat([fresh, self.space.encode(proposals)], dim=1)
             if iteration <= 1:  # later iterations have as many candidates as the second, which has no new proposals
                 rows = self.scorer.start_rows(self.state, fresh.shape[1])
-            scores, states = self._score(rows, fresh, is_new=is_first and self.problem.is_new)
+            scores, states = self._score(rows, fresh, is_watched=is_first and self.is_new)
             if is_first:
                 scores = _ignore_nan_actions(fresh, scores)
-            updated = self._refit(progress, [(fresh, scores), *known, *self._keep(progress, known)], scores.returns)
+            updated = self._refit(progress, [(fresh, scores), *known, *self._keep(progress, known)], scores)
             if is_first:  # the policy's proposals and the shifted previous plan stay candidates, with their scores
                 known = [(fresh[:, num_fresh:], scores.rest(num_fresh)), (fresh[:, :1], scores.first(1))]
             elif iteration >= num_common:  # environments that have used up their iterations stay as they are
@@ -239,37 +240,39 @@ class Search:
             budget.lap("iteration")
         return progress, kept, history, stopped
 
-    def _score(self, rows: State, points: Tensor, *, is_new: bool) -> tuple[Scores, State]:
+    def _score(self, rows: State, points: Tensor, *, is_watched: bool) -> tuple[Scores, State]:
         """Returns the scores of points, and the states of their rollouts if the caller keeps them, else None."""
         actions = self.space.decode(points)
-        watch = Watch(rows, actions) if is_new else None
+        watch = Watch(rows, actions) if is_watched else None
         with_states = self.view.keep == "states"
         try:
             rollout = self.scorer.imagine(rows, actions, with_states=with_states)
             scores = self.scorer.score_rollout(rollout)
         except Exception as error:
-            if is_new and "single memory location" in str(error):  # rows of one environment share their memory
+            if is_watched and "single memory location" in str(error):  # rows of one environment share their memory
                 raise ValueError(describe_writing(self.model, "state")) from error
-            if is_new:
+            if is_watched:
                 error.add_note("check_model(model, state, planner=planner) lists everything that a planner needs")
             raise
         if watch is not None:
             watch.check(self.model)
+            self.problem.first_searches.add(self.problem.model)
         return scores, self.scorer.arrange_states(rollout) if with_states else None
 
     def _show(
         self, index: int, points: Tensor, scores: Scores, states: State, progress: Progress, kept: list[Iteration]
     ) -> None:
         """Describes an iteration to the callback and among the kept ones."""
-        is_feasible = torch.isfinite(scores.returns)
-        if scores.violations is not None:
-            is_feasible = is_feasible & (scores.violations == 0)
+        actions, is_feasible = self.space.decode(points), torch.isfinite(scores.returns)
+        violations = self._add_excess(scores.violations, actions)
+        if violations is not None:
+            is_feasible = is_feasible & (violations == 0)
         described = Iteration(
             index,
-            self.space.decode(points),
+            actions,
             scores.returns,
             is_feasible,
-            scores.violations,
+            violations,
             states,
             self.space.decode(self.space.clean(progress.mean)),
             self.space.decode_var(progress.var).sqrt(),
@@ -279,6 +282,13 @@ class Search:
             kept.append(described)
         if self.view.callback is not None:
             self.view.callback(described)
+
+    def _add_excess(self, violation: Tensor | None, actions: Tensor) -> Tensor | None:
+        """Returns the violation of all constraints, given that of those other than rate limits; None without any."""
+        excess = self.space.excess_change(actions)
+        if violation is None or excess is None:
+            return excess if violation is None else violation
+        return violation + excess
 
     def _begin(self, start: WarmStart) -> Progress:
         """Returns the progress before the first refit."""
@@ -324,7 +334,7 @@ class Search:
         is_known = (actions[:, :, None] == others[:, None]).flatten(3).all(dim=3).any(dim=2)
         return [(actions, scores._replace(returns=scores.returns.masked_fill(is_known, float("nan"))))]
 
-    def _refit(self, progress: Progress, candidates: list[Candidates], fresh_returns: Tensor) -> Progress:
+    def _refit(self, progress: Progress, candidates: list[Candidates], fresh: Scores) -> Progress:
         options = self.options
         elites = select_elites(
             torch.cat([actions for actions, _ in candidates], dim=1),
@@ -346,7 +356,7 @@ class Search:
             probabilities,
             elites,
             torch.where(has_elites, mean_return(elites), progress.expected_return),
-            progress.num_nonfinite + (~torch.isfinite(fresh_returns)).sum(dim=1),
+            progress.num_nonfinite + (~fresh.is_finite).sum(dim=1),
             progress.iterations + 1,
             progress.has_elites | has_elites,
         )

@@ -9,10 +9,12 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from latentplan.config.checks import shown
 from latentplan.config.planner import SearchOptions
 from latentplan.planning.model import Model, State
-from latentplan.planning.objectives import Constraint, Objective, Term
+from latentplan.planning.objectives import Constraint, Objective, Term, check_constraints
 from latentplan.planning.plan import Iteration
+from latentplan.planning.search.purity import FirstSearches
 from latentplan.planning.search.space import Bounds, Space
 
 
@@ -34,7 +36,11 @@ class Problem:
         discount: Discount per model step, in (0, 1].
         choices: By dimension, the values of discrete actions.
         last_action: The action executed last, (batch, action); None takes it from the previous plan.
-        is_new: Whether this is the first search in the model, so that the model is watched for changes of its inputs.
+        first_searches: The models that were watched for changes of their inputs; the search watches a new model, and
+            adds the model if it changed none.
+
+    Raises:
+        TypeError: The objective is neither None nor a function.
     """
 
     model: Model
@@ -48,7 +54,13 @@ class Problem:
     discount: float
     choices: Mapping[int, Sequence[float]]
     last_action: Tensor | None
-    is_new: bool
+    first_searches: FirstSearches
+
+    def __post_init__(self) -> None:
+        """Refuses an objective that is not a function."""
+        if self.objective is not None and not callable(self.objective):
+            hint = "; only an agent's set_objective() takes text" if isinstance(self.objective, str) else ""
+            raise TypeError(f"objective must be a function of rollouts, got {shown(self.objective)}{hint}")
 
 
 @dataclass(frozen=True)
@@ -70,7 +82,12 @@ class View:
 
 
 def split_limits(constraints: Sequence[Constraint]) -> tuple[list[Tensor], list[Constraint]]:
-    """Returns the rate limits among the constraints, which the search space holds, and the other constraints."""
+    """Returns the rate limits among the constraints, which the search space holds, and the other constraints.
+
+    Raises:
+        TypeError: The constraints are no sequence of functions.
+    """
+    check_constraints(constraints)
     limits, others = [], []
     for constraint in constraints:
         if isinstance(constraint, Objective) and constraint.max_change is not None:

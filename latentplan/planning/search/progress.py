@@ -22,9 +22,9 @@ class Progress(NamedTuple):
             dimensions.
         elites: Elites of the last refit; None before the first.
         expected_return: Mean return of the last elites, NaN before the first refit, (batch,).
-        num_nonfinite: Number of candidates so far whose return was not finite, (batch,).
+        num_nonfinite: Number of candidates so far whose return or violation was not finite, (batch,).
         iterations: Number of refits so far, (batch,).
-        has_elites: Whether any candidate so far had a finite return, (batch,).
+        has_elites: Whether any candidate so far had a finite return and violation, (batch,).
     """
 
     mean: Tensor

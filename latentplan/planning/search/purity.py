@@ -19,12 +19,16 @@ class FirstSearches:
     def __init__(self) -> None:
         self._seen: dict[int, Any] = {}
 
+    def is_new(self, model: object) -> bool:
+        """Returns whether a model is not remembered."""
+        known = self._seen.get(id(model))
+        return known is None or known() is not model
+
     def add(self, model: object) -> bool:
-        """Remembers a model; returns whether this is its first search."""
-        key = id(model)
-        known = self._seen.get(key)
-        if known is not None and known() is model:
+        """Remembers a model; returns whether the model was new."""
+        if not self.is_new(model):
             return False
+        key = id(model)
         with contextlib.suppress(TypeError):  # without weak references a model cannot be told from a later one
             self._seen[key] = weakref.ref(model, lambda _: self._seen.pop(key, None))
         return True

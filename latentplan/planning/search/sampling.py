@@ -8,6 +8,7 @@ from functools import lru_cache
 import torch
 from torch import Tensor
 
+from latentplan.config.checks import shown
 from latentplan.planning.search.products import contract
 
 # Chosen on the problems of `scripts/bench/problems.py`: smooth sequences find other ways, white ones improve each step.
@@ -30,15 +31,16 @@ class Streams:
         device: Device of the noise.
 
     Raises:
+        TypeError: The generator is neither a generator nor a list of generators.
         ValueError: The list of generators does not have one for each environment.
     """
 
     def __init__(self, generator: Generators, batch: int, device: torch.device) -> None:
         is_shared = generator is None or isinstance(generator, torch.Generator)
-        sources = [generator] if is_shared else list(generator)  # type: ignore[arg-type]
+        sources = _as_list(generator)
         if not is_shared and len(sources) != batch:
             raise ValueError(f"a list of generators needs one for each of {batch} environments, got {len(sources)}")
-        seeds = [_draw_seeds(source) for source in sources]  # type: ignore[arg-type]
+        seeds = [_draw_seeds(source) for source in sources]
         self._noise = [torch.Generator(device).manual_seed(first) for first, _ in seeds]
         self._policy_seeds = [second for _, second in seeds] * (batch if is_shared else 1)
         self._device = device
@@ -83,6 +85,16 @@ class Streams:
         """Returns the stream of a model that samples, which all environments of the call share."""
         seed = sum(self._policy_seeds) % 2**62 ^ MODEL_STREAM
         return torch.Generator(self._device).manual_seed(seed)
+
+
+def _as_list(generators: Generators) -> list[torch.Generator | None]:
+    if generators is None or isinstance(generators, torch.Generator):
+        return [generators]
+    if not isinstance(generators, Sequence) or not all(isinstance(each, torch.Generator) for each in generators):
+        raise TypeError(
+            f"generator must be a torch.Generator or a list with one for each environment, got {shown(generators)}"
+        )
+    return list(generators)
 
 
 def _draw_seeds(generator: torch.Generator | None) -> tuple[int, int]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from einops import rearrange, reduce, repeat
@@ -15,6 +16,7 @@ from latentplan.planning.model import (
     State,
     call_with,
     check_shape,
+    check_tensor,
     count_rows,
     has_policy,
     repeat_rows,
@@ -260,9 +262,8 @@ class Scorer:
         return Scores(returns - self.penalty * violations, violations, is_ranked=False)
 
 
-def _check_reward(reward: Tensor, rows: int) -> None:
-    if not isinstance(reward, Tensor):
-        raise TypeError(f"step()'s reward must be a tensor of shape ({rows},), got {type(reward).__name__}")
+def _check_reward(reward: Any, rows: int) -> None:
+    check_tensor("step()'s reward", reward, (rows,))
     if reward.shape != (rows,):
         raise ValueError(
             f"step()'s reward must have shape ({rows},), got {tuple(reward.shape)}: one number per row; dim 0 of a "

@@ -198,6 +198,28 @@ class Space:
         """Returns a value per step, (1 or batch, 1 or horizon, action), at the steps of a point."""
         return value if self._steps is None or value.shape[1] == 1 else value[:, self._steps]
 
+    def excess_change(self, actions: Tensor) -> Tensor | None:
+        """Returns the changes beyond the rate limit, summed over steps and dimensions; None without a rate limit.
+
+        The sum is above 0 only where the bounds prevail over the limit.
+
+        Args:
+            actions: Decoded actions, (batch, horizon, action) or (batch, sample, horizon, action).
+
+        Returns:
+            The sum, (batch,) or (batch, sample).
+        """
+        if self.max_change is None:
+            return None
+        first = actions[..., :1, :]
+        if self.last_action is not None:
+            last = self.last_action[:, None] if actions.ndim == 3 else self.last_action[:, None, None]
+            first = torch.where(torch.isnan(last), first, last)
+        before = torch.cat([first, actions[..., :-1, :]], dim=-2)
+        # The sums are those of `_limit_changes`, so that a limited action exceeds none of them by rounding.
+        above, below = actions - (before + self.max_change), (before - self.max_change) - actions
+        return (above.clamp_min(0.0) + below.clamp_min(0.0)).sum(dim=(-2, -1))
+
     def _limit_changes(self, actions: Tensor) -> Tensor:
         """Returns the actions with each change limited to `max_change`; the bounds prevail over the limit."""
         if self.max_change is None:

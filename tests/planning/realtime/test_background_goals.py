@@ -5,7 +5,7 @@ import pickle
 import pytest
 import torch
 
-from latentplan.planning import BackgroundPlanner, CEMPlanner, FunctionModel
+from latentplan.planning import BackgroundPlanner, CEMPlanner, FunctionModel, PlanScheduler, conditioned, rate_limit
 from latentplan.planning.objectives import (
     action_penalty,
     at_every_state,
@@ -14,7 +14,7 @@ from latentplan.planning.objectives import (
     risk,
     smoothness_penalty,
 )
-from tests.planning.realtime.integrator import dynamics, reward, wait_for_plan
+from tests.planning.realtime.integrator import dynamics, policy, reward, wait_for_plan
 
 STATE = torch.tensor([[1.0]])
 CEM = CEMPlanner(action_dim=1, horizon=4, num_samples=16, num_elites=4, num_iterations=2)
@@ -105,3 +105,24 @@ def test_poll_raises_until_goals_change_when_the_process_cannot_unpickle_them(pr
     process.set_objective()
     process.request(STATE, 3, seed=3)
     assert wait_for_plan(process)[0] == 3
+
+
+def towards_zero(state, generator):
+    return -state
+
+
+def test_scheduler_holds_a_rate_limit_that_the_background_planner_was_made_with():
+    model = FunctionModel(dynamics, reward, policy=towards_zero)
+    with BackgroundPlanner(CEM, model, constraints=[rate_limit(0.1)], worker="thread") as background:
+        scheduler = PlanScheduler(CEM, model, background)
+        actions = torch.cat([scheduler.decide(sign * STATE).action for sign in (1.0, -1.0, 1.0, -1.0)])
+    assert (actions.diff(dim=0).abs() <= 0.1 + 1e-6).all()
+
+
+def test_scheduler_acts_by_the_goal_that_the_background_planner_was_made_with():
+    model = FunctionModel(dynamics, reward, policy=towards_zero)
+    goal = conditioned(lambda _: FunctionModel(dynamics, reward, value=lambda state: state[:, 0], policy=policy))
+    with BackgroundPlanner(CEM, model, objective=goal, worker="thread") as background:
+        assert torch.equal(PlanScheduler(CEM, model, background).decide(STATE).action, policy(STATE, None))
+        background.set_objective()
+        assert background.objective is None and background.constraints == ()

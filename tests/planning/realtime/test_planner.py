@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import pytest
 import torch
 
-from latentplan.planning import BackgroundPlanner, CEMPlanner, FunctionModel, PlanScheduler
+from latentplan.planning import BackgroundPlanner, CEMPlanner, FunctionModel, PlanScheduler, rate_limit
 from tests.planning.realtime.integrator import dynamics, policy, reward, wait_for_plan
 
 STATE = torch.tensor([[1.0]])
@@ -246,6 +246,13 @@ def test_background_planner_refuses_a_model_that_cannot_be_pickled_and_an_unknow
         assert wait_for_plan(background)[0] == 0
     with pytest.raises(ValueError, match="process, thread"):
         BackgroundPlanner(CEM, MODEL, worker="fork")
+
+
+def test_background_planner_names_a_constraint_that_is_no_sequence(thread):
+    with pytest.raises(TypeError, match="constraints must be a sequence of functions.*, got one function"):
+        BackgroundPlanner(CEM, MODEL, constraints=rate_limit(0.1), worker="thread")
+    with pytest.raises(TypeError, match="constraints must be a sequence of functions.*, got one function"):
+        thread.set_objective(constraints=rate_limit(0.1))
 
 
 def test_state_that_is_refused_leaves_the_planner_idle_and_keeps_the_objective():

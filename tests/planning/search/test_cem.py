@@ -316,3 +316,17 @@ def test_from_config_takes_every_option_of_a_configuration():
         getattr(planner, option.name) == getattr(config, option.name) for option in dataclasses.fields(SearchOptions)
     )
     assert (planner.action_dim, planner.discount, planner.action_low) == (2, 0.9, (-1.0, 0.0))
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"generator": 3}, "generator must be a torch.Generator or a list with one for each environment, got 3"),
+        ({"generator": [1, 2, 3, 4, 5]}, r"a list with one for each environment, got \[1, 2, 3, 4, 5\]"),
+        ({"bounds": 1.0}, r"bounds must be a pair \(lowest action, highest action\), got 1.0"),
+        ({"bounds": (0.0, 0.5, 1.0)}, r"bounds must be a pair .*, got \(0.0, 0.5, 1.0\)"),
+    ],
+)
+def test_plan_names_an_argument_of_a_wrong_kind(point, states, make_planner, arguments, message):
+    with pytest.raises((TypeError, ValueError), match=message):
+        make_planner().plan(point, states, **arguments)

@@ -1,5 +1,6 @@
 """Discrete and mixed actions: the elites refit the probabilities, and everybody sees only values that exist."""
 
+import numpy as np
 import pytest
 import torch
 
@@ -137,6 +138,11 @@ def test_rate_limit_leaves_discrete_dimensions_alone(make_planner, seeded):
 def test_choices_are_refused_when_they_are_none(make_planner, choices):
     with pytest.raises(ValueError, match="action_choices"):
         make_planner(action_choices=choices)
+
+
+@pytest.mark.parametrize("choices", [np.int64(3), {np.int64(0): np.int32(3), 1: np.array([0.0, 1.0, 2.0])}])
+def test_choices_are_numpy_numbers_too(make_planner, choices):
+    assert make_planner(action_choices=choices).choices == {0: (0.0, 1.0, 2.0), 1: (0.0, 1.0, 2.0)}
 
 
 def test_check_model_tries_the_values_of_a_planner(make_planner):

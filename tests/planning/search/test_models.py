@@ -1,5 +1,6 @@
 """Models as people write them: in-place steps, sampling steps, dataclass states, proposals without a policy."""
 
+import contextlib
 import dataclasses
 import pickle
 
@@ -72,6 +73,15 @@ def test_models_are_watched_once_per_planner(point, states, make_planner, monkey
     assert len(copies) == 3
 
 
+@pytest.mark.parametrize("options", [{"objective": lambda rollout: 1 / 0}, {"deadline_ms": 0.0}])
+def test_model_that_writes_into_its_state_is_named_when_the_first_call_scored_nothing(make_planner, options):
+    planner, model = make_planner(), InPlace()
+    with contextlib.suppress(ZeroDivisionError):
+        planner.plan(model, torch.ones(2, 2), **options)
+    with pytest.raises(ValueError, match="InPlace writes into the state"):
+        planner.plan(model, torch.ones(2, 2))
+
+
 def test_first_searches_keep_no_model_alive_and_know_no_later_one():
     seen = FirstSearches()
     model = InPlace()
@@ -120,6 +130,18 @@ class NoisyNetwork(torch.nn.Module):
 def test_module_that_samples_is_given_the_generator(states, make_planner, seeded):
     model = FunctionModel(NoisyNetwork(), lambda state, action: -state.square().sum(dim=1))
     plans = [make_planner().plan(model, states[:, :2], generator=seeded()) for _ in range(2)]
+    assert torch.equal(plans[0].actions, plans[1].actions)
+
+
+def keyword_step(state, action, *, generator):
+    return noisy_step(state, action, generator)
+
+
+def test_dynamics_may_take_the_generator_by_name_only(states, make_planner, seeded):
+    plans = [
+        make_planner().plan(FunctionModel(step, lambda state, action: action[:, 0]), states[:, :2], generator=seeded())
+        for step in (noisy_step, keyword_step)
+    ]
     assert torch.equal(plans[0].actions, plans[1].actions)
 
 

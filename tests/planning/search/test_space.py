@@ -341,9 +341,37 @@ def test_rate_limit_counts_from_the_given_last_action(recorder, make_planner, se
         recorder, torch.zeros(1, 1), constraints=[rate_limit(0.2)], last_action=last, generator=seeded()
     )
     torch.testing.assert_close(plan.action, last + 0.2, atol=0.02, rtol=0)
-    assert "violation" not in plan.info  # every candidate holds the limit
+    assert plan.info["violation"].tolist() == [0.0]  # every candidate holds the limit
     with pytest.raises(ValueError, match="last_action must have shape"):
         make_planner().plan(recorder, torch.zeros(1, 1), constraints=[rate_limit(0.2)], last_action=last[0])
+
+
+@pytest.mark.parametrize(
+    "options", [{}, {"final": "better"}, {"gradient_steps": 3}, {"action_spline": "linear"}, {"overshoot": 2.0}]
+)
+@pytest.mark.parametrize("deadline_ms", [None, 0.0])
+def test_violation_is_zero_where_a_rate_limit_holds(make_planner, seeded, options, deadline_ms):
+    last = torch.tensor([[0.31, -0.47], [float("nan")] * 2, [0.05, 0.9]])
+    given = {"constraints": [rate_limit(0.1)], "last_action": last, "deadline_ms": deadline_ms}
+    plan = make_planner(**options).plan(greedy(), torch.ones(3, 2), generator=seeded(), keep="candidates", **given)
+    assert plan.info["violation"].tolist() == [0.0] * 3
+    assert all((iteration.violations == 0).all() and iteration.is_feasible.all() for iteration in plan.candidates)
+
+
+def test_violation_of_a_rate_limit_is_the_excess_that_the_bounds_enforce(make_planner, seeded):
+    """The bounds allow 0.5 to 1, so that the first action is at least 0.3 beyond the limit in both dimensions."""
+    planner, last = make_planner(action_low=0.5, final="best"), torch.tensor([[0.0, 0.0], [0.5, 0.5]])
+    others, start = [lambda rollout: torch.ones(len(rollout.actions))], -torch.ones(2, 2)
+    for constraints, other in (([rate_limit(0.2)], 0.0), ([rate_limit(0.2), *others], 1.0)):
+        plan = planner.plan(
+            greedy(), start, constraints=constraints, last_action=last, generator=seeded(), keep="candidates"
+        )
+        torch.testing.assert_close(plan.info["violation"], torch.tensor([0.6 + other, other]))
+        for iteration in plan.candidates:
+            assert (iteration.violations[0] >= 0.6 + other - 1e-6).all()
+            assert iteration.is_feasible[1].all() == (not other) and not iteration.is_feasible[0].any()
+    late = planner.plan(greedy(), start, constraints=others, last_action=last, deadline_ms=0.0)
+    assert late.info["violation"].isnan().all()
 
 
 def test_rate_limit_is_a_violation_for_other_planners(point, states):
@@ -409,6 +437,8 @@ def test_plan_around_a_trajectory_starts_the_search_there(recorder, make_planner
     assert Plan.around(trajectory.numpy()).source == "plan"
     with pytest.raises(ValueError, match="a trajectory has shape"):
         Plan.around(trajectory.flatten())
+    with pytest.raises(ValueError, match=r"with one action or more, got \(2, 0, 2\)"):
+        Plan.around(torch.zeros(2, 0, 2))
 
 
 def test_scheduler_without_plan_and_policy_acts_in_the_middle_of_the_bounds(point, make_planner):
