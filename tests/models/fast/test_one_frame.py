@@ -337,3 +337,13 @@ def test_agent_checks_the_weights_once_per_decision(monkeypatch):
     monkeypatch.setattr(ConvertedWeights, "of", lambda *arguments: checks.append(1) or check(*arguments))
     agent.act(frames)
     assert len(checks) == 1
+
+
+def test_model_made_in_inference_mode_decides_outside_it():
+    with torch.inference_mode():
+        model = make_model()
+    state, action, frames = inputs_of(2, model)
+    with torch.no_grad():
+        found = CpuBackend().frame_functions(model).infer(state, action, frames)
+        expected = FrameFunctions(model).infer(state, action, frames)
+    torch.testing.assert_close(found, expected, atol=1e-4, rtol=1e-4)
