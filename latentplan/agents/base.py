@@ -157,6 +157,7 @@ class ModelAgent:
         action, is_reset, noise = (memory[name] for name in ("action", "is_reset", "noise"))
         self._action = None if action is None else action.to(device)
         self._is_reset = None if is_reset is None else is_reset.to(device)
+        self._frame_functions = self.model.backend.frame_functions(self.model)
         self.noise.last = None if noise is None else noise.to(device)
 
     def act(self, frame: Seen) -> np.ndarray:
@@ -168,8 +169,9 @@ class ModelAgent:
                 (batch, vector).
 
         Returns:
-            The action in [-1, 1], float32 (action,) or (batch, action). It is always finite: where the weights
-            give NaN or infinity, the last finite action of the environment, or zeros, is returned with a warning.
+            The action in [-1, 1], float32 (action,) or (batch, action), in memory of its own. It is always finite:
+            where the weights give NaN or infinity, the last finite action of the environment, or zeros, is returned
+            with a warning.
 
         Raises:
             ValueError: The frame has another shape or dtype, or the batch changed without a reset.
@@ -183,10 +185,10 @@ class ModelAgent:
             if self.noise_std > 0.0:
                 noise = self.noise.draw(action, self.generator, self._is_reset)
                 action = self._explore(action, noise)
-            result = action.float().cpu().numpy()
+            result = action.float().cpu().numpy().copy()  # the caller may change it, and the agent keeps the action
             if not np.isfinite(result).all():
                 result = self._replace_actions(result)
-                action = torch.as_tensor(result, device=self.model.device)
+                action = torch.tensor(result, device=self.model.device)
             self.state, self._action, self._is_reset = state, action, None
         return result[0] if single else result
 

@@ -75,6 +75,7 @@ def seal_checkpoint(path: str | Path) -> None:
     seal(folder, (INFO, WEIGHTS))
 
 
+@torch.inference_mode(False)  # a model made of inference tensors could be used in inference mode alone
 def load_model(path: str | Path, device: str = "cpu") -> tuple[WorldModel, Config, dict[str, Any]]:
     """The world model of a checkpoint, the settings of its run, and the description (see `read_info`).
 

@@ -47,7 +47,8 @@ class _Decision(nn.Module):
     def __init__(self, model: WorldModel) -> None:
         super().__init__()
         weights, self._turns = one_frame.convert_weights(model), model.config.turns
-        self._choices = copy.deepcopy(model.actor).cpu() if isinstance(model.actor, MixedActor) else None
+        choices = copy.deepcopy(model.actor) if isinstance(model.actor, MixedActor) else None
+        self._choices = None if choices is None else choices.cpu().float().requires_grad_(False)
         tensors, self._layout = tree_flatten(weights)
         self._names = [f"weight_{index}" for index in range(len(tensors))]
         for name, tensor in zip(self._names, tensors, strict=True):
@@ -135,9 +136,10 @@ def _trace_actor(model: WorldModel) -> ExportedProgram:
 
 
 def _example_inputs(model: WorldModel) -> tuple[Tensor, ...]:
-    vectors = [torch.zeros(EXAMPLE_ROWS, size) for size in input_sizes(model).values()]
-    frame = torch.zeros(EXAMPLE_ROWS, *model.spaces.frame_shape, dtype=torch.uint8)
-    return frame, *vectors, torch.ones(EXAMPLE_ROWS, dtype=torch.bool)
+    with torch.device("cpu"):
+        vectors = [torch.zeros(EXAMPLE_ROWS, size, dtype=torch.float32) for size in input_sizes(model).values()]
+        frame = torch.zeros(EXAMPLE_ROWS, *model.spaces.frame_shape, dtype=torch.uint8)
+        return frame, *vectors, torch.ones(EXAMPLE_ROWS, dtype=torch.bool)
 
 
 def _write_program(program: ExportedProgram, model: WorldModel, path: Path, format: str) -> None:

@@ -179,23 +179,26 @@ class MixedActor(nn.Module):
         self.register_buffer("places", places, persistent=False)
 
     def forward(self, features: Tensor) -> tuple[Tensor, Tensor]:
-        """Mode and std of the action, float32 (..., action) each, for features (..., in)."""
+        """Mode and std of the action, float32 (..., action) each, for features (..., in); NaN features give NaN."""
         mean, std, logits = self._distribution(features)
         probabilities = logits.softmax(-1)
         values = torch.where(self.code.exists, self.code.values(self.code.categories[:, None]).T, 0.0)
         average = (probabilities * values).sum(-1)
         spread = ((probabilities * values.square()).sum(-1) - average.square()).clamp_min(0.0).sqrt()
-        return self.code.join(mean, self.code.values(logits.argmax(-1))), self.code.join(std, spread)
+        return self.code.join(mean, self._values(logits.argmax(-1), logits)), self.code.join(std, spread)
 
     def sample(self, features: Tensor, noise: Tensor) -> Tensor:
-        """Actions in [-1, 1] for standard normal noise, float32 (..., action) each; categories pass no gradient."""
+        """Actions in [-1, 1] for standard normal noise, float32 (..., action) each; categories pass no gradient.
+
+        NaN features give NaN.
+        """
         mean, std, logits = self._distribution(features)
         continuous = sample_action(mean, std, noise[..., self.code.continuous])
         drawn = noise[..., self.code.discrete]
         quantile = torch.special.ndtr(drawn)[..., None]
         category = torch.minimum((logits.softmax(-1).cumsum(-1) < quantile).sum(-1), self.code.counts - 1)
         category = torch.where(drawn == 0.0, logits.argmax(-1), category)
-        return self.code.join(continuous, self.code.values(category))
+        return self.code.join(continuous, self._values(category, logits))
 
     def score(self, features: Tensor, actions: Tensor) -> tuple[Tensor, Tensor]:
         """Log-probability of actions (..., action), and entropy of the distribution in nats, (...) each.
@@ -209,6 +212,11 @@ class MixedActor(nn.Module):
         error = (actions[..., self.code.continuous] - mean) / std
         density = (-0.5 * error.square() - std.log() + 0.5 - HALF_LOG_2_PI_E).sum(-1)
         return taken + density, entropy + (std.log() + HALF_LOG_2_PI_E).sum(-1)
+
+    def _values(self, categories: Tensor, logits: Tensor) -> Tensor:
+        """The number of each category, (..., discrete); NaN where the logits (..., discrete, category) are NaN."""
+        # Every choice has a first category, and a softmax spreads the NaN of one logit to all.
+        return self.code.values(categories).masked_fill(logits[..., 0].isnan(), torch.nan)
 
     def _distribution(self, features: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Mean and std of the continuous numbers, (..., continuous) each, and logits (..., discrete, category)."""

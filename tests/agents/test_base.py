@@ -119,6 +119,24 @@ def test_belief_is_updated_with_the_executed_action(model, film):
     assert all(torch.allclose(left, right, atol=1e-5) for left, right in zip(noisy.state, expected, strict=True))
 
 
+@pytest.mark.parametrize("make", AGENTS)
+def test_changes_of_the_returned_action_do_not_reach_the_agent(make, model, film):
+    agent, same = make(model), make(model)
+    for frames in film[:3]:
+        action = agent.act(frames)
+        assert np.array_equal(action, same.act(frames))
+        action *= 10.0
+
+
+@pytest.mark.parametrize("make", AGENTS)
+def test_agent_with_the_memory_of_another_has_its_surprise_and_actor(make, model, film):
+    agent, other = make(model), make(model)
+    agent.act(film[0])
+    other.set_memory(agent.memory())
+    assert other.surprise() == agent.surprise()
+    assert np.array_equal(other.actor_action(), agent.actor_action())
+
+
 def test_exploration_noise_changes_actions_within_the_bounds(model, film):
     plain, noisy = make_planner(model).act(film[0]), make_planner(model, noise_std=5.0).act(film[0])
     assert not np.allclose(plain, noisy)

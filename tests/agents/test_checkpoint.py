@@ -266,3 +266,14 @@ print(agent.act(np.zeros((64, 64, 3), np.uint8)).shape)
     finished = run_python("-c", program)
     assert finished.returncode == 0, finished.stderr
     assert finished.stdout == "(2,)\n"
+
+
+@pytest.mark.parametrize("mode", ["planner", "gated", "actor"])
+def test_agent_loaded_in_inference_mode_acts_outside_and_inside_it(mode, folder):
+    expected = load_agent(folder, mode).act(FRAMES[0])
+    with torch.inference_mode():
+        agent = load_agent(folder, mode)
+    assert np.array_equal(agent.act(FRAMES[0]), expected)
+    agent.reset()
+    with torch.inference_mode():
+        assert agent.act(FRAMES[0]).shape == expected.shape

@@ -1,5 +1,6 @@
 """Agents with discrete actions: plans and actors choose categories, checkpoints and programs keep them."""
 
+import copy
 import json
 
 import numpy as np
@@ -96,6 +97,21 @@ def test_exported_program_gives_the_actions_of_the_agent(checkpoint, film, tmp_p
         is_first = torch.tensor([time == 0])
         action, deter, stoch = program(torch.from_numpy(frame[None]), deter, stoch, action, is_first)
         assert np.allclose(action[0].detach().numpy(), agent.act(frame), atol=1e-4)
+        assert not any(part.requires_grad for part in (action, deter, stoch))
+
+
+def test_agent_and_program_repeat_their_last_action_where_weights_are_nan(model, film, tmp_path):
+    agent = ActorAgent(copy.deepcopy(model), CONFIG)
+    before = agent.act(film[0])
+    with torch.no_grad():
+        agent.model.actor.mlp.output.bias[2:].fill_(torch.nan)  # the logits alone
+    with pytest.warns(RuntimeWarning, match="agent's action is not finite"):
+        assert np.array_equal(agent.act(film[1]), before)
+    assert agent.num_replaced_actions == 1
+    program = torch.export.load(export_actor(agent, tmp_path / "actor.pt2")).module()
+    frame, last = torch.from_numpy(film[1:2]), torch.from_numpy(before)[None]
+    action, _, _ = program(frame, torch.zeros(1, 16), torch.zeros(1, 32), last, torch.tensor([False]))
+    assert torch.equal(action, last)
 
 
 def test_distill_refuses_discrete_actions(checkpoint, tmp_path):

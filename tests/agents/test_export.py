@@ -176,3 +176,16 @@ def test_export_command_explains_a_full_disk_in_one_line(checkpoint, capsys, tmp
     errors = capsys.readouterr().err
     assert code == 2 and errors.startswith("error: cannot write") and errors.count("\n") == 1
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("default", [torch.float64, torch.bfloat16])
+def test_exported_program_does_not_depend_on_the_default_dtype(default, checkpoint, module, tmp_path):
+    agent = load_agent(checkpoint, mode="actor")
+    torch.set_default_dtype(default)
+    try:
+        path = export_actor(agent, tmp_path / "actor.pt2")
+    finally:
+        torch.set_default_dtype(torch.float32)
+    given = torch.full((3, 64, 64, 3), 100).byte(), *(torch.full((3, size), 0.5) for size in (16, 32, 2))
+    found = torch.export.load(path).module()(*given, torch.arange(3) == 1)
+    assert all(map(torch.allclose, found, module(*given, torch.arange(3) == 1)))

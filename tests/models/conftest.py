@@ -1,5 +1,7 @@
 """A small untrained world model; the heads that start at zero have random weights."""
 
+from contextlib import contextmanager
+
 import pytest
 import torch
 
@@ -20,6 +22,25 @@ def model():
             head.mlp.output.weight.normal_(std=0.5)
         model.actor.mlp.output.weight.normal_(std=1.0)
     return model.eval()
+
+
+@pytest.fixture(params=["float64", "bfloat16", "meta"])
+def other_defaults(request):
+    """A context with another default dtype of torch, or another default device."""
+
+    @contextmanager
+    def enter():
+        if request.param == "meta":
+            with torch.device("meta"):
+                yield
+            return
+        torch.set_default_dtype(getattr(torch, request.param))
+        try:
+            yield
+        finally:
+            torch.set_default_dtype(torch.float32)
+
+    return enter
 
 
 @pytest.fixture

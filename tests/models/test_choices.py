@@ -149,3 +149,14 @@ def test_model_refuses_what_needs_continuous_actions():
         WorldModel(SIZES, 1, {"speed": 1.0}, goal_dim=8, spaces=Spaces((3,)))
     with pytest.raises(ValueError, match="one entry for each of 2 numbers"):
         WorldModel(SIZES, 2, spaces=Spaces((3,)))
+
+
+def test_features_that_are_nan_give_actions_that_are_nan(actor):
+    features = torch.randn(3, 6)
+    features[1] = torch.nan
+    for action in (
+        actor(features)[0],
+        actor.sample(features, torch.randn(3, 4)),
+        actor.sample(features, torch.zeros(3, 4)),
+    ):
+        assert action[1].isnan().all() and action[[0, 2]].isfinite().all()

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from latentplan.models.fast.library import load
-from latentplan.models.fast.native import MULTIPLE, TILE, find_kernels, pad
+from latentplan.models.fast.native import MULTIPLE, TILE, allocate, find_kernels, pad
 
 if TYPE_CHECKING:
     from latentplan.models.fast.rollout import Trunk, Weights
@@ -85,7 +85,7 @@ def pack(weights: Weights, critic: tuple[Trunk, Tensor, Tensor]) -> Packed | Non
 
 def rollout(packed: Packed, deter: Tensor, stoch: Tensor, actions: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Rewards (rows, time) along actions (rows, time, action), and the last deter and stoch, all float32."""
-    rewards = torch.empty(actions.shape[:2])
+    rewards = allocate(*actions.shape[:2])
     deter, stoch, actions = _copy(deter), _copy(stoch), actions.float().contiguous()
     _call(packed, deter, stoch, actions, rewards)
     return rewards, deter, stoch
@@ -100,8 +100,8 @@ def propose(packed: Packed, deter: Tensor, stoch: Tensor, noise: Tensor) -> Tens
 
 def value(packed: Packed, deter: Tensor, stoch: Tensor) -> Tensor:
     """The value of states, float32 (rows,)."""
-    values = torch.empty(len(deter))
-    _call(packed, _copy(deter), _copy(stoch), torch.empty(len(deter), 0, 0), values=values)
+    values = allocate(len(deter))
+    _call(packed, _copy(deter), _copy(stoch), allocate(len(deter), 0, 0), values=values)
     return values
 
 
@@ -125,6 +125,9 @@ def _call(
         shapes = ", ".join(str(tuple(tensor.shape)) for tensor in (deter, stoch, actions))
         wanted = f"{expected[0]}, {expected[1]}, ({rows}, {time}, {model.action})"
         raise ValueError(f"deter, stoch and actions have shapes {shapes}; the model needs {wanted}")
+    if not (deter.is_cpu and stoch.is_cpu and actions.is_cpu):
+        devices = ", ".join(str(tensor.device) for tensor in (deter, stoch, actions))
+        raise ValueError(f"deter, stoch and actions are on {devices}; the model needs them on the CPU")
     places = [None if tensor is None else tensor.data_ptr() for tensor in (deter, stoch, actions, rewards, values)]
     if library.imagine(ctypes.addressof(packed.model), *places, rows, time, torch.get_num_threads()):
         raise MemoryError(f"not enough memory for a rollout of {rows} rows")

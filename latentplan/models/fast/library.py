@@ -96,8 +96,8 @@ def _library_for(rows: Tensor, *others: Tensor) -> ctypes.CDLL | None:
     tensors = (rows, *others)
     if torch.is_grad_enabled() and any(tensor.requires_grad for tensor in tensors):
         return None
-    known = rows.device.type == "cpu" and rows.dtype in DTYPES and rows.is_contiguous()
-    fit = rows.shape[-1] <= LONGEST_ROW and all(tensor.dtype == torch.float32 for tensor in others)
+    known = rows.is_cpu and rows.dtype in DTYPES and rows.is_contiguous()
+    fit = rows.shape[-1] <= LONGEST_ROW and all(each.is_cpu and each.dtype == torch.float32 for each in others)
     return load() if known and fit else None
 
 

@@ -17,6 +17,7 @@ TILE = 16  # as in products.h: numbers of rows are multiples of this
 MULTIPLE = 32  # padded sizes are multiples of this
 LONGEST_ROW = 4096  # as in layers.h
 MOST_SPARE = 16  # arrays of one shape
+CPU = torch.device("cpu")
 HALVES = {2: torch.bfloat16, 4: torch.float32, 8: torch.float64}
 
 Place = ctypes.c_void_p
@@ -55,6 +56,11 @@ def find_kernels(real: torch.dtype) -> Kernels | None:
     return None if library is None or size == 0 else Kernels(library, real, HALVES[size])
 
 
+def allocate(*shape: int, dtype: torch.dtype = torch.float32) -> Tensor:
+    """An uninitialized array for compiled functions, on the CPU whatever torch's default device and dtype are."""
+    return torch.empty(shape, dtype=dtype, device=CPU)
+
+
 _spare: dict[tuple[tuple[int, ...], torch.dtype], list[Tensor]] = {}
 
 
@@ -66,9 +72,9 @@ def borrow(*shape: int, dtype: torch.dtype) -> Tensor:
     """
     spare = _spare.get((shape, dtype))
     try:
-        return spare.pop() if spare else torch.empty(shape, dtype=dtype)
+        return spare.pop() if spare else allocate(*shape, dtype=dtype)
     except IndexError:  # another thread was faster
-        return torch.empty(shape, dtype=dtype)
+        return allocate(*shape, dtype=dtype)
 
 
 def give_back(tensors: Iterable[Tensor | None]) -> None:
@@ -100,9 +106,10 @@ def require_kernels(tensor: Tensor) -> Kernels:
 
 
 def check_shape(name: str, tensor: Tensor | None, *shape: int) -> None:
-    """Raises ValueError for a tensor of another shape, because compiled functions read past its end."""
-    if tensor is not None and tensor.shape != shape:
-        raise ValueError(f"{name} has the shape {tuple(tensor.shape)}; the model needs {shape}")
+    """Raises ValueError for a tensor of another shape or device, because compiled functions read at its address."""
+    if tensor is not None and (tensor.shape != shape or not tensor.is_cpu):
+        found = f"the shape {tuple(tensor.shape)} on device {tensor.device}"
+        raise ValueError(f"{name} has {found}; the model needs {shape} on the CPU")
 
 
 def describe_layer(linear: Tensor, scale: Tensor | None, shift: Tensor) -> Layer:

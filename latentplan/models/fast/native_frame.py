@@ -99,7 +99,7 @@ class NativeFrameFunctions(FrameFunctions):
         self, state: State, action: Tensor | None, frames: Any, is_first: Tensor | None = None
     ) -> tuple[State, Tensor]:
         """See `FrameFunctions.infer_and_compare`."""
-        belief, mismatch = self._new_belief(frames), torch.empty(len(frames))
+        belief, mismatch = self._new_belief(frames), self._new(len(frames))
         self._call(state, action, is_first, frames, *belief, None, None, None, mismatch)
         return belief, mismatch
 
@@ -111,15 +111,19 @@ class NativeFrameFunctions(FrameFunctions):
 
     def surprise(self, state: State) -> Tensor:
         """See `FrameFunctions.surprise`."""
-        surprise = torch.empty(len(state.deter))
+        surprise = self._new(len(state.deter))
         self._call(state, None, None, None, None, None, None, None, surprise)
         return surprise
 
     def _new_belief(self, rows: Tensor) -> State:
-        return State(torch.empty(len(rows), self._sizes.deter), torch.empty(len(rows), self._sizes.latent))
+        return State(self._new(len(rows), self._sizes.deter), self._new(len(rows), self._sizes.latent))
 
     def _new_actions(self, rows: Tensor) -> tuple[Tensor, Tensor]:
-        return torch.empty(len(rows), self._sizes.action), torch.empty(len(rows), self._sizes.action)
+        return self._new(len(rows), self._sizes.action), self._new(len(rows), self._sizes.action)
+
+    def _new(self, *shape: int) -> Tensor:
+        """An uninitialized result, float32 on the CPU like the packed weights."""
+        return self._kept[0].new_empty(*shape)
 
     def _call(
         self,
@@ -139,7 +143,7 @@ class NativeFrameFunctions(FrameFunctions):
             results: Tensors for the results of `Decision` in frame.c, in order; missing results are not computed.
 
         Raises:
-            ValueError: An input has a wrong shape or dtype.
+            ValueError: An input has a wrong shape or dtype, or lies on another device than the CPU.
         """
         rows, sizes = len(state.deter), self._sizes
         given = (
@@ -158,8 +162,9 @@ def _prepare(tensor: Tensor | None, dtype: torch.dtype, shape: tuple[int, ...]) 
     """The tensor, contiguous and in a dtype; floating-point numbers are converted."""
     if tensor is None:
         return None
-    if tensor.shape != shape or (tensor.dtype != dtype and dtype != torch.float32):
-        raise ValueError(f"an input is {tensor.dtype} {tuple(tensor.shape)}; the model needs {dtype} {shape}")
+    if tensor.shape != shape or (tensor.dtype != dtype and dtype != torch.float32) or not tensor.is_cpu:
+        found = f"{tensor.dtype} {tuple(tensor.shape)} on device {tensor.device}"
+        raise ValueError(f"an input is {found}; the model needs {dtype} {shape} on the CPU")
     return tensor if tensor.dtype == dtype and tensor.is_contiguous() else tensor.to(dtype).contiguous()
 
 

@@ -9,9 +9,11 @@ import torch
 from torch import Tensor
 
 from latentplan.models.fast.native import (
+    CPU,
     Count,
     Layer,
     Place,
+    allocate,
     borrow,
     check_called,
     check_shape,
@@ -62,12 +64,14 @@ def mean(head: ScalarHead, logits: Tensor) -> Tensor:
 def cross_entropy(head: ScalarHead, logits: Tensor, targets: Tensor) -> Tensor:
     """See `ScalarHead.loss`."""
     check_shape("logits", logits, *targets.shape, len(head.values))
+    check_shape("targets", targets, *targets.shape)
     losses: Tensor = _CrossEntropy.apply(logits, head.values, targets.detach().to(logits.dtype))
     return losses
 
 
 def lambda_return(rewards: Tensor, discounts: Tensor, values: Tensor, lambda_: float) -> Tensor:
     """See `Backend.lambda_return`."""
+    check_shape("rewards", rewards, *rewards.shape)
     check_shape("discounts", discounts, *rewards.shape)
     check_shape("values", values, *rewards.shape)
     returns: Tensor = _LambdaReturn.apply(rewards, discounts.to(rewards.dtype), values.to(rewards.dtype), lambda_)
@@ -98,7 +102,7 @@ class _Applied(torch.autograd.Function):
             name: borrow(len(flat), size, dtype=kernels.half) if learns or name in _SUMS else None
             for name, size in zip((*_SUMS, *_INPUTS), (*sizes[1:], *sizes), strict=True)
         }
-        results = torch.empty(len(flat), layers[2].outputs, dtype=kernels.real)
+        results = allocate(len(flat), layers[2].outputs, dtype=kernels.real)
         ctx.network = network = _Network(*layers, len(flat))
         point_to(network, features=flat, results=results, **kept)
         failed = kernels.library.apply_network(ctypes.addressof(network), torch.get_num_threads())
@@ -117,8 +121,8 @@ class _Applied(torch.autograd.Function):
             for name, size in zip(_FACTORS, sizes, strict=True)
         }
         widths = [network.first.outputs, network.second.outputs]
-        norms = torch.zeros(2 * sum(widths), dtype=kernels.real)
-        of_features = torch.empty(len(outer), ctx.shape[-1], dtype=kernels.real) if ctx.needs_input_grad[0] else None
+        norms = torch.zeros(2 * sum(widths), dtype=kernels.real, device=CPU)
+        of_features = allocate(len(outer), ctx.shape[-1], dtype=kernels.real) if ctx.needs_input_grad[0] else None
         gradients = _Gradients()
         point_to(gradients, of_results=outer, of_features=of_features, norms=norms, **factors)
         addresses = ctypes.addressof(network), ctypes.addressof(gradients)

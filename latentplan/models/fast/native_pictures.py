@@ -15,11 +15,13 @@ from torch import Tensor, nn
 from latentplan.models.decoder import Decoder
 from latentplan.models.encoder import FRAME_SIZE, Encoder
 from latentplan.models.fast.native import (
+    CPU,
     LONGEST_ROW,
     TILE,
     Count,
     Layer,
     Place,
+    allocate,
     borrow,
     check_called,
     check_shape,
@@ -120,8 +122,8 @@ class _LayerSums:
         outputs, inputs = len(weight), weight[0].numel()
         height = -(-outputs // TILE) * TILE
         self.weight = weight
-        self.of_weight = torch.zeros(threads, height, pad_size(inputs), dtype=weight.dtype)
-        self.of_shift = torch.zeros(threads, outputs, dtype=weight.dtype)
+        self.of_weight = torch.zeros(threads, height, pad_size(inputs), dtype=weight.dtype, device=CPU)
+        self.of_shift = torch.zeros(threads, outputs, dtype=weight.dtype, device=CPU)
         self.structure = _LayerGradients(self.of_weight.data_ptr(), self.of_shift.data_ptr())
 
     def collect(self) -> tuple[Tensor, Tensor]:
@@ -145,7 +147,7 @@ class _Encoded(torch.autograd.Function):
             side //= 2
             kept += side * side * len(weight)
         structure.rows = len(frames)
-        embeddings = torch.empty(len(frames), len(linear), dtype=kernels.real)
+        embeddings = allocate(len(frames), len(linear), dtype=kernels.real)
         ctx.kept = {"kept": borrow(len(frames), kept, dtype=kernels.half)}
         point_to(structure, frames=frames, embeddings=embeddings, **ctx.kept)
         check_called(kernels.library.encode(ctypes.addressof(structure), None, torch.get_num_threads()))
@@ -180,7 +182,7 @@ class _Reconstructed(torch.autograd.Function):
             len(features),
         )
         rows, places = len(features), 8 * 8
-        errors = torch.empty(rows, dtype=kernels.real)
+        errors = allocate(rows, dtype=kernels.real)
         ctx.kept = {
             "kept": borrow(rows, len(tokens) + places * len(mix), dtype=kernels.half),
             "differences": borrow(rows, places, len(paint), dtype=kernels.half),

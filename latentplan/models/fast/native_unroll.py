@@ -16,9 +16,11 @@ from torch import Tensor
 from latentplan.models.dynamics import Gaussian, State
 from latentplan.models.fast import native_heads
 from latentplan.models.fast.native import (
+    CPU,
     Count,
     Layer,
     Place,
+    allocate,
     borrow,
     check_called,
     check_shape,
@@ -140,7 +142,7 @@ class _Call:
         }
         rows, steps = len(self.given["start_deter"]), len(example) + has_frames  # type: ignore[arg-type]
         if actions is None:
-            self.given["actions"] = torch.empty(steps, rows, example.shape[-1], dtype=kernels.real)
+            self.given["actions"] = allocate(steps, rows, example.shape[-1], dtype=kernels.real)
         self.results = self._allocate(steps, rows)
         self.kept: dict[str, Tensor | None] | None = {name: self.results[name] for name in (*_SUMS, *_INPUTS)}
         self.structure = self._describe(steps, rows, example.shape[-1], policy, decay)
@@ -170,11 +172,11 @@ class _Call:
         first, gates, second = len(weights.input), len(weights.gates), len(weights.hidden)
         sizes = (first, gates, second, 2 * latent, weights.input.shape[1], weights.gates.shape[1], deter, second)
         results = {
-            name: torch.empty(steps, rows, size, dtype=kernels.real)
+            name: allocate(steps, rows, size, dtype=kernels.real)
             for name, size in zip(_RESULTS, (deter, latent, latent, latent), strict=True)
         }
         if not self.learns:  # imagined states lie side by side, as the features that heads read
-            self.features = torch.empty(steps + 1, rows, deter + latent, dtype=kernels.real)
+            self.features = allocate(steps + 1, rows, deter + latent, dtype=kernels.real)
             torch.cat([self.given["start_deter"], self.given["start_stoch"]], -1, out=self.features[0])  # type: ignore[list-item]
             results["deters"], results["stochs"] = self.features[1:].split([deter, latent], -1)
         for name, size in zip((*_SUMS, *_INPUTS), sizes, strict=True):
@@ -218,7 +220,7 @@ class _Call:
             for name, part in zip(("first", "gates", "second", "raw"), map(results.__getitem__, _SUMS), strict=True)
         }
         sizes = [len(weights.input), len(weights.gates), len(weights.hidden)]
-        norms = torch.zeros(2 * sum(sizes), dtype=kernels.real)
+        norms = torch.zeros(2 * sum(sizes), dtype=kernels.real, device=CPU)
         embeddings, actions = self.given["embeddings"], self.given["actions"]
         of_embeddings = None if embeddings is None else torch.empty_like(embeddings)
         of_actions = None if self.learns or actions is None else torch.empty_like(actions)

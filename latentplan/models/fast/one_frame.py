@@ -80,7 +80,8 @@ def convert_weights(model: WorldModel) -> FrameWeights:
     """The weights of a world model, whose dynamics are an `Rssm`, for the functions of this module.
 
     On the CPU the weights share the model's memory. For this purpose the model's convolutions are converted to the
-    memory format `channels_last`, which changes no value. On other devices the weights of convolutions are copies.
+    memory format `channels_last`, which changes no value. On other devices, and of a model made in inference mode, the
+    weights of convolutions are copies.
     """
     encoder, dynamics = model.encoder, cast(Rssm, model.dynamics)
     latent = dynamics.latent_dim
@@ -157,7 +158,7 @@ def _apply_layer(features: Tensor, layer: Hidden) -> Tensor:
 
 def _get_convolution(layer: nn.Conv2d) -> Affine:
     assert layer.bias is not None
-    if layer.weight.device.type == "cpu":
+    if layer.weight.device.type == "cpu" and not layer.weight.is_inference():
         layer.weight.data = layer.weight.data.contiguous(memory_format=torch.channels_last)
     return layer.weight.detach().permute(0, 2, 3, 1).flatten(1), layer.bias.detach()
 

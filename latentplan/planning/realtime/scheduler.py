@@ -70,7 +70,8 @@ class Decision(NamedTuple):
 
     Attributes:
         action: The action of each environment, (batch, action).
-        source: Source of the action: "plan", "tail" (the plan after the next one was expected) or "actor".
+        source: Source of the action: "plan", "tail" (the plan after the next one was expected) or "actor". A plan also
+            counts where the policy acts for some environments, because the search found nothing for them.
         age: Age of the plan in ticks; None for an action of the actor.
     """
 
@@ -87,8 +88,8 @@ class PlanScheduler:
 
         1. polls the executor, and puts a finished plan into the buffer at the tick of its request;
         2. takes this tick's action from the buffer, corrected by the policy if the model has one (see
-           `NominalTrajectory`); without a plan it takes the policy's action, or the middle of the bounds without a
-           policy;
+           `NominalTrajectory`), which acts alone in environments for which the search found nothing; without a plan it
+           takes the policy's action, or the middle of the bounds without a policy;
         3. requests the next plan if the executor is idle: it predicts how many ticks the search takes, steps the model
            by the actions of these ticks (this action, then the buffer's, then the policy's), and requests a plan from
            that state, warm-started from the last plan shifted to the same tick.
@@ -131,6 +132,7 @@ class PlanScheduler:
         # Of the running request: the tick at which it was made, and tick and state of the plan's start.
         self._requested: tuple[int, int, State] | None = None
         self._nominals: dict[int, NominalTrajectory] = {}  # by the tick of the plan's first action
+        self._failures: dict[int, Tensor] = {}  # by the same tick: environments without a search, (batch,) bool
         self._last: tuple[int, Plan] | None = None
         self._batch: int | None = None
         self._action: Tensor | None = None  # of the last tick, (batch, action)
@@ -148,7 +150,7 @@ class PlanScheduler:
     def decide(self, state: State) -> Decision:
         """Returns the decision of this tick, and requests a plan for a later tick.
 
-        Where no plan is due and the policy's action is NaN, the decision is NaN: the caller knows what is safe.
+        Where the policy acts and its action is NaN, the decision is NaN: the caller knows what is safe.
 
         Args:
             state: Believed state of each environment, rows (batch,); a change of the number of rows drops all plans.
@@ -169,7 +171,7 @@ class PlanScheduler:
         if self.executor.is_idle:
             self._request(state, action)
         self.tick += 1
-        return Decision(action, source, age)
+        return Decision(action.clone(), source, age)  # the caller may change it, and plans may hold the action
 
     def set_objective(self, objective: Term | None = None, constraints: Sequence[Constraint] = ()) -> None:
         """Changes the objective and constraints of the next requests; earlier plans are used until new ones arrive.
@@ -183,7 +185,7 @@ class PlanScheduler:
     def reset(self) -> None:
         """Drops all plans, and the plan of the running request when it arrives."""
         self.buffer.clear()
-        self._nominals = {}
+        self._nominals, self._failures = {}, {}
         self._requested = self._last = self._action = None
 
     def _follow(self, objective: Term | None, constraints: Sequence[Constraint]) -> None:
@@ -208,12 +210,16 @@ class PlanScheduler:
         if requested is None or requested[1] != tick:  # the request was made before a reset
             return
         plan.warn_of_failures()
-        if bool(plan.info["is_fallback"].all()):  # without a search, the policy in the real state is the better choice
+        failures = plan.info["is_fallback"]
+        if bool(failures.all()):  # without a search, the policy in the real state is the better choice
             return
         self.buffer.submit(plan.actions, tick)
         now, nominals = self.tick, self._nominals.items()
         self._nominals = {first: nominal for first, nominal in nominals if now - first < nominal.actions.shape[1]}
         self._nominals[tick] = NominalTrajectory(self.model, requested[2], plan.actions)
+        self._failures = {first: failed for first, failed in self._failures.items() if first in self._nominals}
+        if bool(failures.any()):
+            self._failures[tick] = failures.to(plan.actions.device)
         self._last = finished
         if self._follows_latency:
             self.buffer.fresh_ticks = self.latency_ticks
@@ -242,11 +248,17 @@ class PlanScheduler:
         return plan.executed(torch.full_like(plan.elapsed, due - first_tick))
 
     def _act_by_plan(self, state: State, tick: int, age: int) -> Tensor:
-        """Returns the action (batch, action) of the plan that has this age at a tick, corrected by the policy."""
-        nominal = self._nominals[tick - age]
-        if not supports(self._acting, "policy") or getattr(self.planner, "action_choices", None) is not None:
-            return nominal.actions[:, age]  # a discrete action plus a correction is no action
-        return self._bounds(state, age).fit_step(nominal.correct(age, state, self._act_by_policy), 0)
+        """Returns the action (batch, action) of the plan that has this age at a tick, corrected by the policy.
+
+        In environments for which the search found nothing, the policy acts.
+        """
+        nominal, failures = self._nominals[tick - age], self._failures.get(tick - age)
+        planned = nominal.actions[:, age]
+        if not supports(self._acting, "policy"):
+            return planned
+        if getattr(self.planner, "action_choices", None) is None:  # a discrete action plus a correction is no action
+            planned = self._bounds(state, age).fit_step(nominal.correct(age, state, self._act_by_policy), 0)
+        return planned if failures is None else torch.where(failures[:, None], self._act_by_policy(state), planned)
 
     def _act_by_policy(self, state: State) -> Tensor:
         """Returns the policy's mode, or the middle of the bounds without a policy, (rows, action).

@@ -143,3 +143,29 @@ def test_compiled_rollout_raises_for_shapes_that_do_not_fit_the_model(weights, w
     state = State(state.deter[:, : 32 if wrong == "deter" else 64], state.stoch[: 5 if wrong == "rows" else ROWS])
     with pytest.raises(ValueError, match="deter, stoch and actions have shapes"):
         imagine(weights, state, actions)
+
+
+def test_compiled_calls_do_not_depend_on_the_default_dtype_and_device(weights, other_defaults):
+    state, actions = start(), draw(ROWS, TIME, ACTION, seed=2)
+
+    def call():
+        rewards, last = imagine(weights, state, actions)
+        return rewards, *last, propose(weights, state, actions), compiled.value(weights.packed, *state)
+
+    expected = call()
+    with other_defaults():
+        found = call()
+    assert all(map(torch.equal, found, expected))
+
+
+@pytest.mark.parametrize("part", ["deter", "stoch", "actions"])
+def test_compiled_calls_refuse_tensors_outside_the_cpu(weights, part):
+    given = {**start()._asdict(), "actions": draw(ROWS, TIME, ACTION)}
+    given[part] = given[part].to("meta")
+    state = State(given["deter"], given["stoch"])
+    for call in (imagine, propose):
+        with pytest.raises(ValueError, match="needs them on the CPU"):
+            call(weights, state, given["actions"])
+    if part != "actions":
+        with pytest.raises(ValueError, match="needs them on the CPU"):
+            compiled.value(weights.packed, *state)

@@ -282,3 +282,61 @@ def test_inputs_of_another_shape_are_refused_before_compiled_code_reads_them(dty
     for call in calls:
         with pytest.raises(ValueError, match="shape|uint8"):
             call()
+
+
+def test_arrays_of_compiled_functions_lie_on_the_cpu_whatever_the_default_device(dtype):
+    rows, latent, deter, _, action, embedding = sizes = SIZES["sizes of a run"]
+    dynamics, head = make_dynamics(sizes, dtype), randomized(ScalarHead(deter, 40, 31), dtype)
+    actor, frames = randomized(Actor(deter + latent, 40, action), dtype), torch.zeros(rows, 64, 64, 3).byte()
+    encoder, decoder = randomized(Encoder((4, 4), embedding), dtype), randomized(Decoder(deter, 3), dtype)
+    start = State(draw(rows, deter, dtype=dtype), draw(rows, latent, dtype=dtype))
+    moves, noise = draw(rows, 1, action, dtype=dtype).tanh(), draw(rows, 2, latent, dtype=dtype)
+
+    def compute():
+        native._spare.clear()
+        embeddings = native_pictures.encode(encoder, frames)[:, None].expand(-1, 2, -1)
+        imagined = moves.transpose(0, 1), noise[:, :1].transpose(0, 1)
+        features, _ = native_unroll.imagine(dynamics, actor, start, *imagined, 1.0)
+        parts = (
+            native_unroll.observe(dynamics, embeddings, moves, start.deter, noise)[0].stoch,
+            native_unroll.predict(dynamics, start, moves)[0],
+            features,
+            native_heads.apply(head.mlp, start.deter),
+            native_pictures.reconstruction_errors(decoder, start.deter, frames),
+        )
+        weights = [weight for part in (encoder, dynamics, actor, head, decoder) for weight in part.parameters()]
+        found = torch.autograd.grad(sum(part.sum() for part in parts), weights, allow_unused=True)
+        return [part.detach() for part in parts] + [part for part in found if part is not None]
+
+    expected = compute()
+    with torch.device("meta"):
+        found = compute()
+    assert all(map(torch.equal, found, expected))
+
+
+def test_inputs_outside_the_cpu_are_refused_before_compiled_code_reads_them(dtype):
+    sizes = SIZES["odd sizes"]
+    rows, latent, deter, hidden, action, embedding = sizes
+    dynamics, head = make_dynamics(sizes, dtype), randomized(ScalarHead(deter, hidden, 31), dtype)
+    encoder, decoder = randomized(Encoder((4, 4), 8), dtype), randomized(Decoder(deter, 3), dtype)
+    start = State(draw(rows, deter, dtype=dtype), draw(rows, latent, dtype=dtype))
+    frames, logits, far = torch.zeros(rows, 64, 64, 3).byte(), draw(rows, 31, dtype=dtype), start.deter.to("meta")
+    actions, values = draw(rows, STEPS, action, dtype=dtype), draw(STEPS, rows, dtype=dtype)
+    embeddings, noise = (draw(rows, STEPS + 1, size, dtype=dtype) for size in (embedding, latent))
+    calls = [
+        lambda: native_unroll.predict(dynamics, State(far, start.stoch), actions),
+        lambda: native_unroll.predict(dynamics, start, actions.to("meta")),
+        lambda: native_unroll.observe(dynamics, embeddings.to("meta"), actions, start.deter, noise),
+        lambda: native_unroll.observe(dynamics, embeddings, actions, start.deter, noise.to("meta")),
+        lambda: native_heads.apply(head.mlp, far),
+        lambda: native_heads.mean(head, logits.to("meta")),
+        lambda: native_heads.cross_entropy(head, logits, draw(rows, dtype=dtype).to("meta")),
+        lambda: native_heads.lambda_return(values.to("meta"), values, values, 0.9),
+        lambda: native_heads.lambda_return(values, values, values.to("meta"), 0.9),
+        lambda: native_pictures.encode(encoder, frames.to("meta")),
+        lambda: native_pictures.reconstruction_errors(decoder, far, frames),
+        lambda: native_pictures.reconstruction_errors(decoder, start.deter, frames.to("meta")),
+    ]
+    for call in calls:
+        with pytest.raises(ValueError, match="on device meta"):
+            call()

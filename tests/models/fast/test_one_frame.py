@@ -204,6 +204,23 @@ def test_compiled_decision_raises_for_inputs_that_do_not_fit_the_model(native, w
         functions.infer(state, action, frames, is_first)
 
 
+def test_compiled_decision_does_not_depend_on_the_default_dtype_and_device(native, other_defaults):
+    functions, inputs = native
+    expected = call_all(functions, *inputs)
+    with other_defaults():
+        found = call_all(functions, *inputs)
+    assert all(torch.equal(found[name], expected[name]) for name in expected)
+
+
+@pytest.mark.parametrize("part", ["deter", "stoch", "action", "frames", "is_first"])
+def test_compiled_decision_refuses_tensors_outside_the_cpu(native, part):
+    functions, (state, action, frames) = native
+    given = dict(deter=state.deter, stoch=state.stoch, action=action, frames=frames, is_first=torch.arange(9) == 4)
+    given[part] = given[part].to("meta")
+    with pytest.raises(ValueError, match="on device meta; the model needs"):
+        functions.infer(State(given["deter"], given["stoch"]), given["action"], given["frames"], given["is_first"])
+
+
 def run_on(march):
     """Whether this machine runs code for an architecture of the x86-64 family."""
     flags = Path("/proc/cpuinfo").read_text() if Path("/proc/cpuinfo").exists() else ""
@@ -320,3 +337,13 @@ def test_agent_checks_the_weights_once_per_decision(monkeypatch):
     monkeypatch.setattr(ConvertedWeights, "of", lambda *arguments: checks.append(1) or check(*arguments))
     agent.act(frames)
     assert len(checks) == 1
+
+
+def test_model_made_in_inference_mode_decides_outside_it():
+    with torch.inference_mode():
+        model = make_model()
+    state, action, frames = inputs_of(2, model)
+    with torch.no_grad():
+        found = CpuBackend().frame_functions(model).infer(state, action, frames)
+        expected = FrameFunctions(model).infer(state, action, frames)
+    torch.testing.assert_close(found, expected, atol=1e-4, rtol=1e-4)

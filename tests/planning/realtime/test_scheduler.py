@@ -5,7 +5,7 @@ import itertools
 import pytest
 import torch
 
-from latentplan.planning import CEMPlanner, FunctionModel, PlanBuffer, PlanScheduler, learned_return
+from latentplan.planning import CEMPlanner, FunctionModel, PlanBuffer, PlanScheduler, learned_return, rate_limit
 from tests.planning.realtime.integrator import dynamics, policy, reward
 
 HORIZON = 4
@@ -118,6 +118,48 @@ def test_scheduler_takes_the_policy_when_a_search_found_nothing_finite():
     assert [(decision.source, decision.action.item()) for decision in decisions] == [("actor", pytest.approx(0.05))] * 6
 
 
+def broken_beyond_10(state, action):
+    return torch.where(state[:, 0] > 10.0, torch.nan, reward(state, action))
+
+
+@pytest.mark.filterwarnings("ignore::RuntimeWarning")
+@pytest.mark.parametrize("choices", [None, {0: (-1.0, 0.0, 0.05)}])
+def test_policy_acts_in_environments_for_which_a_search_found_nothing(choices):
+    model = FunctionModel(dynamics, broken_beyond_10, policy=policy)
+    planner = CEMPlanner(action_dim=1, horizon=HORIZON, num_samples=32, num_elites=4, action_choices=choices)
+    executor = VirtualExecutor(planner, model, itertools.repeat(0.5))
+    decisions, _ = drive(PlanScheduler(planner, model, executor), executor, 4, start=[[9.0], [20.0]])
+    assert [decision.source for decision in decisions] == ["actor", "plan", "plan", "plan"]
+    for decision in decisions[1:]:
+        assert decision.action[0] < 0.0 and decision.action[1] == pytest.approx(0.05)
+
+
+@pytest.mark.filterwarnings("ignore::RuntimeWarning")
+def test_plan_goes_on_without_a_policy_where_a_search_found_nothing():
+    model = FunctionModel(dynamics, broken_beyond_10)
+    scheduler, executor = make(model, itertools.repeat(0.5))
+    decisions, _ = drive(scheduler, executor, 3, start=[[2.0], [20.0]])
+    plan = executor.planner.plan(model, torch.tensor([[20.0]]))
+    assert torch.equal(decisions[-1].action[1], plan.action[0])
+
+
+@pytest.mark.parametrize("policy", [None, policy])
+@pytest.mark.parametrize("constraints", [(), (rate_limit(0.3),)])
+def test_changes_of_a_decision_do_not_reach_the_scheduler(policy, constraints):
+    made = [make(FunctionModel(dynamics, reward, policy=policy), itertools.repeat(0.5)) for _ in range(2)]
+    state = torch.tensor([[2.0]])
+    for scheduler, executor in made:
+        executor.set_objective = lambda *goals: None
+        scheduler.set_objective(None, constraints)
+    for _ in range(6):
+        first, second = (scheduler.decide(state).action for scheduler, _ in made)
+        assert torch.equal(first, second)
+        state = dynamics(state, second)
+        first.mul_(10.0)
+        for _, executor in made:
+            executor.now += 1.0
+
+
 def test_scheduler_ignores_plans_without_a_search(model):
     planner = CEMPlanner(action_dim=1, horizon=HORIZON, num_policy_samples=4, deadline_ms=1e-6)
     executor = VirtualExecutor(planner, model, itertools.repeat(0.5))
@@ -135,7 +177,7 @@ def make(model, durations, **options):
 
 def drive(scheduler, executor, ticks, start=2.0):
     """Decisions one unit of virtual time apart, in a world that is as modelled; and where each was made."""
-    state, decisions, states = torch.tensor([[start]]), [], []
+    state, decisions, states = torch.as_tensor(start).reshape(-1, 1), [], []
     for _ in range(ticks):
         states.append(state)
         decisions.append(scheduler.decide(state))
