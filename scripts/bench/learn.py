@@ -17,11 +17,11 @@ from typing import Any, Literal
 
 from bench.learn_plot import Curve, Point, plot_runs
 from bench.report import format_interval, format_number, format_table, write_csv, write_json
+from bench.run_evaluations import keep_final, read_all_evaluations
 from bench.runs import RunsRequest, TrainingRun
 from latentplan.config import UserError, make_folder
 from latentplan.config.env_id import as_file_name
 from latentplan.config.parsing import option
-from latentplan.config.run_results import read_evaluations
 from latentplan.reporting.published import FRAMES, published_returns_of
 
 FRAMES_TOLERANCE = 0.03  # largest distance of an evaluation from a number of frames, as a share of that number
@@ -76,12 +76,12 @@ def run(request: Request) -> int:
 
 
 def read_run(task: str, seed: int, folder: Path, mode: str) -> Curve:
-    """The evaluations of a run, including the final evaluation.
+    """The evaluations of a run, including the final evaluation and those of shorter budgets.
 
     Raises:
         UserError: The run has no evaluation, or its files are damaged.
     """
-    points = [Point(each.env_frames, each.minutes, getattr(each, mode)) for each in read_evaluations(folder)]
+    points = [Point(each.env_frames, each.minutes, getattr(each, mode)) for each in read_all_evaluations(folder)]
     if not points:
         raise UserError(f"{folder} holds no evaluation; lower --evaluation.every_frames or train longer")
     return Curve(task, seed, points)
@@ -202,6 +202,7 @@ def _train(run: TrainingRun) -> None:
         print(f"{run.folder} is finished and not repeated", flush=True)
         return
     print(f"training {run.name}", flush=True)
+    keep_final(run.folder)
     training = subprocess.Popen(run.command())
     previous = signal.signal(signal.SIGINT, signal.SIG_IGN)  # the run gets Ctrl-C too, and saves its state
     try:

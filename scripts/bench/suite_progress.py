@@ -10,6 +10,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
+from bench.run_evaluations import keep_final
 from bench.runs import TrainingRun
 from bench.suite_rows import Origin, Row, merge_rows, note_origin, read_origin, read_rows, rows_of, write_rows
 from latentplan.config import UserError, make_folder
@@ -57,9 +58,10 @@ class Board:
         write_rows(results, self.rows)
 
     def begin(self, run: TrainingRun) -> None:
-        """Note the origin of a run, whose process is about to start."""
+        """Note the origin and the final evaluation of a run, whose process is about to start."""
         is_begun = read_origin(run.folder) is not None
         make_folder(run.folder)
+        keep_final(run.folder)
         if self.origin is not None:
             note_origin(run.folder, self.origin)
         self._print(f"{run.name}: {'goes on' if is_begun else 'begins'}; its log is {run.folder / LOG}")

@@ -11,12 +11,12 @@ from pathlib import Path
 from typing import NamedTuple
 
 from bench.report import write_csv, write_json
+from bench.run_evaluations import read_all_evaluations
 from bench.runs import TrainingRun
 from latentplan import __version__
 from latentplan.config import UserError, make_folder
 from latentplan.config.origin import UNKNOWN, describe_commit, describe_hardware
 from latentplan.config.reading import LARGEST_DATA, read_text
-from latentplan.config.run_results import read_evaluations
 
 ORIGIN = "origin.json"
 JOINED = " + "  # between two machines or two commits of one run
@@ -107,7 +107,7 @@ def rows_of(run: TrainingRun) -> list[Row]:
             each.updates,
             *origin,
         )
-        for each in read_evaluations(run.folder)
+        for each in read_all_evaluations(run.folder)
     ]
 
 

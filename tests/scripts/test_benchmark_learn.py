@@ -12,6 +12,7 @@ from bench.anchors import TASK_GROUPS
 from bench.estimates import interquartile_estimate, mean_estimate
 from bench.learn import _train, compare, first_reaching, read_run, run_facts
 from bench.learn_plot import MARKERS, Curve, Point
+from bench.run_evaluations import keep_final
 from bench.runs import TrainingRun, check_same
 
 from latentplan.config import Config, EnvConfig, PlannerConfig, RunConfig, UserError
@@ -36,6 +37,27 @@ def test_read_run_ends_with_the_final_evaluation(tmp_path):
         json.dumps({"env_frames": 100, "updates": 9, "minutes": 5.5, "planner": 7, "actor": 8})
     )
     assert read_run("walker-walk", 0, tmp_path, "actor").points == [Point(80, 4.0, 2.0), Point(100, 5.5, 8.0)]
+
+
+def test_read_run_keeps_the_final_evaluation_of_a_shorter_budget(tmp_path):
+    (tmp_path / "metrics.csv").write_text(HEADER + "80,7,4.0,1,2\n")
+    keep_final(tmp_path)  # before the run has a final evaluation
+    for frames, minutes in ((100, 5.0), (200, 9.0)):
+        final = {"env_frames": frames, "updates": frames, "minutes": minutes, "planner": frames, "actor": 0}
+        (tmp_path / "final.json").write_text(json.dumps(final))
+        if frames == 100:
+            keep_final(tmp_path)
+    points = [Point(80, 4.0, 1.0), Point(100, 5.0, 100), Point(200, 9.0, 200)]
+    assert read_run("walker-walk", 0, tmp_path, "planner").points == points
+    (tmp_path / "metrics.csv").write_text(HEADER + "80,7,4.0,1,2\n100,8,5.0,3,4\n")  # of fewer episodes
+    assert read_run("walker-walk", 0, tmp_path, "planner").points == points
+
+
+def test_read_run_refuses_damaged_final_evaluations_of_shorter_budgets(tmp_path):
+    (tmp_path / "metrics.csv").write_text(HEADER + "80,7,4.0,1,2\n")
+    (tmp_path / "finals.json").write_text("{")
+    with pytest.raises(UserError, match="finals.json is damaged; remove it"):
+        read_run("walker-walk", 0, tmp_path, "planner")
 
 
 def test_compare_sets_runs_beside_published_returns_at_the_same_frames():

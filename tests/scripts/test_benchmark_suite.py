@@ -143,6 +143,14 @@ def test_sweep_runs_everything_once_and_writes_a_row_per_evaluation(tmp_path, ca
     assert "6 of 6 runs finished, 100.0% of the work" in capsys.readouterr().out
 
 
+def test_extended_sweep_keeps_the_final_evaluations_of_its_shorter_runs(tmp_path):
+    for frames in (FRAMES, 2 * FRAMES, 3 * FRAMES):
+        assert sweep(tmp_path, tasks=TASKS[:1], seeds=(0,), frames=frames) == 0
+    rows = {row.env_frames: (row.planner, row.actor) for row in read_rows(tmp_path / "results.csv")}
+    assert list(rows) == list(range(20, 3 * FRAMES + 1, 20))
+    assert [frames for frames, returns in rows.items() if returns == (7.0, 5.0)] == [100, 200, 300]
+
+
 @pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGTERM, signal.SIGINT], ids=lambda number: number.name)
 def test_interrupted_sweep_goes_on_and_ends_like_one_that_was_not(root, tmp_path, number):
     whole, cut = tmp_path / "whole", tmp_path / "cut"
