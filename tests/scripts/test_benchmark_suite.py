@@ -2,6 +2,7 @@
 
 import csv
 import json
+import math
 import os
 import re
 import signal
@@ -350,6 +351,18 @@ def test_finished_run_with_damaged_results_is_named(tmp_path, capsys):
     assert sweep(tmp_path) == 0
     assert "walker-walk, seed 0: the results in" in capsys.readouterr().out
     assert len({(row.task, row.seed) for row in read_rows(tmp_path / "results.csv")}) == 6  # known rows stay
+
+
+@pytest.mark.parametrize("value", [math.nan, math.inf])
+def test_run_with_an_evaluation_that_is_not_finite_is_named_and_adds_no_row(tmp_path, capsys, value):
+    assert sweep(tmp_path, tasks=TASKS[:1]) == 0
+    path = tmp_path / "walker-walk-seed0" / "final.json"
+    path.write_text(json.dumps(json.loads(path.read_text()) | {"planner": value}))
+    (tmp_path / "results.csv").unlink()
+    for _ in range(2):  # the second start reads what the first has written
+        assert sweep(tmp_path, tasks=TASKS[:1]) == 0
+        assert "walker-walk, seed 0: the evaluation at 100 frames in" in capsys.readouterr().out
+    assert {row.seed for row in read_rows(tmp_path / "results.csv")} == {1}
 
 
 def test_time_left_counts_what_is_left_over_the_runs_side_by_side(tmp_path):
