@@ -76,7 +76,8 @@ class RunsRequest:
     @property
     def budget(self) -> tuple[str, ...]:
         """The flags of `train.py` that end a run."""
-        given = (("--frames", self.frames), ("--minutes", self.minutes))
+        updates = self.settings.get("run", {}).get("updates")
+        given = (("--frames", self.frames), ("--minutes", self.minutes), ("--updates", updates))
         return tuple(word for name, value in given if value is not None for word in (name, f"{value:.15g}"))
 
     @property
@@ -86,6 +87,8 @@ class RunsRequest:
         words = [word for name, value in flags.items() if value is not None for word in (name, str(value))]
         for section, fields in self.settings.items():
             for name, value in fields.items():
+                if (section, name) == ("run", "updates"):  # part of the budget
+                    continue
                 words += [f"--{section}.{name}", value if isinstance(value, str) else json.dumps(value)]
         return tuple(words)
 

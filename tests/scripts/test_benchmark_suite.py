@@ -128,6 +128,15 @@ def test_sweep_passes_preset_config_and_settings_to_each_run(tmp_path):
         assert (config.run.frames, config.run.minutes, config.run.seed) == (FRAMES, 9.0, run.seed)
 
 
+def test_resumed_run_keeps_a_limit_of_updates(tmp_path):
+    request = read_request(suite.Request, words(tmp_path, "--run.updates", "40")[1:])
+    run = request.runs[0]
+    assert (run.resolve().run.frames, run.resolve().run.updates) == (FRAMES, 40)
+    (run.folder / "resume" / "save-000001").mkdir(parents=True)
+    assert run.command()[2:] == ["--resume", str(run.folder), "--frames", str(FRAMES), "--updates", "40"]
+    assert run.limits == {"--frames": FRAMES, "--updates": 40}
+
+
 def test_sweep_runs_everything_once_and_writes_a_row_per_evaluation(tmp_path, capsys):
     assert sweep(tmp_path) == 0
     first = processes(tmp_path)
