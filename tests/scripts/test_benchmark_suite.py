@@ -18,7 +18,7 @@ from bench import runs, suite, suite_progress, suite_queue
 from bench.anchors import TASK_GROUPS
 from bench.estimates import interquartile_mean
 from bench.runs import TrainingRun
-from bench.suite_progress import Progress, estimate_minutes_left, format_left
+from bench.suite_progress import Board, Progress, estimate_minutes_left, format_left, measure_progress
 from bench.suite_rows import Origin, Row, merge_rows, note_origin, read_origin, read_rows, write_rows
 from bench.suite_scores import aggregate, completed, improvement, newest_curves, profile, rows_at
 from hypothesis import given
@@ -389,6 +389,26 @@ def test_time_left_counts_what_is_left_over_the_runs_side_by_side(tmp_path):
         "about 1 h 1 min left",
         "about 2 d 2 h left",
     ]
+
+
+def test_progress_is_that_of_the_largest_clocks(tmp_path):
+    run = TrainingRun("walker-walk", 0, tmp_path, ("--frames", "100", "--updates", "1000"))
+    assert measure_progress(run) == Progress(0.0, 0.0)
+    rows = "2,125,0.8,\n2,0,0.1,9\n"  # of the evaluation before the first update, which takes its time
+    (tmp_path / "metrics.csv").write_text("env_frames,updates,minutes,planner_return\n" + rows)
+    assert measure_progress(run) == Progress(0.125, 0.8)
+    assert estimate_minutes_left({run: Progress(0.02, 0.1)}, 1) is None  # before the first update
+
+
+def test_state_of_the_sweep_is_printed_now_and_then_without_a_terminal(tmp_path, monkeypatch, capsys):
+    run = TrainingRun("walker-walk", 0, tmp_path, ("--frames", "100"))
+    monkeypatch.setattr(suite_progress, "LOOK_S", 0.0)
+    board = Board([run], 1, tmp_path / "results.csv", None)
+    board.look([run])
+    assert capsys.readouterr().out == ""
+    monkeypatch.setattr(suite_progress, "STATUS_S", 0.0)
+    board.look([run])
+    assert "0 of 1 runs finished" in capsys.readouterr().out
 
 
 def test_rows_at_a_number_of_frames_are_the_last_within_them_of_the_newest_version():
