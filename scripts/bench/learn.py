@@ -22,6 +22,7 @@ from bench.runs import RunsRequest, TrainingRun
 from latentplan.config import UserError, make_folder
 from latentplan.config.env_id import as_file_name
 from latentplan.config.parsing import option
+from latentplan.config.suites import SUITES, check_task
 from latentplan.reporting.published import FRAMES, published_returns_of
 
 FRAMES_TOLERANCE = 0.03  # largest distance of an evaluation from a number of frames, as a share of that number
@@ -33,7 +34,8 @@ class Request(RunsRequest):
     """Flags of `benchmark.py learn`.
 
     Attributes:
-        tasks: Tasks, each as domain-task, or as gymnasium-ID for an environment of gymnasium's registry.
+        tasks: Tasks, each as domain-task, or as gymnasium-ID for an environment of gymnasium's registry. A domain alone
+            stands for its usual task.
         thresholds: Evaluation returns; the frames and minutes until each of these returns are reported.
         mode: Agent whose evaluation returns are reported.
     """
@@ -43,6 +45,7 @@ class Request(RunsRequest):
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        object.__setattr__(self, "tasks", tuple(dict.fromkeys(map(name_task, self.tasks))))
         if min(self.thresholds) < 0:
             raise UserError(f"--thresholds must be at least 0, got {min(self.thresholds)}")
 
@@ -73,6 +76,12 @@ def run(request: Request) -> int:
     plot_runs(curves, mode, out / "curves.png")
     print(f"curves.csv, summary.json and curves.png are in {out}")
     return 0
+
+
+def name_task(name: str) -> str:
+    """The name of a task as domain-task, where a domain alone stands for its usual task; other names are unchanged."""
+    suite = next((suite for suite, each in SUITES.items() if name in each.tasks), None)
+    return name if suite is None else f"{name}-{check_task(suite, name)[0]}"
 
 
 def read_run(task: str, seed: int, folder: Path, mode: str) -> Curve:

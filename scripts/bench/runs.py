@@ -44,7 +44,7 @@ class RunsRequest:
 
     Attributes:
         tasks: Tasks, each as domain-task.
-        seeds: Seeds of each task.
+        seeds: Seeds of each task, each once.
         frames: Simulator frames of each run; without frames and minutes, a run has the budget of the preset.
         minutes: Minutes of each run; with frames given too, a run ends at the first of the two limits.
         out: Folder of the runs and results; finished runs in this folder are not repeated.
@@ -66,6 +66,7 @@ class RunsRequest:
 
     def __post_init__(self) -> None:
         above_zero(self, "frames", "minutes")
+        object.__setattr__(self, "seeds", tuple(dict.fromkeys(self.seeds)))
         if min(self.seeds, default=0) < 0:
             raise UserError(f"--seeds must be at least 0, got {min(self.seeds)}")
         for key, own in OWN_FLAGS.items():

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from bench.anchors import TASK_GROUPS
 from bench.estimates import interquartile_estimate, mean_estimate
-from bench.learn import _train, compare, first_reaching, read_run, run_facts
+from bench.learn import Request, _train, compare, first_reaching, read_run, run_facts
 from bench.learn_plot import MARKERS, Curve, Point
 from bench.run_evaluations import keep_final
 from bench.runs import TrainingRun, check_same
@@ -148,6 +148,12 @@ def test_request_refuses_settings_that_its_own_flags_set(tmp_path, capsys, flag,
     assert benchmark.main(["learn", flag, "5", "--out", str(tmp_path / "out")]) == 2
     assert f"{own} sets {flag} here" in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
+
+
+def test_learn_takes_each_task_and_seed_once():
+    names = ("walker", "walker-walk", "gymnasium-my_robot:Reach-v0", "walkr")
+    request = Request(tasks=names, seeds=(1, 0, 1))
+    assert request.tasks == ("walker-walk", "gymnasium-my_robot:Reach-v0", "walkr") and request.seeds == (1, 0)
 
 
 def test_compare_takes_the_median_of_frames_to_a_threshold():

@@ -105,6 +105,12 @@ def test_runs_begin_with_the_first_seed_of_every_task(tmp_path):
     ]
 
 
+@pytest.mark.parametrize("seeds", [("0", "00"), ("[0, 0]",)])
+def test_runs_have_each_seed_once(tmp_path, seeds):
+    request = read_request(suite.Request, words(tmp_path, tasks=TASKS[:1], seeds=seeds)[1:])
+    assert [run.seed for run in request.runs] == [0]
+
+
 def test_every_task_of_dmc20_has_settings():
     for run in suite.Request(tasks=("dmc20",), seeds=(0,)).runs:
         env = run.resolve().env
