@@ -229,6 +229,16 @@ def test_failed_run_is_reported_and_tried_again_and_stops_no_other(tmp_path, cap
     assert set(after) - set(before) == {"walker-walk-seed0"} and before.items() <= after.items()
 
 
+def test_run_whose_folder_cannot_be_prepared_stops_no_other(tmp_path, capsys):
+    (tmp_path / "walker-walk-seed0" / "train.log").mkdir(parents=True)
+    (tmp_path / "cartpole-swingup-seed0" / "origin.json").mkdir(parents=True)
+    assert sweep(tmp_path) == 1
+    printed = capsys.readouterr().out
+    assert "walker-walk, seed 0: failed, [Errno 21] Is a directory" in printed
+    assert re.search("cartpole-swingup, seed 0: failed, .*origin.json could not be written", printed)
+    assert "4 of 6 runs finished, 2 failed" in printed
+
+
 def test_run_waits_while_another_process_has_its_folder(tmp_path, capsys):
     folder = tmp_path / "walker-walk-seed0"
     code = f"import sys; sys.path.insert(0, {str(STUB.parents[2])!r})\n"
