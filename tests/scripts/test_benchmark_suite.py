@@ -19,6 +19,7 @@ from bench.anchors import TASK_GROUPS
 from bench.estimates import interquartile_mean
 from bench.runs import TrainingRun
 from bench.suite_progress import Board, Progress, estimate_minutes_left, format_left, measure_progress
+from bench.suite_report import write_report
 from bench.suite_rows import Origin, Row, merge_rows, note_origin, read_origin, read_rows, write_rows
 from bench.suite_scores import aggregate, completed, improvement, newest_curves, profile, rows_at
 from hypothesis import given
@@ -485,6 +486,22 @@ def test_report_needs_nothing_but_a_file_of_results(tmp_path, capsys):
     assert "1 runs of 1 tasks" in report.read_text() and "walker" not in report.read_text()
     assert benchmark.main(["suite", *flags, "--frames", "20", "--report", str(report)]) == 2
     assert "no run has an evaluation within 20 frames" in capsys.readouterr().err
+
+
+def test_sweep_without_results_ends_with_a_note_in_place_of_its_report(tmp_path, capsys):
+    (tmp_path / "walker-walk-seed0.broken").touch()
+    assert sweep(tmp_path, "--report", tmp_path / "report.md", tasks=TASKS[:1], seeds=(0,)) == 1
+    captured = capsys.readouterr()
+    assert "no report: no run has an evaluation within 100 frames" in captured.out and captured.err == ""
+    assert not (tmp_path / "report.md").exists()
+
+
+def test_report_counts_the_same_number_of_runs_in_every_table(tmp_path):
+    rows = [make_row("walker-walk", seed, planner=500.0 + seed) for seed in (0, 1)] + [make_row("fish-swim")]
+    write_report(rows, 100_000, tmp_path / "report.md")
+    together = (tmp_path / "report.md").read_text().partition("## All tasks together")[2]
+    assert "One run per task counts; without a second seed there are no intervals." in together
+    assert not re.search(r"\d \(\d", together)
 
 
 def test_sweep_ends_with_its_report(tmp_path):
