@@ -116,6 +116,7 @@ def read_request(request: type[Request], argv: Sequence[str]) -> Request:
         argv = [first, *argv]
     names = {flag.setting.key: flag.names[0] for flag in flags}
     values = read_values([flag.setting for flag in flags], _read_texts(flags, argv), names)
+    _check_lists(flags, values)
     _check_resumed(request, [names[key] for key in values])
     _check_outputs(flags, values)
     for flag in flags:
@@ -263,6 +264,18 @@ def _read_texts(flags: Sequence[Flag], argv: Sequence[str]) -> dict[str, Any]:
     return texts
 
 
+def _check_lists(flags: Sequence[Flag], values: Mapping[str, Any]) -> None:
+    """Refuses an empty list as YAML writes it, for which a command has nothing to do.
+
+    A list that is empty by default may be empty, and so may a list among the settings of another dataclass: a run
+    without trackers is a run.
+    """
+    for flag in flags:
+        key, separator = flag.setting.key, flag.setting.options.get("separator")
+        if separator and "." not in key and flag.setting.default != () and values.get(key) == ():
+            raise _empty_list(flag.names[0], separator, "[]")
+
+
 def _check_resumed(request: type, given: Sequence[str]) -> None:
     resumable = getattr(request, "RESUMABLE", ())
     if "--resume" in given:
@@ -287,8 +300,12 @@ def _split(name: str, text: str, separator: str) -> list[str]:
     """The distinct items of a list, in order."""
     items = list(dict.fromkeys(item.strip() for item in text.split(separator) if item.strip()))
     if not items:
-        raise UserError(f"{name} must name at least one, separated by {separator!r}, got {text!r}")
+        raise _empty_list(name, separator, text)
     return items
+
+
+def _empty_list(name: str, separator: str, text: str) -> UserError:
+    return UserError(f"{name} must name at least one, separated by {separator!r}, got {text!r}")
 
 
 def _spelled(key: str) -> str:

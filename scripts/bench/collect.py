@@ -20,7 +20,7 @@ from bench.options import ComposeRequest
 from bench.report import format_number, format_table, write_json
 from latentplan.config import UserError
 from latentplan.config.checks import above_zero, at_least
-from latentplan.config.learning import COLLECTION_BACKENDS, CollectionBackend
+from latentplan.config.learning import COLLECTION_BACKENDS, MAX_WORKERS, CollectionBackend
 from latentplan.config.parsing import option, raise_unknown
 from latentplan.config.settings import RenderQuality
 
@@ -37,8 +37,8 @@ class Request(ComposeRequest):
 
     Attributes:
         backends: Kinds of workers, `process` or `ray`.
-        workers: Numbers of workers from which the model is fitted, at least three.
-        held_out: Numbers of workers that the fitted model predicts.
+        workers: Numbers of workers from which the model is fitted, at least three, each in [1, 256].
+        held_out: Numbers of workers that the fitted model predicts, each in [1, 256].
         decisions: Decisions of a round, one measurement for each.
         rounds: Timed rounds of each measurement.
         quality: Render quality.
@@ -66,6 +66,12 @@ class Request(ComposeRequest):
     def __post_init__(self) -> None:
         super().__post_init__()
         at_least(self, rounds=1, learners=1, collectors=1)
+        for name in ("workers", "held_out"):
+            for number in getattr(self, name):
+                if not 1 <= number <= MAX_WORKERS:
+                    raise ValueError(f"{name} must be in [1, {MAX_WORKERS}], got {number}")
+        if min(self.decisions) < 1:
+            raise ValueError(f"decisions must be at least 1, got {min(self.decisions)}")
         if len(set(self.workers)) < 3:
             raise UserError("--workers must name at least three numbers, from which the model is fitted")
         above_zero(self, "update_ms", "link_gbit")
@@ -85,11 +91,11 @@ def run(request: Request) -> int:
     for backend in request.backends:
         rows = list(measure(config, request, backend))
         model = fit([row for row in rows if row["workers"] in request.workers], cores)
+        print_rows(backend, rows, model, cores)
         cluster = predict_cluster(model, rows[-1], config, request)
         result[backend] = {"rows": rows, "model": model, "cluster": cluster}
-        print_rows(backend, rows, model, cores)
         print_cluster(cluster, request)
-    write_json(request.json, {"cores": cores, "quality": request.quality, "backends": result})
+        write_json(request.json, {"cores": cores, "quality": request.quality, "backends": result})
     return 0
 
 
@@ -166,6 +172,10 @@ def predict_cluster(
 
     Every learner takes its share of each batch, and an update is taken to be no faster for it. Gradients travel around
     a ring once: 2 (N - 1) / N times their bytes. Rows travel to the learner, weights to each worker.
+
+    Returns:
+        Rates per second, and `limits` in workers. `joining` is None where the fitted time of a worker is 0; all limits
+        and `bytes_per_s` are None where that of a decision is 0, as where rounds take no longer with more decisions.
     """
     workers, ranks = request.collectors, request.learners
     decisions = config.collection.round_decisions * workers
@@ -173,22 +183,21 @@ def predict_cluster(
     gradient_s = 2.0 * (ranks - 1) / ranks * row["weight_bytes"] / link
     updates = 1.0 / (request.update_ms / 1000.0 + gradient_s)
     repeat, ratio = config.env.action_repeat, config.collection.updates_per_decision
-    alone = 1.0 / model["decision"]  # decisions per second of one worker
+    decision, worker = model["decision"], model["worker"]
     seconds = predict(model, workers, decisions, workers)
-    bytes_per_worker = alone * row["row_bytes"] + row["weight_bytes"] * alone / config.collection.round_decisions
+    bytes_per_decision = row["row_bytes"] + row["weight_bytes"] / config.collection.round_decisions
+    limits = {
+        "updates": updates / ratio * decision,
+        "network": link / bytes_per_decision * decision,
+        "joining": config.collection.round_decisions * decision / worker if worker else None,
+    }
     return {
         "collected_frames_per_s": repeat * decisions / seconds,
         "learned_frames_per_s": repeat * updates / ratio,
         "updates_per_s": updates,
         "gradient_s": gradient_s,
-        "bytes_per_s": bytes_per_worker * workers,
-        "limits": {
-            "updates": updates / ratio / alone,
-            "network": link / bytes_per_worker,
-            "joining": config.collection.round_decisions * model["decision"] / model["worker"]
-            if model["worker"]
-            else None,
-        },
+        "bytes_per_s": workers * bytes_per_decision / decision if decision else None,
+        "limits": limits if decision else dict.fromkeys(limits),
     }
 
 
@@ -213,10 +222,11 @@ def print_rows(backend: str, rows: Sequence[Mapping[str, Any]], model: Mapping[s
 
 def print_cluster(cluster: Mapping[str, Any], request: Request) -> None:
     """The prediction for a cluster."""
+    megabytes = None if cluster["bytes_per_s"] is None else cluster["bytes_per_s"] / 1e6
     print(
         f"{request.collectors} workers collect {cluster['collected_frames_per_s']:,.0f} frames/s, "
         f"{request.learners} learners use {cluster['learned_frames_per_s']:,.0f}; "
-        f"{cluster['bytes_per_s'] / 1e6:,.0f} MB/s arrive and leave"
+        f"{format_number(megabytes, 0)} MB/s arrive and leave"
     )
     limits = ", ".join(f"{part} {format_number(workers, 1)}" for part, workers in cluster["limits"].items())
     print(f"workers at which each part is at its limit: {limits}\n", flush=True)

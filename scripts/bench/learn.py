@@ -17,11 +17,12 @@ from typing import Any, Literal
 
 from bench.learn_plot import Curve, Point, plot_runs
 from bench.report import format_interval, format_number, format_table, write_csv, write_json
+from bench.run_evaluations import keep_final, read_all_evaluations
 from bench.runs import RunsRequest, TrainingRun
 from latentplan.config import UserError, make_folder
 from latentplan.config.env_id import as_file_name
 from latentplan.config.parsing import option
-from latentplan.config.run_results import read_evaluations
+from latentplan.config.suites import SUITES, check_task
 from latentplan.reporting.published import FRAMES, published_returns_of
 
 FRAMES_TOLERANCE = 0.03  # largest distance of an evaluation from a number of frames, as a share of that number
@@ -33,7 +34,8 @@ class Request(RunsRequest):
     """Flags of `benchmark.py learn`.
 
     Attributes:
-        tasks: Tasks, each as domain-task, or as gymnasium-ID for an environment of gymnasium's registry.
+        tasks: Tasks, each as domain-task, or as gymnasium-ID for an environment of gymnasium's registry. A domain alone
+            stands for its usual task.
         thresholds: Evaluation returns; the frames and minutes until each of these returns are reported.
         mode: Agent whose evaluation returns are reported.
     """
@@ -43,6 +45,7 @@ class Request(RunsRequest):
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        object.__setattr__(self, "tasks", tuple(dict.fromkeys(map(name_task, self.tasks))))
         if min(self.thresholds) < 0:
             raise UserError(f"--thresholds must be at least 0, got {min(self.thresholds)}")
 
@@ -75,13 +78,19 @@ def run(request: Request) -> int:
     return 0
 
 
+def name_task(name: str) -> str:
+    """The name of a task as domain-task, where a domain alone stands for its usual task; other names are unchanged."""
+    suite = next((suite for suite, each in SUITES.items() if name in each.tasks), None)
+    return name if suite is None else f"{name}-{check_task(suite, name)[0]}"
+
+
 def read_run(task: str, seed: int, folder: Path, mode: str) -> Curve:
-    """The evaluations of a run, including the final evaluation.
+    """The evaluations of a run, including the final evaluation and those of shorter budgets.
 
     Raises:
         UserError: The run has no evaluation, or its files are damaged.
     """
-    points = [Point(each.env_frames, each.minutes, getattr(each, mode)) for each in read_evaluations(folder)]
+    points = [Point(each.env_frames, each.minutes, getattr(each, mode)) for each in read_all_evaluations(folder)]
     if not points:
         raise UserError(f"{folder} holds no evaluation; lower --evaluation.every_frames or train longer")
     return Curve(task, seed, points)
@@ -202,6 +211,7 @@ def _train(run: TrainingRun) -> None:
         print(f"{run.folder} is finished and not repeated", flush=True)
         return
     print(f"training {run.name}", flush=True)
+    keep_final(run.folder)
     training = subprocess.Popen(run.command())
     previous = signal.signal(signal.SIGINT, signal.SIG_IGN)  # the run gets Ctrl-C too, and saves its state
     try:

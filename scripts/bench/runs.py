@@ -44,7 +44,7 @@ class RunsRequest:
 
     Attributes:
         tasks: Tasks, each as domain-task.
-        seeds: Seeds of each task.
+        seeds: Seeds of each task, each once.
         frames: Simulator frames of each run; without frames and minutes, a run has the budget of the preset.
         minutes: Minutes of each run; with frames given too, a run ends at the first of the two limits.
         out: Folder of the runs and results; finished runs in this folder are not repeated.
@@ -66,6 +66,7 @@ class RunsRequest:
 
     def __post_init__(self) -> None:
         above_zero(self, "frames", "minutes")
+        object.__setattr__(self, "seeds", tuple(dict.fromkeys(self.seeds)))
         if min(self.seeds, default=0) < 0:
             raise UserError(f"--seeds must be at least 0, got {min(self.seeds)}")
         for key, own in OWN_FLAGS.items():
@@ -76,7 +77,8 @@ class RunsRequest:
     @property
     def budget(self) -> tuple[str, ...]:
         """The flags of `train.py` that end a run."""
-        given = (("--frames", self.frames), ("--minutes", self.minutes))
+        updates = self.settings.get("run", {}).get("updates")
+        given = (("--frames", self.frames), ("--minutes", self.minutes), ("--updates", updates))
         return tuple(word for name, value in given if value is not None for word in (name, f"{value:.15g}"))
 
     @property
@@ -86,6 +88,8 @@ class RunsRequest:
         words = [word for name, value in flags.items() if value is not None for word in (name, str(value))]
         for section, fields in self.settings.items():
             for name, value in fields.items():
+                if (section, name) == ("run", "updates"):  # part of the budget
+                    continue
                 words += [f"--{section}.{name}", value if isinstance(value, str) else json.dumps(value)]
         return tuple(words)
 

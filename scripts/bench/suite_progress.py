@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import heapq
 import statistics
 import sys
@@ -10,14 +11,18 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
+from bench.run_evaluations import keep_final
 from bench.runs import TrainingRun
 from bench.suite_rows import Origin, Row, merge_rows, note_origin, read_origin, read_rows, rows_of, write_rows
 from latentplan.config import UserError, make_folder
-from latentplan.config.run_results import FINAL_FILE, METRICS_FILE, read_progress
+from latentplan.config.run_results import FINAL_FILE, METRICS_FILE
+from latentplan.config.run_results import read_rows as read_metrics
 from latentplan.training.child_run import LOG
 
 LOOK_S = 5.0
-LEAST_SHARE = 0.02  # of a run, from which its speed is known
+STATUS_S = 300.0  # between two lines about the whole sweep where there is no terminal
+LEAST_SHARE = 0.05  # of a run, from which its speed is known; collection before the first update is faster
+CLOCKS = {"--frames": "env_frames", "--minutes": "minutes", "--updates": "updates"}  # columns of metrics, by limit
 
 
 class Progress(NamedTuple):
@@ -51,26 +56,31 @@ class Board:
         self._changes: dict[TrainingRun, tuple[int, ...]] = {}
         self._seen: dict[TrainingRun, list[Row]] = {}
         self._progress = {run: measure_progress(run) for run in runs}
-        self._looked = 0.0
+        self._looked, self._stated = 0.0, time.monotonic()
         for run in runs:
             self._read(run)
         write_rows(results, self.rows)
 
     def begin(self, run: TrainingRun) -> None:
-        """Note the origin of a run, whose process is about to start."""
+        """Note the origin and the final evaluation of a run, whose process is about to start."""
         is_begun = read_origin(run.folder) is not None
         make_folder(run.folder)
+        keep_final(run.folder)
         if self.origin is not None:
             note_origin(run.folder, self.origin)
         self._print(f"{run.name}: {'goes on' if is_begun else 'begins'}; its log is {run.folder / LOG}")
 
     def look(self, active: Sequence[TrainingRun]) -> None:
-        """Take new evaluations of active runs into the file of results; at most once in five seconds."""
+        """Take new evaluations of active runs into the file of results; at most once in five seconds.
+
+        Without a terminal the state of the sweep is printed at least every five minutes.
+        """
         if time.monotonic() - self._looked < LOOK_S:
             return
         self._looked = time.monotonic()
-        if any([self._update(run) for run in active]):
-            self._print(self.status())
+        is_quiet = not sys.stdout.isatty() and self._looked - self._stated >= STATUS_S
+        if any([self._update(run) for run in active]) or is_quiet:
+            self._print_status()
         if sys.stdout.isatty():
             print(f"\r\x1b[K{self.status()}", end="", flush=True)
 
@@ -82,14 +92,14 @@ class Board:
         """Take the last rows of a run."""
         self._update(run)
         self._print(f"{run.name}: finished")
-        self._print(self.status())
+        self._print_status()
 
     def fail(self, run: TrainingRun, reason: str) -> None:
         """Remember why a run failed; the next start of the sweep tries the run again."""
         self._update(run)
         self.failures[run] = reason
         self._print(f"{run.name}: failed, {reason}")
-        self._print(self.status())
+        self._print_status()
 
     def stop(self, active: Sequence[TrainingRun]) -> None:
         """Say that runs save themselves."""
@@ -145,17 +155,26 @@ class Board:
         self._print(f"{run.name}: {clocks}, planner {last.planner:.1f}, actor {last.actor:.1f}")
         return True
 
+    def _print_status(self) -> None:
+        self._stated = time.monotonic()
+        self._print(self.status())
+
     def _print(self, line: str) -> None:
         print(("\r\x1b[K" if sys.stdout.isatty() else "") + line, flush=True)
 
 
 def measure_progress(run: TrainingRun) -> Progress:
-    """How far a run is, from its metrics."""
-    frames, minutes = read_progress(run.folder)
-    if run.is_finished():
-        return Progress(1.0, minutes)
-    spent = {"--frames": frames, "--minutes": minutes}
-    return Progress(min(1.0, max(spent[name] / limit for name, limit in run.limits.items())), minutes)
+    """How far a run is, from the largest clocks in its metrics.
+
+    An evaluation runs beside the updates, and its row has the clocks of its start.
+    """
+    try:
+        rows = list(read_metrics(run.folder / METRICS_FILE))
+        spent = {name: max((float(row[clock]) for row in rows), default=0.0) for name, clock in CLOCKS.items()}
+    except (OSError, ValueError, TypeError, KeyError, csv.Error):  # a damaged file, which the run itself reports
+        spent = dict.fromkeys(CLOCKS, 0.0)
+    share = max(spent[name] / limit for name, limit in run.limits.items())
+    return Progress(1.0 if run.is_finished() else min(1.0, share), spent["--minutes"])
 
 
 def estimate_minutes_left(progress: Mapping[TrainingRun, Progress], jobs: int) -> float | None:

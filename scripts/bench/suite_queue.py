@@ -118,10 +118,10 @@ class Queue:
                     self.observer.wait(run)
                 continue
             self.waiting.remove(run)
-            self.observer.begin(run)
             try:
+                self.observer.begin(run)
                 self.active[run] = self.start(run)
-            except UserError as error:
+            except (UserError, OSError) as error:  # such as a folder in which nothing can be written
                 self.observer.fail(run, str(error))
 
     def _stop(self) -> None:

@@ -145,6 +145,7 @@ def _describe_table(frames: int) -> str:
 
 def _describe_all(reached: Mapping[str, Sequence[Row]], frames: int) -> list[str]:
     num_runs = min(map(len, reached.values()))
+    reached = {task: rows[:num_runs] for task, rows in reached.items()}  # the same number in every table
     if num_runs == 1:
         bounds = "One run per task counts; without a second seed there are no intervals."
     else:

@@ -11,12 +11,12 @@ from pathlib import Path
 from typing import NamedTuple
 
 from bench.report import write_csv, write_json
+from bench.run_evaluations import read_all_evaluations
 from bench.runs import TrainingRun
 from latentplan import __version__
 from latentplan.config import UserError, make_folder
 from latentplan.config.origin import UNKNOWN, describe_commit, describe_hardware
 from latentplan.config.reading import LARGEST_DATA, read_text
-from latentplan.config.run_results import read_evaluations
 
 ORIGIN = "origin.json"
 JOINED = " + "  # between two machines or two commits of one run
@@ -93,9 +93,16 @@ def rows_of(run: TrainingRun) -> list[Row]:
     """The rows of a run, in the order of their frames.
 
     Raises:
-        UserError: The files of the run are damaged.
+        UserError: The files of the run are damaged, or an evaluation is not finite.
     """
     origin = read_origin(run.folder) or Origin(UNKNOWN, UNKNOWN, UNKNOWN)
+    evaluations = read_all_evaluations(run.folder)
+    for each in evaluations:
+        if not all(map(math.isfinite, (each.minutes, each.planner, each.actor))):
+            raise UserError(
+                f"the evaluation at {each.env_frames:,} frames in {run.folder} is not finite, and no further row "
+                "of this run is taken; remove the folder to repeat the run"
+            )
     return [
         Row(
             run.task,
@@ -107,7 +114,7 @@ def rows_of(run: TrainingRun) -> list[Row]:
             each.updates,
             *origin,
         )
-        for each in read_evaluations(run.folder)
+        for each in evaluations
     ]
 
 

@@ -96,9 +96,15 @@ def listen(address: str, seconds: float) -> list[dict[str, Any]]:
 
 
 def summarize(moments: Sequence[dict[str, Any]]) -> dict[str, float]:
-    """Decisions per second, share of late ones, and quantiles of the milliseconds of decisions and of whole periods."""
+    """Decisions per second, share of late ones, and quantiles of the milliseconds of decisions and of whole periods.
+
+    Raises:
+        UserError: The moments are not of two decisions.
+    """
     import numpy as np
 
+    if not moments or moments[0]["number"] == moments[-1]["number"]:
+        raise UserError("no two decisions within --seconds; give more --seconds or a higher --control-hz")
     first, last = moments[0], moments[-1]
     num = last["number"] - first["number"]
     quantiles = {

@@ -11,7 +11,7 @@ import pytest
 
 from latentplan.commands.flags import format_flags, list_flags, overrides, read_request
 from latentplan.commands.main import COMMANDS
-from latentplan.config import DistillConfig, GoalsConfig, PlannerConfig, UserError
+from latentplan.config import Config, DistillConfig, GoalsConfig, PlannerConfig, UserError
 from latentplan.config.checks import at_least
 from latentplan.config.parsing import option
 
@@ -82,6 +82,23 @@ def test_read_request_takes_the_items_of_a_list_as_words_too():
     assert read("--seeds 5 --seeds 2 1").seeds == (2, 1)
 
 
+def test_read_request_takes_an_empty_list_where_it_is_the_default_or_a_setting_of_a_run():
+    @dataclass(frozen=True)
+    class Lists:
+        """Lists.
+
+        Attributes:
+            earlier: Files.
+            settings: Settings of a run.
+        """
+
+        earlier: tuple[str, ...] = option((), separator=",")
+        settings: dict[str, Any] = overrides(Config)
+
+    request = read_request(Lists, ["--earlier", "[]", "--run.logger", "[]"])
+    assert request == Lists((), {"run": {"logger": ()}})
+
+
 def test_read_request_keeps_only_the_given_settings_of_another_dataclass():
     request = read("--planner.min_std 1e-3 --updates 2e2 --learning-rate 1 --minutes null")
     assert request.planner == {"min_std": 1e-3}
@@ -116,6 +133,7 @@ def test_read_request_tries_outputs_and_takes_where_links_lead(tmp_path):
         ("--planner.min_std nan", "--planner.min_std must be a finite number, got 'nan'"),
         ("--relabel-share 2", "--relabel-share must be in [0.0, 1.0], got 2.0"),
         ("--seeds ,", "--seeds must name at least one, separated by ',', got ','"),
+        ("--seeds []", "--seeds must name at least one, separated by ',', got '[]'"),
         ("--seeds 1 x", "--seeds must be whole numbers, separated by ',', got '1,x'"),
         ("--seeds=1 2", "unexpected argument '2'"),
         ("--seeds --num-episodes 3", "flag --seeds needs a value"),

@@ -18,6 +18,7 @@ from bench.machine import product_limits
 from bench.render import measure_qualities
 from bench.report import format_interval, format_number, format_table
 from bench.train_update import PARTS, measure_graph, measure_update
+from bench.view import summarize
 
 from latentplan.agents.actor import ActorAgent
 from latentplan.agents.planning import PlanningAgent
@@ -109,6 +110,13 @@ def test_format_table_aligns_columns_and_marks_missing_values():
     assert table.splitlines() == ["arm     return", "------  ------", "a         12.3", "longer       -"]
     assert format_interval((None, None)) == "-"
     assert format_interval((-1.0, 2.0), sign=True) == "-1.0 to +2.0"
+
+
+@pytest.mark.parametrize("numbers", [(), (4,), (4, 4)])
+def test_rate_of_the_view_needs_two_decisions(numbers):
+    moments = [{"number": number, "late": 0, "decision_ms": 1.0, "busy_ms": 1.0, "at": 0.0} for number in numbers]
+    with pytest.raises(UserError, match="no two decisions within --seconds"):
+        summarize(moments)
 
 
 def test_parse_arms_puts_the_full_planner_first():

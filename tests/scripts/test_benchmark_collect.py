@@ -6,7 +6,7 @@ from types import SimpleNamespace
 
 import benchmark
 import pytest
-from bench.collect import fit, predict, predict_cluster
+from bench.collect import fit, predict, predict_cluster, print_cluster
 
 from latentplan.config import Config
 
@@ -42,6 +42,13 @@ def test_cluster_collects_no_faster_than_its_workers_without_overhead():
     assert free["collected_frames_per_s"] == pytest.approx(ideal) and free["limits"]["joining"] is None
 
 
+def test_cluster_has_no_limits_where_a_decision_takes_no_time(capsys):
+    found = cluster(MODEL | {"decision": 0.0})
+    assert found["bytes_per_s"] is None and set(found["limits"].values()) == {None}
+    print_cluster(found, SimpleNamespace(learners=8, collectors=256))
+    assert "updates -, network -, joining -" in capsys.readouterr().out
+
+
 def test_limits_of_a_cluster_grow_with_the_speed_of_their_parts():
     usual = cluster()["limits"]
     assert cluster(update_ms=5.0)["limits"]["updates"] > usual["updates"]
@@ -52,6 +59,21 @@ def test_limits_of_a_cluster_grow_with_the_speed_of_their_parts():
 def test_collect_refuses_too_few_numbers_for_a_fit(capsys):
     assert benchmark.main(["collect", "--workers", "1,2"]) == 2
     assert "--workers must name at least three numbers" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("flags", "named"),
+    [
+        ("--workers 0,1,2", "--workers must be in [1, 256], got 0"),
+        ("--workers 1,2,257", "--workers must be in [1, 256], got 257"),
+        ("--held-out 0", "--held-out must be in [1, 256], got 0"),
+        ("--decisions 0", "--decisions must be at least 1, got 0"),
+    ],
+)
+def test_collect_refuses_counts_out_of_range(capsys, flags, named):
+    assert benchmark.main(["collect", *flags.split()]) == 2
+    captured = capsys.readouterr()
+    assert named in captured.err and captured.out == ""
 
 
 @pytest.mark.slow

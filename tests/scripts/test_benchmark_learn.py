@@ -10,8 +10,9 @@ import numpy as np
 import pytest
 from bench.anchors import TASK_GROUPS
 from bench.estimates import interquartile_estimate, mean_estimate
-from bench.learn import _train, compare, first_reaching, read_run, run_facts
+from bench.learn import Request, _train, compare, first_reaching, read_run, run_facts
 from bench.learn_plot import MARKERS, Curve, Point
+from bench.run_evaluations import keep_final
 from bench.runs import TrainingRun, check_same
 
 from latentplan.config import Config, EnvConfig, PlannerConfig, RunConfig, UserError
@@ -36,6 +37,27 @@ def test_read_run_ends_with_the_final_evaluation(tmp_path):
         json.dumps({"env_frames": 100, "updates": 9, "minutes": 5.5, "planner": 7, "actor": 8})
     )
     assert read_run("walker-walk", 0, tmp_path, "actor").points == [Point(80, 4.0, 2.0), Point(100, 5.5, 8.0)]
+
+
+def test_read_run_keeps_the_final_evaluation_of_a_shorter_budget(tmp_path):
+    (tmp_path / "metrics.csv").write_text(HEADER + "80,7,4.0,1,2\n")
+    keep_final(tmp_path)  # before the run has a final evaluation
+    for frames, minutes in ((100, 5.0), (200, 9.0)):
+        final = {"env_frames": frames, "updates": frames, "minutes": minutes, "planner": frames, "actor": 0}
+        (tmp_path / "final.json").write_text(json.dumps(final))
+        if frames == 100:
+            keep_final(tmp_path)
+    points = [Point(80, 4.0, 1.0), Point(100, 5.0, 100), Point(200, 9.0, 200)]
+    assert read_run("walker-walk", 0, tmp_path, "planner").points == points
+    (tmp_path / "metrics.csv").write_text(HEADER + "80,7,4.0,1,2\n100,8,5.0,3,4\n")  # of fewer episodes
+    assert read_run("walker-walk", 0, tmp_path, "planner").points == points
+
+
+def test_read_run_refuses_damaged_final_evaluations_of_shorter_budgets(tmp_path):
+    (tmp_path / "metrics.csv").write_text(HEADER + "80,7,4.0,1,2\n")
+    (tmp_path / "finals.json").write_text("{")
+    with pytest.raises(UserError, match="finals.json is damaged; remove it"):
+        read_run("walker-walk", 0, tmp_path, "planner")
 
 
 def test_compare_sets_runs_beside_published_returns_at_the_same_frames():
@@ -126,6 +148,12 @@ def test_request_refuses_settings_that_its_own_flags_set(tmp_path, capsys, flag,
     assert benchmark.main(["learn", flag, "5", "--out", str(tmp_path / "out")]) == 2
     assert f"{own} sets {flag} here" in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
+
+
+def test_learn_takes_each_task_and_seed_once():
+    names = ("walker", "walker-walk", "gymnasium-my_robot:Reach-v0", "walkr")
+    request = Request(tasks=names, seeds=(1, 0, 1))
+    assert request.tasks == ("walker-walk", "gymnasium-my_robot:Reach-v0", "walkr") and request.seeds == (1, 0)
 
 
 def test_compare_takes_the_median_of_frames_to_a_threshold():

@@ -1,7 +1,8 @@
-"""`benchmark.py suite`: the queue of runs and its interruptions, rows of results, and the report."""
+"""`benchmark.py suite`: the queue of runs, its interruptions and its progress."""
 
 import csv
 import json
+import math
 import os
 import re
 import signal
@@ -11,17 +12,12 @@ import time
 from pathlib import Path
 
 import benchmark
-import numpy as np
 import pytest
 from bench import runs, suite, suite_progress, suite_queue
 from bench.anchors import TASK_GROUPS
-from bench.estimates import interquartile_mean
 from bench.runs import TrainingRun
-from bench.suite_progress import Progress, estimate_minutes_left, format_left
-from bench.suite_rows import Origin, Row, merge_rows, note_origin, read_origin, read_rows, write_rows
-from bench.suite_scores import aggregate, completed, improvement, newest_curves, profile, rows_at
-from hypothesis import given
-from hypothesis import strategies as st
+from bench.suite_progress import Board, Progress, estimate_minutes_left, format_left, measure_progress
+from bench.suite_rows import read_origin, read_rows
 
 from latentplan.commands.flags import read_request
 from latentplan.config import extras
@@ -84,10 +80,6 @@ def wait_for(condition, seconds=60.0):
         time.sleep(0.01)
 
 
-def make_row(task="walker-walk", seed=0, env_frames=100_000, planner=500.0, actor=400.0, version="0.2.0", minutes=60.0):
-    return Row(task, seed, env_frames, minutes, planner, actor, env_frames // 4, "2 cores of X", "abc", version)
-
-
 def results_of(out):
     """The rows of a sweep without the origin of its runs."""
     return [row[:7] for row in read_rows(out / "results.csv")]
@@ -102,6 +94,12 @@ def test_runs_begin_with_the_first_seed_of_every_task(tmp_path):
         "walker-walk",
         "walker-run",
     ]
+
+
+@pytest.mark.parametrize("seeds", [("0", "00"), ("[0, 0]",)])
+def test_runs_have_each_seed_once(tmp_path, seeds):
+    request = read_request(suite.Request, words(tmp_path, tasks=TASKS[:1], seeds=seeds)[1:])
+    assert [run.seed for run in request.runs] == [0]
 
 
 def test_every_task_of_dmc20_has_settings():
@@ -127,6 +125,15 @@ def test_sweep_passes_preset_config_and_settings_to_each_run(tmp_path):
         assert (config.run.frames, config.run.minutes, config.run.seed) == (FRAMES, 9.0, run.seed)
 
 
+def test_resumed_run_keeps_a_limit_of_updates(tmp_path):
+    request = read_request(suite.Request, words(tmp_path, "--run.updates", "40")[1:])
+    run = request.runs[0]
+    assert (run.resolve().run.frames, run.resolve().run.updates) == (FRAMES, 40)
+    (run.folder / "resume" / "save-000001").mkdir(parents=True)
+    assert run.command()[2:] == ["--resume", str(run.folder), "--frames", str(FRAMES), "--updates", "40"]
+    assert run.limits == {"--frames": FRAMES, "--updates": 40}
+
+
 def test_sweep_runs_everything_once_and_writes_a_row_per_evaluation(tmp_path, capsys):
     assert sweep(tmp_path) == 0
     first = processes(tmp_path)
@@ -141,6 +148,14 @@ def test_sweep_runs_everything_once_and_writes_a_row_per_evaluation(tmp_path, ca
     assert sweep(tmp_path, frames=FRAMES - 20) == 0  # and so does less
     assert processes(tmp_path) == first and read_rows(tmp_path / "results.csv") == rows
     assert "6 of 6 runs finished, 100.0% of the work" in capsys.readouterr().out
+
+
+def test_extended_sweep_keeps_the_final_evaluations_of_its_shorter_runs(tmp_path):
+    for frames in (FRAMES, 2 * FRAMES, 3 * FRAMES):
+        assert sweep(tmp_path, tasks=TASKS[:1], seeds=(0,), frames=frames) == 0
+    rows = {row.env_frames: (row.planner, row.actor) for row in read_rows(tmp_path / "results.csv")}
+    assert list(rows) == list(range(20, 3 * FRAMES + 1, 20))
+    assert [frames for frames, returns in rows.items() if returns == (7.0, 5.0)] == [100, 200, 300]
 
 
 @pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGTERM, signal.SIGINT], ids=lambda number: number.name)
@@ -205,6 +220,16 @@ def test_failed_run_is_reported_and_tried_again_and_stops_no_other(tmp_path, cap
     assert set(after) - set(before) == {"walker-walk-seed0"} and before.items() <= after.items()
 
 
+def test_run_whose_folder_cannot_be_prepared_stops_no_other(tmp_path, capsys):
+    (tmp_path / "walker-walk-seed0" / "train.log").mkdir(parents=True)
+    (tmp_path / "cartpole-swingup-seed0" / "origin.json").mkdir(parents=True)
+    assert sweep(tmp_path) == 1
+    printed = capsys.readouterr().out
+    assert "walker-walk, seed 0: failed, [Errno 21] Is a directory" in printed
+    assert re.search("cartpole-swingup, seed 0: failed, .*origin.json could not be written", printed)
+    assert "4 of 6 runs finished, 2 failed" in printed
+
+
 def test_run_waits_while_another_process_has_its_folder(tmp_path, capsys):
     folder = tmp_path / "walker-walk-seed0"
     code = f"import sys; sys.path.insert(0, {str(STUB.parents[2])!r})\n"
@@ -255,73 +280,6 @@ def test_missing_rliable_is_one_line_before_anything_starts(tmp_path, monkeypatc
     assert capsys.readouterr().err == line and not (tmp_path / "out").exists()
 
 
-ROWS = st.lists(
-    st.builds(
-        make_row,
-        task=st.sampled_from(TASKS),
-        seed=st.integers(0, 2),
-        env_frames=st.integers(1, 4).map(lambda count: 25_000 * count),
-        planner=st.floats(0.0, 1000.0).map(lambda value: round(value, 2)),
-        version=st.sampled_from(("0.2.0", "0.10.0")),
-    ),
-    unique_by=lambda row: (row.task, row.seed, row.version, row.env_frames),
-)
-
-
-@given(known=ROWS, new=ROWS)
-def test_merge_keeps_other_runs_and_replaces_those_of_a_task_seed_and_version(known, new):
-    merged = merge_rows(known, new)
-    replaced = {(row.task, row.seed, row.version) for row in new}
-    kept = [row for row in known if (row.task, row.seed, row.version) not in replaced]
-    assert sorted(merged) == sorted([*kept, *new])
-    assert merge_rows(merged, new) == merged == merge_rows(merged, []) == merge_rows([], merged)
-
-
-@given(rows=ROWS)
-def test_rows_return_unchanged_from_their_file(tmp_path_factory, rows):
-    path = tmp_path_factory.mktemp("rows") / "rows.csv"
-    write_rows(path, rows)
-    assert read_rows(path) == rows and path.exists() == bool(rows)
-
-
-def test_merge_adds_a_sweep_to_a_file_that_need_not_exist(tmp_path, capsys):
-    results, out = tmp_path / "suite.csv", tmp_path / "out"
-    out.mkdir()
-    other, old, new = make_row("fish-swim"), make_row(planner=1.0), make_row(planner=2.0)
-    for rows, expected in (([other, old], [other, old]), ([new], [other, new])):
-        write_rows(out / "results.csv", rows)
-        assert benchmark.main(["suite", "--results", str(results), "--merge", str(out)]) == 0
-        assert read_rows(results) == expected
-    assert results.read_text().splitlines()[0] == (
-        "task,seed,env_frames,minutes,planner,actor,updates,hardware,commit,version"
-    )
-
-
-@pytest.mark.parametrize(
-    ("old", "new", "named"),
-    [
-        ("planner", "plan", "lacks the column planner"),
-        ("100000", "many", "line 2"),
-        ("500.0", "nan", "line 2"),
-        ("walker-walk", "", "line 2"),
-        (",0.2.0", "", "line 2"),
-    ],
-)
-def test_damaged_file_of_results_is_refused_in_one_line(tmp_path, capsys, old, new, named):
-    path = tmp_path / "rows.csv"
-    write_rows(path, [make_row()])
-    path.write_text(path.read_text().replace(old, new))
-    assert benchmark.main(["suite", "--results", str(path), "--report", str(tmp_path / "report.md")]) == 2
-    assert named in capsys.readouterr().err
-
-
-def test_origin_names_every_machine_and_commit_and_the_version_that_began(tmp_path):
-    assert read_origin(tmp_path) is None
-    for hardware, commit, version in (("A", "1", "0.2.0"), ("A", "2", "0.3.0"), ("B", "1", "0.3.0")):
-        note_origin(tmp_path, Origin(hardware, commit, version))
-    assert read_origin(tmp_path) == Origin("A + B", "1 + 2", "0.2.0")
-
-
 def test_evaluations_of_an_extended_run_keep_those_after_its_former_end(tmp_path):
     lines = [
         "env_frames,updates,minutes,planner_return,actor_return",
@@ -344,6 +302,18 @@ def test_finished_run_with_damaged_results_is_named(tmp_path, capsys):
     assert len({(row.task, row.seed) for row in read_rows(tmp_path / "results.csv")}) == 6  # known rows stay
 
 
+@pytest.mark.parametrize("value", [math.nan, math.inf])
+def test_run_with_an_evaluation_that_is_not_finite_is_named_and_adds_no_row(tmp_path, capsys, value):
+    assert sweep(tmp_path, tasks=TASKS[:1]) == 0
+    path = tmp_path / "walker-walk-seed0" / "final.json"
+    path.write_text(json.dumps(json.loads(path.read_text()) | {"planner": value}))
+    (tmp_path / "results.csv").unlink()
+    for _ in range(2):  # the second start reads what the first has written
+        assert sweep(tmp_path, tasks=TASKS[:1]) == 0
+        assert "walker-walk, seed 0: the evaluation at 100 frames in" in capsys.readouterr().out
+    assert {row.seed for row in read_rows(tmp_path / "results.csv")} == {1}
+
+
 def test_time_left_counts_what_is_left_over_the_runs_side_by_side(tmp_path):
     some = [TrainingRun("walker-walk", seed, tmp_path / str(seed), ("--frames", "100")) for seed in range(4)]
     assert estimate_minutes_left(dict.fromkeys(some, Progress(0.0, 0.0)), 2) is None
@@ -361,64 +331,32 @@ def test_time_left_counts_what_is_left_over_the_runs_side_by_side(tmp_path):
     ]
 
 
-def test_rows_at_a_number_of_frames_are_the_last_within_them_of_the_newest_version():
-    rows = [make_row(env_frames=frames) for frames in (50_000, 100_800, 150_000)]
-    rows += [make_row(env_frames=60_000, version="0.1.9"), make_row(seed=1, env_frames=60_000, version="0.10.0")]
-    found = rows_at(newest_curves(rows), 100_000)
-    assert found == {"walker-walk": {0: rows[1], 1: rows[4]}}
-    assert completed(found, 100_000) == {"walker-walk": [rows[1]]}
+def test_progress_is_that_of_the_largest_clocks(tmp_path):
+    run = TrainingRun("walker-walk", 0, tmp_path, ("--frames", "100", "--updates", "1000"))
+    assert measure_progress(run) == Progress(0.0, 0.0)
+    rows = "2,125,0.8,\n2,0,0.1,9\n"  # of the evaluation before the first update, which takes its time
+    (tmp_path / "metrics.csv").write_text("env_frames,updates,minutes,planner_return\n" + rows)
+    assert measure_progress(run) == Progress(0.125, 0.8)
+    assert estimate_minutes_left({run: Progress(0.02, 0.1)}, 1) is None  # before the first update
 
 
-def test_improvement_agrees_with_rliable_and_is_fair():
-    from rliable.metrics import probability_of_improvement
-
-    rng = np.random.default_rng(0)
-    ours, theirs = rng.integers(0, 9, (4, 6)) / 9, rng.integers(0, 9, (3, 6)) / 9
-    forward, backward = improvement(ours, theirs), improvement(theirs, ours)
-    assert forward.mean == pytest.approx(probability_of_improvement(ours, theirs))
-    assert forward.mean + backward.mean == pytest.approx(1.0) and improvement(ours, ours).mean == pytest.approx(0.5)
-    assert forward.low <= forward.mean <= forward.high
-    assert improvement(ours[:1], theirs).low is None
-
-
-def test_aggregate_is_repeatable_and_has_intervals_from_two_runs_on():
-    scores = np.random.default_rng(1).uniform(size=(3, 8))
-    found = aggregate(scores)
-    assert found == aggregate(scores)
-    assert found["interquartile mean"].mean == pytest.approx(interquartile_mean(scores.ravel().tolist()))
-    mean, low, high = found["mean"]
-    assert mean == pytest.approx(scores.mean()) and low < mean < high
-    assert all(each.low is None for each in aggregate(scores[:1]).values())
-    share, low, high = profile(scores, np.array([-0.1, 0.5, 1.0]))
-    assert share.tolist() == [1.0, np.mean(scores > 0.5), 0.0] and (low <= share).all() and (share <= high).all()
+def test_state_of_the_sweep_is_printed_now_and_then_without_a_terminal(tmp_path, monkeypatch, capsys):
+    run = TrainingRun("walker-walk", 0, tmp_path, ("--frames", "100"))
+    monkeypatch.setattr(suite_progress, "LOOK_S", 0.0)
+    board = Board([run], 1, tmp_path / "results.csv", None)
+    board.look([run])
+    assert capsys.readouterr().out == ""
+    monkeypatch.setattr(suite_progress, "STATUS_S", 0.0)
+    board.look([run])
+    assert "0 of 1 runs finished" in capsys.readouterr().out
 
 
-def test_report_needs_nothing_but_a_file_of_results(tmp_path, capsys):
-    rows = [
-        make_row(task, seed, frames, planner=frames / 200 + 10 * seed, actor=frames / 250)
-        for task in (*TASKS, "fish-swim")
-        for seed in (0, 1)
-        for frames in (50_000, 100_000, 150_000)
-    ]
-    rows.append(make_row("cheetah-run", 0, 50_000))
-    write_rows(tmp_path / "suite.csv", rows)
-    report = tmp_path / "suite.md"
-    assert benchmark.main(["suite", "--results", str(tmp_path / "suite.csv"), "--report", str(report)]) == 0
-    text = report.read_text()
-    lines = {line.split(" | ")[0].strip("| "): line for line in text.splitlines() if line.startswith("| ")}
-    assert "| 505 (441 to 569) | 400 (400 to 400) | 60 | 625 / 874 |" in lines["walker-walk"]
-    assert "| 505 (441 to 569) |" in lines["fish-swim"]  # of which nothing is published
-    assert "| 50,000 | 1 | **500** | 400 | 60 |" in lines["cheetah-run"]  # EfficientZero V2 has 463
-    assert "cheetah-run, seed 0 (50,000)" in text
-    assert lines["mean"].startswith("| mean | 505 (")
-    assert re.match(r"\| DreamerV3 \| 3 \| 505 / 6\d\d \|", lines["DreamerV3"])
-    for kind in ("curves", "profile"):
-        assert f"(suite-{kind}.png)" in text and (tmp_path / f"suite-{kind}.png").stat().st_size > 10_000
-    flags = ["--results", str(tmp_path / "suite.csv"), "--tasks", "fish-swim", "--seeds", "1"]
-    assert benchmark.main(["suite", *flags, "--report", str(report)]) == 0
-    assert "1 runs of 1 tasks" in report.read_text() and "walker" not in report.read_text()
-    assert benchmark.main(["suite", *flags, "--frames", "20", "--report", str(report)]) == 2
-    assert "no run has an evaluation within 20 frames" in capsys.readouterr().err
+def test_sweep_without_results_ends_with_a_note_in_place_of_its_report(tmp_path, capsys):
+    (tmp_path / "walker-walk-seed0.broken").touch()
+    assert sweep(tmp_path, "--report", tmp_path / "report.md", tasks=TASKS[:1], seeds=(0,)) == 1
+    captured = capsys.readouterr()
+    assert "no report: no run has an evaluation within 100 frames" in captured.out and captured.err == ""
+    assert not (tmp_path / "report.md").exists()
 
 
 def test_sweep_ends_with_its_report(tmp_path):
