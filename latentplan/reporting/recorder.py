@@ -99,7 +99,8 @@ class Recording:
         surprise: Surprise of each frame, in nats; empty for an agent without a world model.
         threshold: Threshold of the gate after each decision, in standard deviations; empty without a gate.
         totals: Return before each decision, and at last the return of the episode.
-        clauses: Whether each clause of the goals was met before each decision, by its text.
+        clauses: Whether each clause of the goals was met before each decision, by its text; None at the first decision
+            and while a clause is not part of the goals, as before the phase of its objective begins.
         inspections: The decisions that were looked at closely.
         strips: Parts of the episode beside their imagination.
         picture_error: Mean absolute difference of imagined and real pictures, in grey levels, (start, step).
@@ -114,7 +115,7 @@ class Recording:
     surprise: list[float] = field(default_factory=list)
     threshold: list[float] = field(default_factory=list)
     totals: list[float] = field(default_factory=list)
-    clauses: dict[str, list[bool]] = field(default_factory=dict)
+    clauses: dict[str, list[bool | None]] = field(default_factory=dict)
     inspections: list[Inspection] = field(default_factory=list)
     strips: list[Strip] = field(default_factory=list)
     picture_error: Floats = field(default_factory=lambda: np.zeros((0, 0), np.float32))
@@ -169,10 +170,7 @@ class EpisodeRecorder:
         recording.actions.append(np.array(moment.action, np.float32))
         recording.sources.append(getattr(agent, "last_source", "actor"))
         if self.goals is not None:
-            for text, is_met in self.goals.clauses:
-                before = [False] * (len(recording.totals) - 1)
-                met = recording.clauses.setdefault(text, before)
-                met.append(is_met)
+            self._note_clauses(self.goals.clauses)
         if not self._has_model:
             return
         recording.actor_actions.append(agent.actor_action())
@@ -182,6 +180,15 @@ class EpisodeRecorder:
         self._beliefs.append(agent.belief())
         self._look_at_search(moment)
         self._choose_next(moment.decision + 1)
+
+    def _note_clauses(self, clauses: Sequence[tuple[str, bool]]) -> None:
+        """Notes one value per clause; a clause that stands in objective and constraint is met if both say so."""
+        noted, known = self.recording.clauses, dict[str, bool]()
+        for text, is_met in clauses:
+            known[text] = known.get(text, True) and is_met
+            noted.setdefault(text, [None] * (len(self.recording.actions) - 1))
+        for text, met in noted.items():
+            met.append(known.get(text))
 
     def _choose_next(self, decision: int) -> None:
         """Let the search of the next decision keep its candidates, if that decision is wanted."""

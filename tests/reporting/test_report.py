@@ -13,10 +13,10 @@ from latentplan.agents.gated import GatedAgent
 from latentplan.agents.planning import PlanningAgent
 from latentplan.config import Config
 from latentplan.config.run_results import Evaluation
-from latentplan.evaluation.episodes import run_episodes
+from latentplan.evaluation.episodes import Step, run_episodes
 from latentplan.reporting.page import Section, film, render_page, scrubber, table
 from latentplan.reporting.recorder import COMPARED_STEPS, EpisodeRecorder, GuardedRecorder
-from latentplan.reporting.report import ReportData, Returns, render_report, tile
+from latentplan.reporting.report import ReportData, Returns, _goals, render_report, tile
 from latentplan.reporting.svg import Labels, Line, plot_lines
 from tests.agents.small_agents import CONFIG, make_model
 
@@ -184,6 +184,31 @@ def test_page_escapes_text_and_a_film_that_is_too_large_is_named(tmp_path):
 def test_tile_keeps_pictures_apart():
     black = np.zeros((2, 4, 4, 3), np.uint8)
     assert tile([black, black]).shape == (9, 9, 3) and (tile([black, black])[4] == 128).all()
+
+
+def record_clauses(clauses):
+    """The recording of decisions before which the goals had these clauses."""
+    goals = SimpleNamespace(objective_scores=[], clauses=[])
+    recorder = EpisodeRecorder(SimpleNamespace(), len(clauses), goals=goals)
+    for decision, goals.clauses in enumerate(clauses):
+        recorder(Step(0, decision, 0.0, np.zeros((4, 4, 3), np.uint8), np.zeros(1, np.float32)))
+    return recorder.recording
+
+
+def test_shares_of_clauses_count_only_decisions_at_which_the_clause_was_part_of_the_goals():
+    one, other = ("cart < 1", True), ("upright > 0", True)
+    recording = record_clauses([[], [one], [one], [other], [other], [one, one]])
+    assert recording.clauses == {
+        "cart < 1": [None, True, True, None, None, True],
+        "upright > 0": [None, None, None, True, True, None],
+    }
+    rows = re.findall("<td>(.*?)</td><td.*?>(.*?)</td>", "".join(_goals(recording)))
+    assert rows == [("cart &lt; 1", "100.0 %"), ("upright &gt; 0", "100.0 %")]
+
+
+def test_clause_in_objective_and_constraint_is_met_where_both_say_so():
+    recording = record_clauses([[], [("a", True), ("a", False)], [("a", True), ("a", True)], [("a", False)]])
+    assert recording.clauses == {"a": [None, False, True, False]}
 
 
 def test_recorder_of_an_agent_without_a_model_keeps_actions_and_returns():
