@@ -106,7 +106,7 @@ class Recording:
         picture_error: Mean absolute difference of imagined and real pictures, in grey levels, (start, step).
         reward_error: Absolute difference of predicted and real rewards, (start, step).
         objective_scores: Score of the objective at each env frame; empty without an objective.
-        surprise_limit: Surprise above which the actor acts, in nats; None without a limit.
+        surprise_limit: Surprise above which the actor acted, in nats; None where no decision had such a limit.
     """
 
     actions: list[Floats] = field(default_factory=list)
@@ -149,7 +149,7 @@ class EpisodeRecorder:
     def _begin(self) -> None:
         """Forget everything; the first search of an episode is always looked at."""
         share = np.arange(NUM_MOMENTS) / NUM_MOMENTS
-        self.recording = Recording(surprise_limit=getattr(self.agent, "surprise_limit", None))
+        self.recording = Recording()
         self._wanted = sorted({int(each * self._length) for each in share})
         self._frames: list[Frame] = []
         self._beliefs: list[Any] = []
@@ -175,6 +175,8 @@ class EpisodeRecorder:
             return
         recording.actor_actions.append(agent.actor_action())
         recording.surprise.append(agent.surprise())
+        limit = getattr(agent, "effective_surprise_limit", None)
+        recording.surprise_limit = recording.surprise_limit if limit is None else limit
         if hasattr(agent, "threshold"):
             recording.threshold.append(float(agent.threshold))
         self._beliefs.append(agent.belief())

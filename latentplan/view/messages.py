@@ -81,7 +81,7 @@ def describe_settings(session: Session) -> dict[str, Any]:
             "search": {name: planner.get(name) for name in SEARCH},
             "own": {name: getattr(session.search, name) for name in SEARCH},
             "goal_horizon": session.search.goal_horizon,
-            "surprise_limit": getattr(session.agent, "surprise_limit", None),
+            "surprise_limit": getattr(session.agent, "effective_surprise_limit", None),
             "period_ms": 1000.0 * session.period_s,
             "weight": weight,
             "pushed_body": getattr(session.env.unwrapped, "pushed_body", None),

@@ -1,6 +1,7 @@
 """Recording an episode changes nothing of it, and a report is one page that needs no other file."""
 
 import re
+from dataclasses import replace
 from html.parser import HTMLParser
 from types import SimpleNamespace
 
@@ -94,6 +95,12 @@ def test_recorder_sorts_candidates_from_elites(recording):
     assert first.elites.shape[1:] == first.mean.shape == (CONFIG.planner.horizon, 2)
     assert last.elite_return >= first.elite_return - 1e-4  # elites of an earlier iteration are no longer candidates
     assert first.elite_pictures.dtype == np.uint8
+
+
+@pytest.mark.parametrize(("kind", "limit"), [(PlanningAgent, 5.0), (GatedAgent, None)])
+def test_recording_has_the_surprise_limit_where_it_has_an_effect(kind, limit):
+    settings = replace(CONFIG.planner, surprise_limit=5.0)
+    assert play(lambda: kind(make_model(), CONFIG, 0.95, planner=settings), record=True)[1].surprise_limit == limit
 
 
 def test_recorder_compares_imagination_with_the_frames_that_followed(recording):
