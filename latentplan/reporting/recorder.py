@@ -33,11 +33,11 @@ class SearchStep(NamedTuple):
 
     Attributes:
         candidates: Some candidates that are no elites, (sample, horizon, action).
-        elites: The candidates with the highest predicted returns, (elite, horizon, action).
+        elites: Some elites, best first, (elite, horizon, action).
         mean: Mean of the search distribution after the iteration, (horizon, action).
         elite_return: Mean predicted return of all elites.
         candidate_pictures: Mean picture over candidates and elites at the shown steps, uint8 (step, side, side, 3).
-        elite_pictures: Mean picture over the elites, uint8 (step, side, side, 3).
+        elite_pictures: Mean picture over the elites, uint8 (step, side, side, 3); black without elites.
     """
 
     candidates: Floats
@@ -209,8 +209,7 @@ class EpisodeRecorder:
         shown = spread(horizon, NUM_PICTURES)
         by_plan = self.agent.imagine_along([self._beliefs[-1]], actions, horizon, shown)
         by_actor = self.agent.imagine_along([self._beliefs[-1]], None, horizon, shown)
-        num_elites = getattr(self._controller.planner, "num_best", 1)
-        search = [self._read_iteration(each, num_elites, shown) for each in plan.candidates]
+        search = [self._read_iteration(each, shown) for each in plan.candidates]
         self.recording.inspections.append(
             Inspection(
                 moment.decision,
@@ -224,8 +223,8 @@ class EpisodeRecorder:
             )
         )
 
-    def _read_iteration(self, iteration: Any, num_elites: int, shown: Sequence[int]) -> SearchStep:
-        others, elites = choose_candidates(iteration, num_elites)
+    def _read_iteration(self, iteration: Any, shown: Sequence[int]) -> SearchStep:
+        others, elites = choose_candidates(iteration)
         rows = np.concatenate([elites, others])
         pictures = self.agent.imagine_along([self._beliefs[-1]], rows, rows.shape[1], shown).pictures
         return SearchStep(
@@ -266,24 +265,22 @@ class EpisodeRecorder:
             )
 
 
-def choose_candidates(iteration: Any, num_elites: int) -> tuple[Floats, Floats]:
+def choose_candidates(iteration: Any) -> tuple[Floats, Floats]:
     """Some candidates of an iteration of the first environment's search, to be drawn.
 
     Args:
         iteration: The iteration; see `latentplan.planning.plan.Iteration`.
-        num_elites: Number of elites of the search.
 
     Returns:
-        Candidates that are no elites, (sample, horizon, action), and elites, (elite, horizon, action); from the highest
-        predicted return to the lowest.
+        Candidates that are no elites, (sample, horizon, action), and elites, best first, (elite, horizon, action).
     """
-    returns = iteration.returns[0].float().cpu().numpy()
-    is_feasible = iteration.is_feasible[0].cpu().numpy()
-    order = np.argsort(np.where(is_feasible & np.isfinite(returns), -returns, np.inf), kind="stable")
-    actions = iteration.actions[0].float().cpu().numpy()
-    best, rest = order[:num_elites], order[num_elites:]
-    elites = actions[best[spread(len(best), NUM_CANDIDATES // 2)]]
-    return actions[rest[spread(len(rest), NUM_CANDIDATES - len(elites))]], elites
+    elites = iteration.elites[0].float().cpu().numpy()
+    elites = elites[np.isfinite(elites).all(axis=(1, 2))]
+    known = {elite.tobytes() for elite in elites}
+    others = [row for row in iteration.actions[0].float().cpu().numpy() if row.tobytes() not in known]
+    drawn = elites[spread(len(elites), NUM_CANDIDATES // 2)]
+    rest = np.array(others, np.float32).reshape(-1, *elites.shape[1:])
+    return rest[spread(len(rest), NUM_CANDIDATES - len(drawn))], drawn
 
 
 def spread(length: int, num: int) -> list[int]:
@@ -294,7 +291,9 @@ def spread(length: int, num: int) -> list[int]:
 
 
 def _mean_picture(pictures: Frame) -> Frame:
-    """The mean over rows of pictures (row, step, height, width, 3)."""
+    """The mean over rows of pictures (row, step, height, width, 3); black without rows."""
+    if len(pictures) == 0:
+        return np.zeros(pictures.shape[1:], np.uint8)
     return pictures.astype(np.float32).mean(axis=0).round().astype(np.uint8)
 
 

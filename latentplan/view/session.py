@@ -352,7 +352,7 @@ class Session:
         if plan is None or not plan.candidates or self.agent.last_source != "plan":
             return None
         last = plan.candidates[-1]
-        candidates, elites = choose_candidates(last, getattr(self.agent.controller.planner, "num_best", 1))
+        candidates, elites = choose_candidates(last)
         return Fan(candidates, elites, last.mean[0].float().cpu().numpy())
 
 

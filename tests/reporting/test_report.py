@@ -16,7 +16,7 @@ from latentplan.config import Config
 from latentplan.config.run_results import Evaluation
 from latentplan.evaluation.episodes import Step, run_episodes
 from latentplan.reporting.page import Section, film, render_page, scrubber, table
-from latentplan.reporting.recorder import COMPARED_STEPS, EpisodeRecorder, GuardedRecorder
+from latentplan.reporting.recorder import COMPARED_STEPS, EpisodeRecorder, GuardedRecorder, _mean_picture, choose_candidates
 from latentplan.reporting.report import ReportData, Returns, _goals, render_report, tile
 from latentplan.reporting.svg import Labels, Line, plot_lines
 from tests.agents.small_agents import CONFIG, make_model
@@ -101,6 +101,23 @@ def test_recorder_sorts_candidates_from_elites(recording):
 def test_recording_has_the_surprise_limit_where_it_has_an_effect(kind, limit):
     settings = replace(CONFIG.planner, surprise_limit=5.0)
     assert play(lambda: kind(make_model(), CONFIG, 0.95, planner=settings), record=True)[1].surprise_limit == limit
+
+
+def test_drawn_elites_are_those_of_the_search_and_no_other_candidate_is_one():
+    elites = torch.tensor([[5.0, 0.0, torch.nan]])[:, :, None, None]
+    iteration = SimpleNamespace(actions=torch.arange(4.0)[None, :, None, None], elites=elites)
+    others, drawn = choose_candidates(iteration)
+    assert others.ravel().tolist() == [1.0, 2.0, 3.0] and drawn.ravel().tolist() == [5.0, 0.0]
+    others, drawn = choose_candidates(SimpleNamespace(actions=elites[:, :2], elites=elites))
+    assert others.shape == (0, 1, 1) and len(drawn) == 2
+
+
+def test_iteration_without_elites_is_drawn_with_its_candidates_alone(recording):
+    iteration = SimpleNamespace(actions=torch.zeros(1, 4, 1, 1), elites=torch.full((1, 2, 1, 1), torch.nan))
+    others, drawn = choose_candidates(iteration)
+    assert others.shape == (4, 1, 1) and drawn.shape == (0, 1, 1)
+    pictures = recording.strips[0].real[None]
+    assert np.array_equal(_mean_picture(pictures), pictures[0]) and not _mean_picture(pictures[:0]).any()
 
 
 def test_recorder_compares_imagination_with_the_frames_that_followed(recording):

@@ -264,6 +264,8 @@ class Search:
         is_feasible = torch.isfinite(scores.returns)
         if scores.violations is not None:
             is_feasible = is_feasible & (scores.violations == 0)
+        assert progress.elites is not None
+        is_elite = torch.isfinite(progress.elites.scores.returns)[:, :, None, None]
         described = Iteration(
             index,
             self.space.decode(points),
@@ -274,6 +276,7 @@ class Search:
             self.space.decode(self.space.clean(progress.mean)),
             self.space.decode_var(progress.var).sqrt(),
             progress.expected_return,
+            self.space.decode(progress.elites.actions).masked_fill(~is_elite, torch.nan),
         )
         if self.view.keep is not None:
             kept.append(described)
