@@ -184,9 +184,14 @@ def _read_picture(session: Session, value: Any) -> bytes:
 
 
 def _read_number(name: str, value: Any) -> float:
-    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+    is_number = isinstance(value, int | float) and not isinstance(value, bool)
+    try:
+        number = float(value) if is_number else math.nan
+    except OverflowError:  # a whole number beyond the largest float
+        number = math.inf
+    if not math.isfinite(number):
         raise UserError(f"{name} must be a finite number, got {shown(value)}")
-    return float(value)
+    return number
 
 
 def _plain(value: Any) -> Any:

@@ -66,6 +66,7 @@ def test_push_reset_and_picture_are_obeyed(session):
         ('{"mode": ""}', "mode"),
         ('{"push": "far"}', "push must be a finite number"),
         ('{"push": NaN}', "push must be a finite number"),
+        (f'{{"push": 1{"0" * 400}}}', "push must be a finite number"),
         ('{"push": true}', "push must be a finite number"),
         ('{"push": 1e9}', "ten times the weight"),
         ('{"picture": "???"}', "base64"),
