@@ -197,6 +197,8 @@ class Session:
         except UserError:
             if has_same_agent:
                 self._pass_on(self._goals, agent, self.settings)
+                if isinstance(self._world, ScoredEnv):
+                    self._world.repeat_objective()
             else:
                 _close(agent)
             raise
