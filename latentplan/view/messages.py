@@ -22,6 +22,7 @@ from latentplan.config.parsing import list_settings, raise_unknown, read_values
 from latentplan.config.quantities import QUANTITIES
 from latentplan.reporting.page import data_address, encode_png
 from latentplan.view.pace import Pace
+from latentplan.view.pictures import LARGEST_BYTES, RULE
 from latentplan.view.session import MOST_WEIGHTS, PUSH_S, Fan, Future, Moment, Session
 
 SEARCH = ("horizon", "num_samples", "num_iterations", "warm_start_iterations", "deadline_ms")
@@ -88,6 +89,8 @@ def describe_settings(session: Session) -> dict[str, Any]:
             "push_s": PUSH_S,
             "most_push": None if weight is None else MOST_WEIGHTS * weight,
             "units": units,
+            "largest_picture": LARGEST_BYTES,
+            "picture_rule": RULE,
         }
     }
 

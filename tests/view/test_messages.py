@@ -103,6 +103,13 @@ def test_settings_have_the_surprise_limit_where_it_has_an_effect(make_session, c
     assert describe_settings(session)["settings"]["surprise_limit"] == limit
 
 
+def test_settings_tell_the_page_which_pictures_are_too_large_to_send(session):
+    settings = describe_settings(session)["settings"]
+    with pytest.raises(UserError) as error:
+        session.pictures.add(b"x" * (settings["largest_picture"] + 1))
+    assert settings["picture_rule"] == str(error.value)
+
+
 def test_moment_names_every_quantity_of_the_settings(session):
     moment = describe_moment(session.decide(), Pace(0.04))["moment"]
     assert moment["quantities"].keys() == describe_settings(session)["settings"]["units"].keys()
