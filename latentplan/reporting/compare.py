@@ -147,7 +147,7 @@ def render_comparison(runs: Sequence[RunSummary], interval: Interval) -> str:
             ),
             Section(
                 "Learning curves",
-                "Mean return of the evaluations over seeds. Bands are Student's 95 % intervals; one seed has no band.",
+                "Mean return of the evaluations over seeds. Bands and bars are Student's 95 % intervals; one seed has none.",
                 _curves(groups, interval),
             ),
             Section(

@@ -195,6 +195,18 @@ def test_figures_take_their_colours_from_the_theme():
     assert not re.search(r"#[0-9a-f]{6}\b", svg)
 
 
+@pytest.mark.parametrize(("values", "num_dots"), [([1.0], 1), ([1.0, 2.0], 0), ([1.0, np.nan, 2.0, 3.0], 1)])
+def test_points_without_a_neighbour_are_dots(values, num_dots):
+    svg = plot_lines([Line("", range(len(values)), values)], Labels("", "x", "y"))
+    assert len(re.findall(r"<use [^>]*var\(--series-1\)", svg)) == num_dots
+
+
+def test_interval_of_a_single_point_is_a_bar():
+    plain, with_bar = (plot_lines([Line("", [1], [5.0], *ends)], Labels("", "x", "y")) for ends in ([], [[4.0], [6.0]]))
+    paths = [re.findall(r'<path d="(M[^"]*)"[^>]*stroke: var\(--series-1\)', svg) for svg in (plain, with_bar)]
+    assert not any("L" in path for path in paths[0]) and any("L" in path for path in paths[1])
+
+
 def test_page_escapes_text_and_a_film_that_is_too_large_is_named(tmp_path):
     path = tmp_path / "film.webm"
     path.write_bytes(b"0" * 100)
