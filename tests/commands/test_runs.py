@@ -121,6 +121,25 @@ def test_compare_groups_seeds_and_names_the_settings_that_differ(make_run, tmp_p
     assert not re.search(r"""(?:src|href)=["'](?!data:|#)""", html)
 
 
+def test_compare_gives_every_group_a_name_of_its_own(make_run):
+    run = read_run(make_run("run"))
+    runs = []
+    for domain, task in (("walker", "walk"), ("cheetah", "run")):
+        for horizon, num_samples in ((8, 64), (12, 64), (12, 128)):
+            planner = PlannerConfig(horizon=horizon, num_samples=num_samples, num_elites=8)
+            config = replace(run.config, env=EnvConfig(domain=domain, task=task), planner=planner)
+            runs.append(replace(run, config=config))
+    groups, differ = group_runs(runs)
+    assert len(differ) > 2 and len({group.name for group in groups}) == len(groups) == 6
+    assert groups[1].name == f"domain walker, horizon 12, num_samples 64 and {len(differ) - 3} more"
+    assert [group.name for group in group_runs(runs[:2])[0]] == ["horizon 8", "horizon 12"]
+
+
+def test_compare_takes_equal_settings_as_one_group_however_they_are_written(make_run):
+    runs = [read_run(make_run(str(index), seed=index, deadline_ms=value)) for index, value in enumerate((5, 5.0))]
+    assert len(group_runs(runs)[0]) == 1
+
+
 def test_mean_curve_of_one_seed_is_its_evaluations_and_of_several_their_mean(make_run):
     runs = [read_run(make_run("a", seed=0)), read_run(make_run("b", (200.0, 400.0, 300.0), seed=1))]
     alone = mean_curve(group_runs(runs[:1])[0][0], "planner", "env_frames", confidence_interval)
