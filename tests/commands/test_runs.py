@@ -1,9 +1,11 @@
 """Training runs are listed, watched and compared from what their folders hold."""
 
 import csv
+import errno
 import json
 import re
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 
@@ -67,6 +69,47 @@ def test_runs_gives_one_line_for_each_folder_that_is_no_run(make_run, tmp_path, 
     assert len(lines) == 4
     for name, line in zip(("damaged", "empty", "foreign", "settings"), lines, strict=True):
         assert line.startswith("no run: ") and str(tmp_path / name) in line
+
+
+@pytest.mark.parametrize(
+    ("name", "text"),
+    [
+        ("metrics.csv", ",".join(COLUMNS) + '\n1000,10,0.5,"' + "1" * 140_000 + "\n"),
+        ("metrics.csv", ",".join(COLUMNS) + "\n1000,10,0.5,7,7\nnan,20,1.0,,\n"),
+        ("final.json", json.dumps({"env_frames": "x", "updates": 1, "minutes": 1.0, "planner": 1.0, "actor": 1.0})),
+        ("final.json", json.dumps({"env_frames": 9, "updates": 1, "minutes": 1.0, "planner": None, "actor": 1.0})),
+        ("final.json", '{"env_frames": 9, "updates": 1e999, "minutes": 1.0, "planner": 1.0, "actor": 1.0}'),
+        ("final.json", "[" * 100_000),
+    ],
+)
+def test_damaged_results_of_one_run_are_one_line_beside_the_other_runs(make_run, tmp_path, capsys, name, text):
+    good, damaged = make_run("good"), make_run("damaged")
+    (damaged / name).write_text(text)
+    assert main(["runs", str(tmp_path)]) == 0
+    output = capsys.readouterr()
+    assert [line.split()[0] for line in output.out.splitlines()] == ["run", "good"]
+    assert output.err.startswith(f"no run: the results in {damaged} cannot be read: ") and output.err.count("\n") == 1
+    assert main(["compare", str(good), str(damaged)]) == 2
+    assert capsys.readouterr().err.count("\n") == 1
+
+
+@pytest.mark.parametrize("method", ["iterdir", "exists"])
+def test_folder_that_may_not_be_read_is_one_line_beside_the_runs(make_run, tmp_path, capsys, monkeypatch, method):
+    make_run("good")
+    closed = tmp_path / "closed"
+    closed.mkdir()
+    allowed = getattr(Path, method)
+
+    def refuse(self, *given):  # root may read everything, so the refusal is imitated
+        if closed in (self, self.parent):
+            raise PermissionError(errno.EACCES, "Permission denied", str(self))
+        return allowed(self, *given)
+
+    monkeypatch.setattr(Path, method, refuse)
+    assert main(["runs", str(tmp_path)]) == 0
+    output = capsys.readouterr()
+    assert [line.split()[0] for line in output.out.splitlines()] == ["run", "good"]
+    assert output.err == f"no run: {closed} cannot be read: Permission denied\n"
 
 
 @pytest.mark.parametrize("command", ["runs", "watch", "compare"])
