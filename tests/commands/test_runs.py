@@ -2,8 +2,10 @@
 
 import csv
 import errno
+import io
 import json
 import re
+import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -110,6 +112,16 @@ def test_folder_that_may_not_be_read_is_one_line_beside_the_runs(make_run, tmp_p
     output = capsys.readouterr()
     assert [line.split()[0] for line in output.out.splitlines()] == ["run", "good"]
     assert output.err == f"no run: {closed} cannot be read: Permission denied\n"
+
+
+def test_names_that_are_not_utf8_are_printed_as_escapes(make_run, tmp_path, monkeypatch):
+    folders, page = [make_run("caf\udce9"), make_run("other", horizon=5)], tmp_path / "page.html"
+    for words in (["runs", tmp_path], ["compare", *folders, "--report", page]):
+        output = io.TextIOWrapper(io.BytesIO(), encoding="utf-8", errors="strict")
+        monkeypatch.setattr(sys, "stdout", output)
+        assert main([*map(str, words)]) == 0
+        assert (b"caf\\udce9" in output.buffer.getvalue()) == (words[0] == "runs")
+    assert "caf\\udce9" in page.read_text()
 
 
 @pytest.mark.parametrize("command", ["runs", "watch", "compare"])

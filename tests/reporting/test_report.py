@@ -14,6 +14,7 @@ from latentplan.agents.gated import GatedAgent
 from latentplan.agents.planning import PlanningAgent
 from latentplan.config import Config
 from latentplan.config.run_results import Evaluation
+from latentplan.config.writing import write_whole
 from latentplan.evaluation.episodes import Step, run_episodes
 from latentplan.reporting.page import Section, film, render_page, scrubber, table
 from latentplan.reporting.recorder import COMPARED_STEPS, EpisodeRecorder, GuardedRecorder, _mean_picture, choose_candidates
@@ -182,6 +183,11 @@ def test_report_shows_every_part_that_has_figures(page):
     for name in ("Planner and actor", "Surprise and gate", "Goals", "Provenance"):
         assert f"<h2>{name}</h2>" in page
     assert "eval.py &lt;&amp;&gt;" in page and "DreamerV3" in page and "torch 1" in page
+
+
+def test_report_with_a_name_that_is_not_utf8_can_be_written(tmp_path):
+    page = render_report(ReportData("corridor", Config(), facts={"command": "eval --report caf\udce9.html"}))
+    assert "caf\\udce9.html" in write_whole(tmp_path / "page.html", page).read_text()
 
 
 def test_report_leaves_out_parts_without_figures():
