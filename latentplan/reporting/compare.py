@@ -162,7 +162,8 @@ def render_comparison(runs: Sequence[RunSummary], interval: Interval) -> str:
             ),
             Section(
                 "Learning curves",
-                "Mean return of the evaluations over seeds. Bands and bars are Student's 95 % intervals; one seed has none.",
+                "Mean return of the evaluations over seeds. Bands and bars are Student's 95 % intervals; one seed has "
+                "no interval.",
                 _curves(groups, interval),
             ),
             Section(

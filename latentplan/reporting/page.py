@@ -38,7 +38,7 @@ class Section(NamedTuple):
 def render_page(title: str, sections: Iterable[Section]) -> str:
     """The page as HTML; sections without elements are left out.
 
-    Characters that UTF-8 cannot encode, as in names of files that are not UTF-8, become escapes such as `\\udce9`.
+    Characters that UTF-8 cannot encode, as in names of files that are not UTF-8, become escapes.
 
     Args:
         title: Title and heading.

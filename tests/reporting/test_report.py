@@ -17,7 +17,13 @@ from latentplan.config.run_results import Evaluation
 from latentplan.config.writing import write_whole
 from latentplan.evaluation.episodes import Step, run_episodes
 from latentplan.reporting.page import Section, film, render_page, scrubber, table
-from latentplan.reporting.recorder import COMPARED_STEPS, EpisodeRecorder, GuardedRecorder, _mean_picture, choose_candidates
+from latentplan.reporting.recorder import (
+    COMPARED_STEPS,
+    EpisodeRecorder,
+    GuardedRecorder,
+    _mean_picture,
+    choose_candidates,
+)
 from latentplan.reporting.report import ReportData, Returns, _goals, render_report, tile
 from latentplan.reporting.svg import Labels, Line, plot_lines
 from tests.agents.small_agents import CONFIG, make_model
