@@ -114,6 +114,11 @@ class GatedAgent(PlanningAgent):
         """Share of decisions so far at which a search was requested; 0 before the first decision."""
         return self._num_planned / self._num_decisions if self._num_decisions else 0.0
 
+    @property
+    def effective_surprise_limit(self) -> None:
+        """None, because a gated agent ignores `planner.surprise_limit`: it compares surprise with its own threshold."""
+        return None
+
     def plan_actions(self) -> Tensor | None:
         """The first environment's plan, (1, horizon, action); None without a new plan."""
         source = self.last_source if isinstance(self.last_source, str) else self.last_source[0]

@@ -84,6 +84,12 @@ class PlanningAgent(ModelAgent):
         super().set_memory(memory)
         self.controller.set_memory(memory["controller"], self.model.device)
 
+    @property
+    def effective_surprise_limit(self) -> float | None:
+        """Surprise in nats above which the actor acts; None without a limit, and with an objective or constraints."""
+        has_goals = self.controller.objective is not None or bool(self.controller.constraints)
+        return None if has_goals else self.surprise_limit
+
     def weigh_ends(self) -> None:
         """From the next decision on, plans weigh rewards by the probability that the episode goes on."""
         planner = self.controller.planner
@@ -120,10 +126,11 @@ class PlanningAgent(ModelAgent):
         if self.controller.plan is not None:
             self.controller.plan.warn_of_failures()
         self.was_surprised = False
-        if self.surprise_limit is None or self.controller.objective is not None or self.controller.constraints:
+        limit = self.effective_surprise_limit
+        if limit is None:
             return action
         surprise = mean_over_turns(self._frame_functions.surprise(flat(state)), state)
-        is_surprised = surprise > self.surprise_limit
+        is_surprised = surprise > limit
         if not bool(is_surprised.any()):
             return action
         if bool(is_surprised[0]):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import io
 import os
 import re
 import signal
@@ -28,8 +29,11 @@ def run_guarded(command: Callable[[Sequence[str]], int], argv: Sequence[str]) ->
     """The exit code of a command: 2 after a mistake of the user, which becomes one line on stderr.
 
     A failed environment gives one line and the environment's own traceback. Ctrl-C gives 130, SIGTERM 143 and SIGHUP
-    129. A reader that closes the output early, as in `train.py --help | head`, gives 141.
+    129. A reader that closes the output early, as in `train.py --help | head`, gives 141. Characters that stdout cannot
+    encode are printed as escapes, as Python does on stderr.
     """
+    if isinstance(sys.stdout, io.TextIOWrapper) and sys.stdout.errors == "strict":
+        sys.stdout.reconfigure(errors="backslashreplace")  # for names of files that are not UTF-8
     try:
         try:
             with _ending_by_signals():

@@ -21,6 +21,7 @@ from latentplan.config.writing import write_whole
 
 METRICS_FILE, FINAL_FILE, STATUS_FILE = "metrics.csv", "final.json", "status.json"
 StateName = Literal["running", "finished", "stopped", "failed"]
+_DAMAGES = (OSError, ValueError, TypeError, KeyError, OverflowError, RecursionError, csv.Error)  # of files of results
 
 
 class Evaluation(NamedTuple):
@@ -45,11 +46,11 @@ def read_evaluations(folder: Path) -> list[Evaluation]:
         found = {_moment(each): each for each in _read_metrics(folder / METRICS_FILE)}
         if (folder / FINAL_FILE).exists():
             final = json.loads((folder / FINAL_FILE).read_text())
-            last = Evaluation(*(final[name] for name in Evaluation._fields))
+            last = _to_evaluation(*(final[name] for name in Evaluation._fields))
             found[_moment(last)] = last
     except KeyError as error:
         raise UserError(f"the results in {folder} cannot be read: they lack {error}") from None
-    except (OSError, ValueError, TypeError) as error:
+    except _DAMAGES as error:
         raise UserError(f"the results in {folder} cannot be read: {error}") from None
     return [found[moment] for moment in sorted(found)]
 
@@ -66,7 +67,7 @@ def read_progress(folder: Path) -> tuple[float, float]:
     try:
         *_, last = read_rows(folder / METRICS_FILE)
         return float(last["env_frames"]), float(last["minutes"])
-    except (OSError, ValueError, TypeError, KeyError):  # no row yet, or a damaged file, which the run itself reports
+    except _DAMAGES:  # no row yet, or a damaged file, which the run itself reports
         return 0.0, 0.0
 
 
@@ -118,7 +119,7 @@ def read_facts(folder: Path) -> dict[str, Any]:
     """What a run has noted about itself: `state`, `reason`, `command`, `commit` and others; empty without a note."""
     try:
         facts = json.loads((folder / STATUS_FILE).read_text())
-    except (OSError, ValueError):
+    except _DAMAGES:
         return {}
     return facts if isinstance(facts, dict) else {}
 
@@ -155,7 +156,7 @@ def _has_final_evaluation(folder: Path) -> bool:
     """Whether the run was evaluated finally after the last frames that it has collected."""
     try:
         return bool(json.loads((folder / FINAL_FILE).read_text())["env_frames"] >= read_progress(folder)[0])
-    except (OSError, ValueError, TypeError, KeyError):
+    except _DAMAGES:
         return False
 
 
@@ -179,6 +180,10 @@ def is_locked(folder: Path) -> bool:
 def _read_metrics(path: Path) -> Iterator[Evaluation]:
     """The evaluations of a file of metrics, whose columns `actor` and `value` are losses."""
     for row in read_rows(path):
+        frames = int(row["env_frames"])
         if row["planner_return"]:
-            returns = float(row["planner_return"]), float(row["actor_return"])
-            yield Evaluation(int(row["env_frames"]), float(row["minutes"]), *returns, int(row["updates"]))
+            yield _to_evaluation(frames, row["minutes"], row["planner_return"], row["actor_return"], row["updates"])
+
+
+def _to_evaluation(env_frames: Any, minutes: Any, planner: Any, actor: Any, updates: Any) -> Evaluation:
+    return Evaluation(int(env_frames), float(minutes), float(planner), float(actor), int(updates))

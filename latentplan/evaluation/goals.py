@@ -146,7 +146,12 @@ class ScoredEnv(gymnasium.Wrapper[Any, Any, Any, Any]):
         """Begins the score and the first objective, as `reset` does, wherever the episode is."""
         self._num_frames = self._num_violated = 0
         self._totals = np.zeros(len(self._names))
-        self.objective_scores, self.clauses, self._reported_phase = [], [], None
+        self.objective_scores, self.clauses = [], []
+        self.repeat_objective()
+
+    def repeat_objective(self) -> None:
+        """Reports the present objective again, after the agent was given another."""
+        self._reported_phase = None
         self._report_objective()
 
     def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import inspect
 import time
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
@@ -32,7 +33,8 @@ class ModelPredictiveController:
         constraints: Violations that plans must avoid.
         generator: One random stream, or a list with one per environment.
         replan_every: Number of actions executed from each plan; at most the planner's horizon.
-        keep: See `CEMPlanner.plan`; the candidates of the last search are in `plan.candidates`.
+        keep: See `CEMPlanner.plan`; the candidates of the last search are in `plan.candidates`. A planner whose `plan`
+            does not take this argument keeps nothing.
         callback: See `CEMPlanner.plan`.
 
     Attributes:
@@ -231,7 +233,10 @@ class ModelPredictiveController:
 
     def _search(self, state: State, previous: Plan | None, generator: Generators, last_action: Tensor | None) -> Plan:
         """Returns a new plan, of which no action has been executed."""
-        given: dict[str, Any] = {"keep": self.keep, "callback": self.callback, "last_action": last_action}
+        asked: dict[str, Any] = {"keep": self.keep, "last_action": last_action}
+        given = {name: value for name, value in asked.items() if value is not None and _takes(self.planner.plan, name)}
+        if self.callback is not None:
+            given["callback"] = self.callback
         plan = self.planner.plan(
             self.model,
             state,
@@ -239,9 +244,15 @@ class ModelPredictiveController:
             objective=self.objective,
             constraints=self.constraints,
             generator=generator,
-            **{name: value for name, value in given.items() if value is not None},  # not every planner knows them
+            **given,
         )
         return plan.executed(torch.zeros_like(plan.elapsed))
+
+
+def _takes(function: Callable[..., Any], name: str) -> bool:
+    """Whether a function takes an argument of a name."""
+    parameters = inspect.signature(function).parameters
+    return name in parameters or any(each.kind is each.VAR_KEYWORD for each in parameters.values())
 
 
 @contextlib.contextmanager

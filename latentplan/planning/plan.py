@@ -34,6 +34,8 @@ class Iteration:
         mean: Mean of the distribution after the refit, (batch, horizon, action).
         std: Standard deviation of the distribution after the refit, (batch, horizon, action).
         elite_return: Mean return of the elites, (batch,).
+        elites: The elites, best first, (batch, elite, horizon, action): the best of these candidates, and of those of
+            earlier iterations that stay candidates. NaN where fewer candidates have a finite return.
     """
 
     index: int
@@ -45,6 +47,7 @@ class Iteration:
     mean: Tensor
     std: Tensor
     elite_return: Tensor
+    elites: Tensor
 
     def take(self, rows: Tensor) -> Iteration:
         """Returns the iteration of the environments at rows (chosen,) int."""

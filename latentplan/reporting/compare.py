@@ -29,7 +29,7 @@ class Group:
     """Runs that differ in their seeds alone.
 
     Attributes:
-        name: The settings in which the group differs from the others; the task where only one setting is compared.
+        name: Settings that tell the group from all others; the task where no setting differs.
         task: The task as domain-task.
         runs: The runs, by seed.
     """
@@ -45,24 +45,39 @@ def group_runs(runs: Sequence[RunSummary]) -> tuple[list[Group], dict[str, list[
     Returns:
         The groups; by setting that differs between groups, the value in each group.
     """
-    found: dict[str, list[RunSummary]] = {}
-    settings: dict[str, dict[str, Any]] = {}
+    found: list[list[RunSummary]] = []
+    settings: list[dict[str, Any]] = []
     for run in runs:
         own = comparable_settings(run.config)
         own.pop(SEED)
-        key = repr(sorted(own.items()))
-        settings.setdefault(key, own)
-        found.setdefault(key, []).append(run)
-    names = list(dict.fromkeys(name for own in settings.values() for name in own))
-    differ = {name: [own.get(name) for own in settings.values()] for name in names}
+        if own not in settings:
+            settings.append(own)
+            found.append([])
+        found[settings.index(own)].append(run)
+    names = list(dict.fromkeys(name for own in settings for name in own))
+    differ = {name: [own.get(name) for own in settings] for name in names}
     differ = {name: values for name, values in differ.items() if any(value != values[0] for value in values)}
     groups = []
-    for index, members in enumerate(found.values()):
-        words = [f"{name.partition('.')[2]} {values[index]}" for name, values in differ.items()]
-        name = ", ".join(words[:2]) + (f" and {len(words) - 2} more" if len(words) > 2 else "")
+    chosen = _choose_settings(differ)
+    for index, members in enumerate(found):
+        words = [f"{name.partition('.')[2]} {differ[name][index]}" for name in chosen]
+        name = ", ".join(words) + (f" and {len(differ) - len(words)} more" if len(differ) > len(words) else "")
         ordered = sorted(members, key=lambda run: run.config.run.seed)
         groups.append(Group(name or members[0].task, members[0].task, ordered))
     return groups, differ
+
+
+def _choose_settings(differ: dict[str, list[Any]]) -> list[str]:
+    """The settings that name groups: those that tell all groups apart, and as many others as make two."""
+    chosen: list[str] = []
+    parts = 1
+    for name in differ:
+        num = len({*zip(*(map(str, differ[each]) for each in (*chosen, name)), strict=True)})
+        if num > parts:
+            chosen, parts = [*chosen, name], num
+    others = [name for name in differ if name not in chosen]
+    shown = {*chosen, *others[: max(0, 2 - len(chosen))]}
+    return [name for name in differ if name in shown]
 
 
 def mean_curve(group: Group, mode: str, clock: str, interval: Interval) -> Line | None:
@@ -147,7 +162,8 @@ def render_comparison(runs: Sequence[RunSummary], interval: Interval) -> str:
             ),
             Section(
                 "Learning curves",
-                "Mean return of the evaluations over seeds. Bands are Student's 95 % intervals; one seed has no band.",
+                "Mean return of the evaluations over seeds. Bands and bars are Student's 95 % intervals; one seed has "
+                "no interval.",
                 _curves(groups, interval),
             ),
             Section(

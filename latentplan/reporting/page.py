@@ -38,6 +38,8 @@ class Section(NamedTuple):
 def render_page(title: str, sections: Iterable[Section]) -> str:
     """The page as HTML; sections without elements are left out.
 
+    Characters that UTF-8 cannot encode, as in names of files that are not UTF-8, become escapes.
+
     Args:
         title: Title and heading.
         sections: The sections, in order.
@@ -54,7 +56,8 @@ def render_page(title: str, sections: Iterable[Section]) -> str:
             )
     template = string.Template(read_part("page.html"))
     parts = {"style": read_part("page.css"), "theme": read_part("theme.js")}
-    return template.substitute(title=escape(title), links="\n".join(links), body="\n".join(bodies), **parts)
+    page = template.substitute(title=escape(title), links="\n".join(links), body="\n".join(bodies), **parts)
+    return page.encode("utf-8", "backslashreplace").decode("utf-8")
 
 
 def read_part(name: str) -> str:

@@ -33,11 +33,11 @@ class SearchStep(NamedTuple):
 
     Attributes:
         candidates: Some candidates that are no elites, (sample, horizon, action).
-        elites: The candidates with the highest predicted returns, (elite, horizon, action).
+        elites: Some elites, best first, (elite, horizon, action).
         mean: Mean of the search distribution after the iteration, (horizon, action).
         elite_return: Mean predicted return of all elites.
         candidate_pictures: Mean picture over candidates and elites at the shown steps, uint8 (step, side, side, 3).
-        elite_pictures: Mean picture over the elites, uint8 (step, side, side, 3).
+        elite_pictures: Mean picture over the elites, uint8 (step, side, side, 3); black without elites.
     """
 
     candidates: Floats
@@ -99,13 +99,14 @@ class Recording:
         surprise: Surprise of each frame, in nats; empty for an agent without a world model.
         threshold: Threshold of the gate after each decision, in standard deviations; empty without a gate.
         totals: Return before each decision, and at last the return of the episode.
-        clauses: Whether each clause of the goals was met before each decision, by its text.
+        clauses: Whether each clause of the goals was met before each decision, by its text; None at the first decision
+            and while a clause is not part of the goals, as before the phase of its objective begins.
         inspections: The decisions that were looked at closely.
         strips: Parts of the episode beside their imagination.
         picture_error: Mean absolute difference of imagined and real pictures, in grey levels, (start, step).
         reward_error: Absolute difference of predicted and real rewards, (start, step).
         objective_scores: Score of the objective at each env frame; empty without an objective.
-        surprise_limit: Surprise above which the actor acts, in nats; None without a limit.
+        surprise_limit: Surprise above which the actor acted, in nats; None where no decision had such a limit.
     """
 
     actions: list[Floats] = field(default_factory=list)
@@ -114,7 +115,7 @@ class Recording:
     surprise: list[float] = field(default_factory=list)
     threshold: list[float] = field(default_factory=list)
     totals: list[float] = field(default_factory=list)
-    clauses: dict[str, list[bool]] = field(default_factory=dict)
+    clauses: dict[str, list[bool | None]] = field(default_factory=dict)
     inspections: list[Inspection] = field(default_factory=list)
     strips: list[Strip] = field(default_factory=list)
     picture_error: Floats = field(default_factory=lambda: np.zeros((0, 0), np.float32))
@@ -148,7 +149,7 @@ class EpisodeRecorder:
     def _begin(self) -> None:
         """Forget everything; the first search of an episode is always looked at."""
         share = np.arange(NUM_MOMENTS) / NUM_MOMENTS
-        self.recording = Recording(surprise_limit=getattr(self.agent, "surprise_limit", None))
+        self.recording = Recording()
         self._wanted = sorted({int(each * self._length) for each in share})
         self._frames: list[Frame] = []
         self._beliefs: list[Any] = []
@@ -169,19 +170,27 @@ class EpisodeRecorder:
         recording.actions.append(np.array(moment.action, np.float32))
         recording.sources.append(getattr(agent, "last_source", "actor"))
         if self.goals is not None:
-            for text, is_met in self.goals.clauses:
-                before = [False] * (len(recording.totals) - 1)
-                met = recording.clauses.setdefault(text, before)
-                met.append(is_met)
+            self._note_clauses(self.goals.clauses)
         if not self._has_model:
             return
         recording.actor_actions.append(agent.actor_action())
         recording.surprise.append(agent.surprise())
+        limit = getattr(agent, "effective_surprise_limit", None)
+        recording.surprise_limit = recording.surprise_limit if limit is None else limit
         if hasattr(agent, "threshold"):
             recording.threshold.append(float(agent.threshold))
         self._beliefs.append(agent.belief())
         self._look_at_search(moment)
         self._choose_next(moment.decision + 1)
+
+    def _note_clauses(self, clauses: Sequence[tuple[str, bool]]) -> None:
+        """Notes one value per clause; a clause that stands in objective and constraint is met if both say so."""
+        noted, known = self.recording.clauses, dict[str, bool]()
+        for text, is_met in clauses:
+            known[text] = known.get(text, True) and is_met
+            noted.setdefault(text, [None] * (len(self.recording.actions) - 1))
+        for text, met in noted.items():
+            met.append(known.get(text))
 
     def _choose_next(self, decision: int) -> None:
         """Let the search of the next decision keep its candidates, if that decision is wanted."""
@@ -200,8 +209,7 @@ class EpisodeRecorder:
         shown = spread(horizon, NUM_PICTURES)
         by_plan = self.agent.imagine_along([self._beliefs[-1]], actions, horizon, shown)
         by_actor = self.agent.imagine_along([self._beliefs[-1]], None, horizon, shown)
-        num_elites = getattr(self._controller.planner, "num_best", 1)
-        search = [self._read_iteration(each, num_elites, shown) for each in plan.candidates]
+        search = [self._read_iteration(each, shown) for each in plan.candidates]
         self.recording.inspections.append(
             Inspection(
                 moment.decision,
@@ -215,8 +223,8 @@ class EpisodeRecorder:
             )
         )
 
-    def _read_iteration(self, iteration: Any, num_elites: int, shown: Sequence[int]) -> SearchStep:
-        others, elites = choose_candidates(iteration, num_elites)
+    def _read_iteration(self, iteration: Any, shown: Sequence[int]) -> SearchStep:
+        others, elites = choose_candidates(iteration)
         rows = np.concatenate([elites, others])
         pictures = self.agent.imagine_along([self._beliefs[-1]], rows, rows.shape[1], shown).pictures
         return SearchStep(
@@ -257,24 +265,22 @@ class EpisodeRecorder:
             )
 
 
-def choose_candidates(iteration: Any, num_elites: int) -> tuple[Floats, Floats]:
+def choose_candidates(iteration: Any) -> tuple[Floats, Floats]:
     """Some candidates of an iteration of the first environment's search, to be drawn.
 
     Args:
         iteration: The iteration; see `latentplan.planning.plan.Iteration`.
-        num_elites: Number of elites of the search.
 
     Returns:
-        Candidates that are no elites, (sample, horizon, action), and elites, (elite, horizon, action); from the highest
-        predicted return to the lowest.
+        Candidates that are no elites, (sample, horizon, action), and elites, best first, (elite, horizon, action).
     """
-    returns = iteration.returns[0].float().cpu().numpy()
-    is_feasible = iteration.is_feasible[0].cpu().numpy()
-    order = np.argsort(np.where(is_feasible & np.isfinite(returns), -returns, np.inf), kind="stable")
-    actions = iteration.actions[0].float().cpu().numpy()
-    best, rest = order[:num_elites], order[num_elites:]
-    elites = actions[best[spread(len(best), NUM_CANDIDATES // 2)]]
-    return actions[rest[spread(len(rest), NUM_CANDIDATES - len(elites))]], elites
+    elites = iteration.elites[0].float().cpu().numpy()
+    elites = elites[np.isfinite(elites).all(axis=(1, 2))]
+    known = {elite.tobytes() for elite in elites}
+    others = [row for row in iteration.actions[0].float().cpu().numpy() if row.tobytes() not in known]
+    drawn = elites[spread(len(elites), NUM_CANDIDATES // 2)]
+    rest = np.array(others, np.float32).reshape(-1, *elites.shape[1:])
+    return rest[spread(len(rest), NUM_CANDIDATES - len(drawn))], drawn
 
 
 def spread(length: int, num: int) -> list[int]:
@@ -285,7 +291,9 @@ def spread(length: int, num: int) -> list[int]:
 
 
 def _mean_picture(pictures: Frame) -> Frame:
-    """The mean over rows of pictures (row, step, height, width, 3)."""
+    """The mean over rows of pictures (row, step, height, width, 3); black without rows."""
+    if len(pictures) == 0:
+        return np.zeros(pictures.shape[1:], np.uint8)
     return pictures.astype(np.float32).mean(axis=0).round().astype(np.uint8)
 
 

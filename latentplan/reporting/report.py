@@ -281,7 +281,8 @@ def _goals(recording: Recording) -> list[str]:
         labels = Labels("Clauses that are met", "decision", "met (1) or not (0)")
         parts.append(figure(plot_lines(lines, labels), labels.alt + "."))
         rows = [["clause", "met"]] + [
-            [text, f"{100.0 * np.mean(met):.1f} %"] for text, met in recording.clauses.items()
+            [text, _percent(np.mean([each for each in met if each is not None]))]
+            for text, met in recording.clauses.items()
         ]
         parts.append(table(rows))
     return parts

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -91,18 +92,22 @@ def find_runs(folder: Path) -> tuple[list[RunSummary], list[str]]:
     """The runs in a folder and in the folders below it, and one line for each folder that is no run.
 
     Raises:
-        UserError: There is no such folder.
+        UserError: There is no such folder, or it cannot be read.
     """
     if not folder.is_dir():
         raise UserError(f"there is no folder {folder}: give the folder that holds runs")
+    if not os.access(folder, os.R_OK | os.X_OK):
+        raise UserError(f"the folder {folder} may not be read: give one that this user may read")
     runs, problems = [], []
-    for path, is_run in _walk(folder, DEEPEST):
+    for path, problem in _walk(folder, DEEPEST):
         try:
-            if not is_run:
-                raise UserError(f"{path} holds no training run")
+            if problem is not None:
+                raise UserError(problem)
             runs.append(read_run(path))
         except UserError as error:
             problems.append(str(error))
+        except OSError as error:
+            problems.append(_describe_unreadable(path, error))
     return runs, problems
 
 
@@ -152,17 +157,27 @@ def format_evaluation(entry: Evaluation) -> str:
     )
 
 
-def _walk(folder: Path, depth: int) -> Iterator[tuple[Path, bool]]:
-    """Every folder that may be a run, in order of names, and whether it looks like one."""
-    if any((folder / name).exists() for name in (RUN_FILE, STATUS_FILE, SAVES_FOLDER)):
-        yield folder, True
+def _walk(folder: Path, depth: int) -> Iterator[tuple[Path, str | None]]:
+    """Every folder that may be a run, in order of names, and why it is none; None where it looks like a run."""
+    try:
+        is_run = any((folder / name).exists() for name in (RUN_FILE, STATUS_FILE, SAVES_FOLDER))
+        below = sorted(path for path in folder.iterdir() if path.is_dir() and not path.name.startswith("."))
+    except OSError as error:
+        yield folder, _describe_unreadable(folder, error)
         return
-    below = sorted(path for path in folder.iterdir() if path.is_dir() and not path.name.startswith("."))
+    if is_run:
+        yield folder, None
+        return
+    foreign = folder, f"{folder} holds no training run"
     if depth == 0 or not below:
-        yield folder, False
+        yield foreign
         return
     found = [entry for path in below for entry in _walk(path, depth - 1)]
-    if depth == DEEPEST or any(is_run for _, is_run in found):
+    if depth == DEEPEST or any(problem is None for _, problem in found):
         yield from found
     else:
-        yield folder, False  # the folders of something else are not listed one by one
+        yield foreign  # the folders of something else are not listed one by one
+
+
+def _describe_unreadable(folder: Path, error: OSError) -> str:
+    return f"{folder} cannot be read: {error.strerror or error}"

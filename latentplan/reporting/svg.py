@@ -18,7 +18,7 @@ from matplotlib.ticker import EngFormatter, MaxNLocator
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
-    from numpy.typing import ArrayLike
+    from numpy.typing import ArrayLike, NDArray
 
 INK, FAINT = "#010203", "#010204"
 COLORS = ("#0102f1", "#0102f2", "#0102f3", "#0102f4", "#0102f5", "#0102f6")  # stand for colours of the page's theme
@@ -86,7 +86,9 @@ class Labels:
 
 
 def plot_lines(lines: Sequence[Line], labels: Labels, *, large_x: bool = False, whole_x: bool = False) -> str:
-    """Lines with their intervals, as SVG.
+    """Lines with their intervals, as SVG; NaN leaves a gap in a line.
+
+    A point without a neighbour, which no line would show, is a dot, and its interval is a bar.
 
     Args:
         lines: The lines, at most six with a colour of their own.
@@ -102,14 +104,26 @@ def plot_lines(lines: Sequence[Line], labels: Labels, *, large_x: bool = False, 
                 axes.plot(line.x, line.y, "o", color=color, markersize=3, label=line.name or None)
                 continue
             axes.plot(line.x, line.y, ls=style, lw=1.4, color=color, label=line.name or None)
+            x, y = np.asarray(line.x, float), np.asarray(line.y, float)
+            is_alone = _find_lone_points(y)
+            axes.plot(x[is_alone], y[is_alone], "o", color=color, markersize=3)
             if line.low is not None and line.high is not None:
-                axes.fill_between(line.x, line.low, line.high, color=color, alpha=0.2, lw=0)
+                low, high = np.asarray(line.low, float), np.asarray(line.high, float)
+                axes.fill_between(x, low, high, color=color, alpha=0.2, lw=0)
+                axes.vlines(x[is_alone], low[is_alone], high[is_alone], color=color, lw=1.4)
         if large_x:
             axes.xaxis.set_major_formatter(EngFormatter(sep=""))
         if whole_x:
             axes.xaxis.set_major_locator(MaxNLocator(integer=True, min_n_ticks=1))
 
     return _draw(draw, labels)
+
+
+def _find_lone_points(values: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Where a finite value has no finite neighbour, (point,)."""
+    is_finite = np.pad(np.isfinite(values), 1)
+    lone: NDArray[np.bool_] = is_finite[1:-1] & ~is_finite[:-2] & ~is_finite[2:]
+    return lone
 
 
 def plot_histogram(values: Sequence[tuple[str, ArrayLike]], labels: Labels, bins: Sequence[float]) -> str:

@@ -7,7 +7,6 @@ import secrets
 import socket
 from collections.abc import Mapping
 from dataclasses import dataclass
-from http.cookies import CookieError, SimpleCookie
 from urllib.parse import SplitResult, parse_qs, urlsplit
 
 from latentplan.config import UserError
@@ -65,12 +64,10 @@ class Access:
         return self.token is not None and self._is_token(_given(query))
 
     def _has_token(self, headers: Mapping[str, str], query: str) -> bool:
-        try:
-            cookies = SimpleCookie(headers.get("cookie", ""))
-        except CookieError:
-            cookies = SimpleCookie()
-        kept = cookies[self.cookie].value if self.cookie in cookies else ""
-        return self._is_token(_given(query)) or self._is_token(kept)
+        # `http.cookies` drops every cookie beside one that it cannot read, and other programs of the host set cookies.
+        cookies = [cookie.strip().partition("=") for cookie in headers.get("cookie", "").split(";")]
+        kept = [value for name, _, value in cookies if name == self.cookie]
+        return any(self._is_token(given) for given in (_given(query), *kept))
 
     def _is_token(self, given: str) -> bool:
         """Whether a text is the token, in a time that does not depend on the text."""

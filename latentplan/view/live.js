@@ -10,6 +10,7 @@
   function find(id) { return document.getElementById(id); }
   function write(id, text) { find(id).textContent = text; }
   function digits(value, count) { return value === null || value === undefined ? "-" : value.toFixed(count); }
+  function refuse(reason) { write("refusal", reason); find("refusal").hidden = false; }
   function send(request) {
     find("refusal").hidden = true;
     if (socket.readyState === WebSocket.OPEN) { socket.send(JSON.stringify(request)); }
@@ -22,7 +23,7 @@
     future: showFuture,
     settings: showSettings,
     picture: addPicture,
-    refused: function (reason) { write("refusal", reason); find("refusal").hidden = false; }
+    refused: refuse
   };
 
   function connect() {
@@ -166,9 +167,13 @@
   find("reset").addEventListener("click", function () { send({ reset: true }); });
   find("snapshot").addEventListener("click", function () { send({ picture: "camera" }); });
   find("file").addEventListener("change", function () {
-    var reader = new FileReader();
+    var reader = new FileReader(), file = this.files[0];
     reader.onload = function () { send({ picture: reader.result.split(",")[1] || "" }); };
-    if (this.files.length) { reader.readAsDataURL(this.files[0]); }
+    if (file && settings && file.size > settings.largest_picture) {  // a message that is too large would end the connection
+      refuse(settings.picture_rule);
+    } else if (file) {
+      reader.readAsDataURL(file);
+    }
     this.value = "";
   });
 

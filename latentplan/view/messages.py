@@ -22,6 +22,7 @@ from latentplan.config.parsing import list_settings, raise_unknown, read_values
 from latentplan.config.quantities import QUANTITIES
 from latentplan.reporting.page import data_address, encode_png
 from latentplan.view.pace import Pace
+from latentplan.view.pictures import LARGEST_BYTES, RULE
 from latentplan.view.session import MOST_WEIGHTS, PUSH_S, Fan, Future, Moment, Session
 
 SEARCH = ("horizon", "num_samples", "num_iterations", "warm_start_iterations", "deadline_ms")
@@ -81,13 +82,15 @@ def describe_settings(session: Session) -> dict[str, Any]:
             "search": {name: planner.get(name) for name in SEARCH},
             "own": {name: getattr(session.search, name) for name in SEARCH},
             "goal_horizon": session.search.goal_horizon,
-            "surprise_limit": getattr(session.agent, "surprise_limit", None),
+            "surprise_limit": getattr(session.agent, "effective_surprise_limit", None),
             "period_ms": 1000.0 * session.period_s,
             "weight": weight,
             "pushed_body": getattr(session.env.unwrapped, "pushed_body", None),
             "push_s": PUSH_S,
             "most_push": None if weight is None else MOST_WEIGHTS * weight,
             "units": units,
+            "largest_picture": LARGEST_BYTES,
+            "picture_rule": RULE,
         }
     }
 
@@ -184,9 +187,14 @@ def _read_picture(session: Session, value: Any) -> bytes:
 
 
 def _read_number(name: str, value: Any) -> float:
-    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+    is_number = isinstance(value, int | float) and not isinstance(value, bool)
+    try:
+        number = float(value) if is_number else math.nan
+    except OverflowError:  # a whole number beyond the largest float
+        number = math.inf
+    if not math.isfinite(number):
         raise UserError(f"{name} must be a finite number, got {shown(value)}")
-    return float(value)
+    return number
 
 
 def _plain(value: Any) -> Any:

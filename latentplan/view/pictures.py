@@ -13,6 +13,7 @@ from latentplan.objectives.goal_image import read_goal_image
 LARGEST_BYTES = 2_000_000
 LARGEST_SIDE = 2048  # pixels; a picture of few bytes may be of very many
 MOST_PICTURES = 20
+RULE = f"a goal picture must be a PNG file of at most {LARGEST_BYTES // 1_000_000} MB"
 _PNG = b"\x89PNG\r\n\x1a\n"
 _GOAL = re.compile(r'goal:(?P<name>"[^"]*"|[^\s();"]+)')
 
@@ -45,7 +46,7 @@ class GoalPictures:
         if len(self.contents) >= MOST_PICTURES:
             raise UserError(f"there are {MOST_PICTURES} goal pictures already; start the program anew")
         if len(content) > LARGEST_BYTES or not content.startswith(_PNG) or len(content) < 24:
-            raise UserError(f"a goal picture must be a PNG file of at most {LARGEST_BYTES // 1_000_000} MB")
+            raise UserError(RULE)
         if max(struct.unpack(">II", content[16:24])) > LARGEST_SIDE:
             raise UserError(f"a goal picture must have at most {LARGEST_SIDE} x {LARGEST_SIDE} pixels")
         name = f"picture-{len(self.contents) + 1}.png"

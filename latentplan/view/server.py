@@ -28,6 +28,7 @@ from latentplan.view.pictures import LARGEST_BYTES
 
 START_S = 10.0
 STOP_S = 2.0
+UNSUPPORTED_DATA = 1003  # code with which a websocket is closed after bytes (RFC 6455)
 _FOLDER = Path(__file__).parent
 _HEADERS = {
     "Content-Security-Policy": "default-src 'none'; script-src 'self'; style-src 'self' 'unsafe-inline'; "
@@ -149,8 +150,12 @@ def _make_app(title: str, access: Access, hub: Hub) -> Starlette:
         hub.open(opened)
         sending = asyncio.create_task(_send_all(websocket, opened))
         try:
-            async for text in websocket.iter_text():
-                hub.ask(opened, text)
+            while (message := await websocket.receive())["type"] == "websocket.receive":
+                if message.get("text") is None:
+                    with contextlib.suppress(WebSocketDisconnect, RuntimeError):  # the page has gone meanwhile
+                        await websocket.close(UNSUPPORTED_DATA)
+                    break
+                hub.ask(opened, message["text"])
         finally:
             hub.close(opened)
             sending.cancel()

@@ -197,6 +197,8 @@ class Session:
         except UserError:
             if has_same_agent:
                 self._pass_on(self._goals, agent, self.settings)
+                if isinstance(self._world, ScoredEnv):
+                    self._world.repeat_objective()
             else:
                 _close(agent)
             raise
@@ -352,7 +354,7 @@ class Session:
         if plan is None or not plan.candidates or self.agent.last_source != "plan":
             return None
         last = plan.candidates[-1]
-        candidates, elites = choose_candidates(last, getattr(self.agent.controller.planner, "num_best", 1))
+        candidates, elites = choose_candidates(last)
         return Fan(candidates, elites, last.mean[0].float().cpu().numpy())
 
 

@@ -92,8 +92,10 @@ def test_planning_agent_acts_by_the_actor_when_a_frame_exceeds_the_surprise_limi
 def test_planning_agent_ignores_surprise_when_an_objective_or_constraint_is_set(model, frames, goals):
     planner = make_planner(model)
     limited = make_planner(model, surprise_limit=1e-6)
+    assert planner.effective_surprise_limit is None and limited.effective_surprise_limit == 1e-6
     for agent in (planner, limited):
         agent.set_objective(**goals)
+        assert agent.effective_surprise_limit is None
     assert np.array_equal(planner.act(frames[0]), limited.act(frames[0])) and limited.last_source == "plan"
 
 

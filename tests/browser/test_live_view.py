@@ -143,3 +143,13 @@ def test_live_view_fits_the_window(open_page, address, width):
     live = Live(open_page(address, width, "dark"))
     assert live.page.evaluate("document.documentElement.scrollWidth") <= width
     assert live.page.evaluate("getComputedStyle(document.body).backgroundColor") == "rgb(20, 23, 28)"
+
+
+def test_picture_that_is_too_large_is_refused_and_the_page_stays_connected(live):
+    content = {"name": "large.png", "mimeType": "image/png", "buffer": bytes(5_000_000)}
+    live.page.locator("#file").set_input_files(content)
+    refusal = live.page.locator("#refusal")
+    wait_until(refusal.is_visible)
+    assert refusal.text_content() == "a goal picture must be a PNG file of at most 2 MB"
+    before = live.place()
+    wait_until(lambda: live.place() != before)

@@ -1,9 +1,13 @@
 """Training runs are listed, watched and compared from what their folders hold."""
 
 import csv
+import errno
+import io
 import json
 import re
+import sys
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 
@@ -69,6 +73,57 @@ def test_runs_gives_one_line_for_each_folder_that_is_no_run(make_run, tmp_path, 
         assert line.startswith("no run: ") and str(tmp_path / name) in line
 
 
+@pytest.mark.parametrize(
+    ("name", "text"),
+    [
+        ("metrics.csv", ",".join(COLUMNS) + '\n1000,10,0.5,"' + "1" * 140_000 + "\n"),
+        ("metrics.csv", ",".join(COLUMNS) + "\n1000,10,0.5,7,7\nnan,20,1.0,,\n"),
+        ("final.json", json.dumps({"env_frames": "x", "updates": 1, "minutes": 1.0, "planner": 1.0, "actor": 1.0})),
+        ("final.json", json.dumps({"env_frames": 9, "updates": 1, "minutes": 1.0, "planner": None, "actor": 1.0})),
+        ("final.json", '{"env_frames": 9, "updates": 1e999, "minutes": 1.0, "planner": 1.0, "actor": 1.0}'),
+        ("final.json", "[" * 100_000),
+    ],
+)
+def test_damaged_results_of_one_run_are_one_line_beside_the_other_runs(make_run, tmp_path, capsys, name, text):
+    good, damaged = make_run("good"), make_run("damaged")
+    (damaged / name).write_text(text)
+    assert main(["runs", str(tmp_path)]) == 0
+    output = capsys.readouterr()
+    assert [line.split()[0] for line in output.out.splitlines()] == ["run", "good"]
+    assert output.err.startswith(f"no run: the results in {damaged} cannot be read: ") and output.err.count("\n") == 1
+    assert main(["compare", str(good), str(damaged)]) == 2
+    assert capsys.readouterr().err.count("\n") == 1
+
+
+@pytest.mark.parametrize("method", ["iterdir", "exists"])
+def test_folder_that_may_not_be_read_is_one_line_beside_the_runs(make_run, tmp_path, capsys, monkeypatch, method):
+    make_run("good")
+    closed = tmp_path / "closed"
+    closed.mkdir()
+    allowed = getattr(Path, method)
+
+    def refuse(self, *given):  # root may read everything, so the refusal is imitated
+        if closed in (self, self.parent):
+            raise PermissionError(errno.EACCES, "Permission denied", str(self))
+        return allowed(self, *given)
+
+    monkeypatch.setattr(Path, method, refuse)
+    assert main(["runs", str(tmp_path)]) == 0
+    output = capsys.readouterr()
+    assert [line.split()[0] for line in output.out.splitlines()] == ["run", "good"]
+    assert output.err == f"no run: {closed} cannot be read: Permission denied\n"
+
+
+def test_names_that_are_not_utf8_are_printed_as_escapes(make_run, tmp_path, monkeypatch):
+    folders, page = [make_run("caf\udce9"), make_run("other", horizon=5)], tmp_path / "page.html"
+    for words in (["runs", tmp_path], ["compare", *folders, "--report", page]):
+        output = io.TextIOWrapper(io.BytesIO(), encoding="utf-8", errors="strict")
+        monkeypatch.setattr(sys, "stdout", output)
+        assert main([*map(str, words)]) == 0
+        assert (b"caf\\udce9" in output.buffer.getvalue()) == (words[0] == "runs")
+    assert "caf\\udce9" in page.read_text()
+
+
 @pytest.mark.parametrize("command", ["runs", "watch", "compare"])
 def test_a_missing_folder_is_refused_in_one_line(command, tmp_path, capsys):
     other = [str(tmp_path)] if command == "compare" else []
@@ -119,6 +174,25 @@ def test_compare_groups_seeds_and_names_the_settings_that_differ(make_run, tmp_p
     html = page.read_text()
     assert "planner.horizon" in html and "<svg" in html
     assert not re.search(r"""(?:src|href)=["'](?!data:|#)""", html)
+
+
+def test_compare_gives_every_group_a_name_of_its_own(make_run):
+    run = read_run(make_run("run"))
+    runs = []
+    for domain, task in (("walker", "walk"), ("cheetah", "run")):
+        for horizon, num_samples in ((8, 64), (12, 64), (12, 128)):
+            planner = PlannerConfig(horizon=horizon, num_samples=num_samples, num_elites=8)
+            config = replace(run.config, env=EnvConfig(domain=domain, task=task), planner=planner)
+            runs.append(replace(run, config=config))
+    groups, differ = group_runs(runs)
+    assert len(differ) > 2 and len({group.name for group in groups}) == len(groups) == 6
+    assert groups[1].name == f"domain walker, horizon 12, num_samples 64 and {len(differ) - 3} more"
+    assert [group.name for group in group_runs(runs[:2])[0]] == ["horizon 8", "horizon 12"]
+
+
+def test_compare_takes_equal_settings_as_one_group_however_they_are_written(make_run):
+    runs = [read_run(make_run(str(index), seed=index, deadline_ms=value)) for index, value in enumerate((5, 5.0))]
+    assert len(group_runs(runs)[0]) == 1
 
 
 def test_mean_curve_of_one_seed_is_its_evaluations_and_of_several_their_mean(make_run):

@@ -27,6 +27,28 @@ def test_act_plans_with_the_last_plan(point, states, make_controller, make_plann
     torch.testing.assert_close(controller.act(states + 0.1), second.action)
 
 
+def test_planner_with_the_arguments_of_the_protocol_alone_is_called_with_no_other(point, states, make_planner, seeded):
+    inner = make_planner()
+
+    class OwnPlanner:
+        def __getattr__(self, name):
+            return getattr(inner, name)
+
+        def plan(
+            self, model, state, previous=None, *, objective=None, constraints=(), generator=None, deadline_ms=None
+        ):
+            goals = {"objective": objective, "constraints": constraints}
+            return inner.plan(model, state, previous, generator=generator, deadline_ms=deadline_ms, **goals)
+
+    controller = ModelPredictiveController(OwnPlanner(), point, generator=seeded(), keep="candidates")
+    expected = ModelPredictiveController(inner, point, generator=seeded(), keep="candidates")
+    assert torch.equal(controller.act(states), expected.act(states))
+    assert controller.plan.candidates == () and len(expected.plan.candidates) > 0
+    everywhere = torch.ones(len(states), dtype=torch.bool)
+    last = torch.zeros(len(states), 2)
+    assert torch.equal(controller.act_where(states, everywhere, last), expected.act_where(states, everywhere, last))
+
+
 def test_reset_forgets_the_plan(states, make_controller):
     controller = make_controller(num_iterations=4, warm_start_iterations=1, keep_elite_fraction=0.5)
     controller.act(states)

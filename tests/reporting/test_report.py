@@ -1,6 +1,7 @@
 """Recording an episode changes nothing of it, and a report is one page that needs no other file."""
 
 import re
+from dataclasses import replace
 from html.parser import HTMLParser
 from types import SimpleNamespace
 
@@ -13,10 +14,17 @@ from latentplan.agents.gated import GatedAgent
 from latentplan.agents.planning import PlanningAgent
 from latentplan.config import Config
 from latentplan.config.run_results import Evaluation
-from latentplan.evaluation.episodes import run_episodes
+from latentplan.config.writing import write_whole
+from latentplan.evaluation.episodes import Step, run_episodes
 from latentplan.reporting.page import Section, film, render_page, scrubber, table
-from latentplan.reporting.recorder import COMPARED_STEPS, EpisodeRecorder, GuardedRecorder
-from latentplan.reporting.report import ReportData, Returns, render_report, tile
+from latentplan.reporting.recorder import (
+    COMPARED_STEPS,
+    EpisodeRecorder,
+    GuardedRecorder,
+    _mean_picture,
+    choose_candidates,
+)
+from latentplan.reporting.report import ReportData, Returns, _goals, render_report, tile
 from latentplan.reporting.svg import Labels, Line, plot_lines
 from tests.agents.small_agents import CONFIG, make_model
 
@@ -96,6 +104,29 @@ def test_recorder_sorts_candidates_from_elites(recording):
     assert first.elite_pictures.dtype == np.uint8
 
 
+@pytest.mark.parametrize(("kind", "limit"), [(PlanningAgent, 5.0), (GatedAgent, None)])
+def test_recording_has_the_surprise_limit_where_it_has_an_effect(kind, limit):
+    settings = replace(CONFIG.planner, surprise_limit=5.0)
+    assert play(lambda: kind(make_model(), CONFIG, 0.95, planner=settings), record=True)[1].surprise_limit == limit
+
+
+def test_drawn_elites_are_those_of_the_search_and_no_other_candidate_is_one():
+    elites = torch.tensor([[5.0, 0.0, torch.nan]])[:, :, None, None]
+    iteration = SimpleNamespace(actions=torch.arange(4.0)[None, :, None, None], elites=elites)
+    others, drawn = choose_candidates(iteration)
+    assert others.ravel().tolist() == [1.0, 2.0, 3.0] and drawn.ravel().tolist() == [5.0, 0.0]
+    others, drawn = choose_candidates(SimpleNamespace(actions=elites[:, :2], elites=elites))
+    assert others.shape == (0, 1, 1) and len(drawn) == 2
+
+
+def test_iteration_without_elites_is_drawn_with_its_candidates_alone(recording):
+    iteration = SimpleNamespace(actions=torch.zeros(1, 4, 1, 1), elites=torch.full((1, 2, 1, 1), torch.nan))
+    others, drawn = choose_candidates(iteration)
+    assert others.shape == (4, 1, 1) and drawn.shape == (0, 1, 1)
+    pictures = recording.strips[0].real[None]
+    assert np.array_equal(_mean_picture(pictures), pictures[0]) and not _mean_picture(pictures[:0]).any()
+
+
 def test_recorder_compares_imagination_with_the_frames_that_followed(recording):
     assert recording.picture_error.shape[1] == recording.reward_error.shape[1] == COMPARED_STEPS
     assert np.isfinite(recording.picture_error).all() and (recording.picture_error > 0.0).all()
@@ -160,6 +191,11 @@ def test_report_shows_every_part_that_has_figures(page):
     assert "eval.py &lt;&amp;&gt;" in page and "DreamerV3" in page and "torch 1" in page
 
 
+def test_report_with_a_name_that_is_not_utf8_can_be_written(tmp_path):
+    page = render_report(ReportData("corridor", Config(), facts={"command": "eval --report caf\udce9.html"}))
+    assert "caf\\udce9.html" in write_whole(tmp_path / "page.html", page).read_text()
+
+
 def test_report_leaves_out_parts_without_figures():
     page = render_report(ReportData("corridor", Config()))
     assert re.findall("<h2>(.*?)</h2>", page) == ["Provenance"]
@@ -169,6 +205,18 @@ def test_figures_take_their_colours_from_the_theme():
     svg = plot_lines([Line("a", [0, 1], [0, 1], [0, 0], [1, 2])], Labels("a & b", "x", "y", [("level", 0.5)]))
     assert "var(--series-1)" in svg and "var(--ink)" in svg and 'aria-label="a &amp; b"' in svg
     assert not re.search(r"#[0-9a-f]{6}\b", svg)
+
+
+@pytest.mark.parametrize(("values", "num_dots"), [([1.0], 1), ([1.0, 2.0], 0), ([1.0, np.nan, 2.0, 3.0], 1)])
+def test_points_without_a_neighbour_are_dots(values, num_dots):
+    svg = plot_lines([Line("", range(len(values)), values)], Labels("", "x", "y"))
+    assert len(re.findall(r"<use [^>]*var\(--series-1\)", svg)) == num_dots
+
+
+def test_interval_of_a_single_point_is_a_bar():
+    plain, with_bar = (plot_lines([Line("", [1], [5.0], *ends)], Labels("", "x", "y")) for ends in ([], [[4.0], [6.0]]))
+    paths = [re.findall(r'<path d="(M[^"]*)"[^>]*stroke: var\(--series-1\)', svg) for svg in (plain, with_bar)]
+    assert not any("L" in path for path in paths[0]) and any("L" in path for path in paths[1])
 
 
 def test_page_escapes_text_and_a_film_that_is_too_large_is_named(tmp_path):
@@ -184,6 +232,31 @@ def test_page_escapes_text_and_a_film_that_is_too_large_is_named(tmp_path):
 def test_tile_keeps_pictures_apart():
     black = np.zeros((2, 4, 4, 3), np.uint8)
     assert tile([black, black]).shape == (9, 9, 3) and (tile([black, black])[4] == 128).all()
+
+
+def record_clauses(clauses):
+    """The recording of decisions before which the goals had these clauses."""
+    goals = SimpleNamespace(objective_scores=[], clauses=[])
+    recorder = EpisodeRecorder(SimpleNamespace(), len(clauses), goals=goals)
+    for decision, goals.clauses in enumerate(clauses):
+        recorder(Step(0, decision, 0.0, np.zeros((4, 4, 3), np.uint8), np.zeros(1, np.float32)))
+    return recorder.recording
+
+
+def test_shares_of_clauses_count_only_decisions_at_which_the_clause_was_part_of_the_goals():
+    one, other = ("cart < 1", True), ("upright > 0", True)
+    recording = record_clauses([[], [one], [one], [other], [other], [one, one]])
+    assert recording.clauses == {
+        "cart < 1": [None, True, True, None, None, True],
+        "upright > 0": [None, None, None, True, True, None],
+    }
+    rows = re.findall("<td>(.*?)</td><td.*?>(.*?)</td>", "".join(_goals(recording)))
+    assert rows == [("cart &lt; 1", "100.0 %"), ("upright &gt; 0", "100.0 %")]
+
+
+def test_clause_in_objective_and_constraint_is_met_where_both_say_so():
+    recording = record_clauses([[], [("a", True), ("a", False)], [("a", True), ("a", True)], [("a", False)]])
+    assert recording.clauses == {"a": [None, False, True, False]}
 
 
 def test_recorder_of_an_agent_without_a_model_keeps_actions_and_returns():

@@ -52,6 +52,14 @@ def test_token_is_taken_from_the_address_or_the_cookie():
     assert LOCKED.brings_token(f"token={token}") and not LOCKED.brings_token("")
 
 
+@pytest.mark.parametrize("other", ['prefs={"theme":"dark"}', "a b=1", "=", f"{LOCKED.cookie}=old", '"; "', "\xfc=1"])
+def test_token_in_the_cookie_is_found_beside_cookies_of_other_programs(other):
+    own = f"{LOCKED.cookie}={LOCKED.token}"
+    assert allows(LOCKED, host="robot:8420", cookie=f"{other}; {own}")
+    assert allows(LOCKED, host="robot:8420", cookie=f"{own};{other}")
+    assert not allows(LOCKED, host="robot:8420", cookie=other)
+
+
 @pytest.mark.parametrize("query", ["", "token=", "token=wrong", "token=\xfc", "Token=x", "token"])
 def test_request_without_the_token_is_refused(query):
     assert not allows(LOCKED, query, host="robot:8420")

@@ -16,7 +16,7 @@ def ask(session, **request):
     return obey(session, json.dumps(request))
 
 
-def test_request_changes_the_settings_and_answers_with_them(session):
+def test_changeschanges_the_settings_and_answers_with_them(session):
     session.decide()
     answers = ask(session, horizon="2", num_samples="20", deadline_ms="250", objective=" cart -> 0.8 ")
     assert dict(session.settings.planner) == {"horizon": 2, "num_samples": 20, "deadline_ms": 250.0}
@@ -66,6 +66,7 @@ def test_push_reset_and_picture_are_obeyed(session):
         ('{"mode": ""}', "mode"),
         ('{"push": "far"}', "push must be a finite number"),
         ('{"push": NaN}', "push must be a finite number"),
+        (f'{{"push": 1{"0" * 400}}}', "push must be a finite number"),
         ('{"push": true}', "push must be a finite number"),
         ('{"push": 1e9}', "ten times the weight"),
         ('{"picture": "???"}', "base64"),
@@ -73,7 +74,7 @@ def test_push_reset_and_picture_are_obeyed(session):
         ('{"picture": "R0lG"}', "PNG file"),
     ],
 )
-def test_request_that_cannot_be_followed_is_refused_in_one_line(session, text, words):
+def test_changesthat_cannot_be_followed_is_refused_in_one_line(session, text, words):
     session.decide()
     before, agent = session.settings, session.agent
     with pytest.raises(UserError) as error:
@@ -91,6 +92,22 @@ def test_messages_are_json_without_special_numbers(session):
         assert read.keys() == message.keys()
     assert json.loads(write(describe_settings(session)))["settings"]["pushed_body"] == "cart"
     assert write({"a": [float("nan"), float("inf"), 1.23456789]}) == '{"a": [null, null, 1.2346]}'
+
+
+@pytest.mark.parametrize(
+    ("changes", "limit"), [({}, 6.0), ({"objective": "cart -> 0.8"}, None), ({"mode": "gated"}, None)]
+)
+def test_settings_have_the_surprise_limit_where_it_has_an_effect(make_session, changes, limit):
+    session = make_session(planner={"surprise_limit": 6.0})
+    ask(session, **changes)
+    assert describe_settings(session)["settings"]["surprise_limit"] == limit
+
+
+def test_settings_tell_the_page_which_pictures_are_too_large_to_send(session):
+    settings = describe_settings(session)["settings"]
+    with pytest.raises(UserError) as error:
+        session.pictures.add(b"x" * (settings["largest_picture"] + 1))
+    assert settings["picture_rule"] == str(error.value)
 
 
 def test_moment_names_every_quantity_of_the_settings(session):

@@ -6,7 +6,7 @@ import re
 import time
 
 import pytest
-from websockets.exceptions import InvalidStatus
+from websockets.exceptions import ConnectionClosedError, InvalidStatus
 from websockets.sync.client import connect
 
 from latentplan.config import UserError
@@ -140,6 +140,15 @@ def test_message_that_is_too_large_closes_the_page_alone(server, session):
             socket.send("x" * 10_000_000)
             with pytest.raises(Exception, match="1009|too big|no close frame|closed"):
                 receive(socket, "moment")
+        step(session, server.hub, Pace(0.04), looks_ahead=False)
+        assert receive(other, "moment")["decision"] == 0
+
+
+def test_message_of_bytes_closes_the_page_alone(server, session):
+    with open_socket(server) as other, open_socket(server) as socket:
+        socket.send(b"abc")
+        with pytest.raises(ConnectionClosedError, match="1003"):
+            receive(socket, "moment")
         step(session, server.hub, Pace(0.04), looks_ahead=False)
         assert receive(other, "moment")["decision"] == 0
 

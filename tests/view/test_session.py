@@ -135,6 +135,23 @@ def test_settings_that_cannot_be_used_leave_the_old_ones(session, changes, words
     assert [text for text, _ in session.decide().clauses] == clauses == ["cart -> 0.8"]
 
 
+def test_refused_goal_leaves_the_present_objective_of_a_schedule(make_session, monkeypatch):
+    session = make_session(objective="cart -> 0.8; 20: cart -> -0.8; 1000: cart -> 0.1", constraint="cart_speed < 5")
+    pursued, set_objective = [], session.agent.set_objective
+
+    def note(objective=None, constraints=()):
+        set_objective(objective, constraints)
+        pursued.append((getattr(objective, "text", None), constraints))
+
+    monkeypatch.setattr(session.agent, "set_objective", note)
+    for num_decisions, present in ((1, "cart -> 0.8"), (2, "cart -> -0.8")):
+        for _ in range(num_decisions):
+            session.decide()
+        with pytest.raises(UserError, match="cannot plan for"):
+            change(session, objective="task(balance)")
+        assert pursued[-1] == (present, "cart_speed < 5")
+
+
 def test_push_moves_the_body_and_ends(make_session):
     pushed, plain = make_session(), make_session()
     for each in (pushed, plain):

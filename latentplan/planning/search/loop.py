@@ -267,6 +267,8 @@ class Search:
         violations = self._add_excess(scores.violations, actions)
         if violations is not None:
             is_feasible = is_feasible & (violations == 0)
+        assert progress.elites is not None
+        is_elite = torch.isfinite(progress.elites.scores.returns)[:, :, None, None]
         described = Iteration(
             index,
             actions,
@@ -277,6 +279,7 @@ class Search:
             self.space.decode(self.space.clean(progress.mean)),
             self.space.decode_var(progress.var).sqrt(),
             progress.expected_return,
+            self.space.decode(progress.elites.actions).masked_fill(~is_elite, torch.nan),
         )
         if self.view.keep is not None:
             kept.append(described)

@@ -21,6 +21,7 @@ def test_keep_returns_every_iteration_and_changes_no_plan(point, states, make_pl
         assert iteration.violations is None and iteration.states is None
         assert iteration.mean.shape == iteration.std.shape == (5, 6, 2)
         torch.testing.assert_close(iteration.elite_return, elite_return)
+        assert iteration.elites.shape == (batch, planner.num_elites, 6, 2)
     torch.testing.assert_close(kept.candidates[-1].mean, kept.mean)
 
 
@@ -64,6 +65,28 @@ def test_kept_candidates_say_which_are_feasible(point, states, make_planner, see
     nan = FunctionModel(point.dynamics, lambda state, action: torch.where(action[:, 0] > 0, torch.nan, action[:, 1]))
     iteration = make_planner().plan(nan, states, generator=seeded(), keep="candidates").candidates[0]
     assert torch.equal(iteration.is_feasible, (iteration.actions[..., 0] <= 0).all(dim=2))
+
+
+@pytest.mark.parametrize("options", [{}, {"constraint_penalty": 0.1}, {"num_iterations": 1}])
+def test_mean_of_the_elites_of_an_iteration_is_the_mean_of_the_search(point, states, make_planner, seeded, options):
+    def push_apart(rollout):  # no candidate satisfies it
+        return 20.0 + rollout.actions[:, :, 0].sum(dim=1)
+
+    planner = make_planner(**RICH | {"smoothing": 1.0} | options)
+    for constraints in ([], [push_apart]):
+        plan = planner.plan(point, states, generator=seeded(), constraints=constraints, keep="candidates")
+        for iteration in plan.candidates:
+            assert iteration.violations is None or not iteration.is_feasible.any()
+            torch.testing.assert_close(iteration.elites.mean(dim=1), iteration.mean)
+
+
+def test_elites_of_an_iteration_are_nan_where_too_few_candidates_have_a_finite_return(
+    point, states, make_planner, seeded
+):
+    nan = FunctionModel(point.dynamics, lambda state, action: torch.where(action[:, 0] > 0, torch.nan, action[:, 1]))
+    iteration = make_planner(horizon=3).plan(nan, states, generator=seeded(), keep="candidates").candidates[0]
+    num_finite = iteration.is_feasible.sum(dim=1).clamp_max(8)
+    assert torch.equal(torch.isfinite(iteration.elites).all(dim=(2, 3)).sum(dim=1), num_finite)
 
 
 def test_candidates_follow_the_environments_that_are_taken(point, states, make_planner, seeded):
