@@ -46,7 +46,8 @@ class EnvConfig:
         action_repeat: Simulator control steps per decision.
         camera: Camera id of the MuJoCo model.
         cameras: Several cameras, whose pictures the agent sees together: ids of the MuJoCo model, or image keys of a
-            `Dict` observation of your own environment. Empty takes `camera`, or all images of the `Dict`.
+            `Dict` observation of your own environment. Empty takes `camera`, or all images of the `Dict` that `vectors`
+            does not name.
         frame_size: Side of the pictures in pixels: 64, 84, 96 or 128.
         vectors: What the agent sees beside the pictures: keys of vectors in a `Dict` observation of your own
             environment; in `dm_control` keys of the task's observation, or `proprioception` for all of them.

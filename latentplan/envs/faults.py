@@ -50,12 +50,12 @@ def check_picture(picture: Any, shape: tuple[int, ...]) -> np.ndarray:
 
 
 def check_unit_picture(picture: Any, shape: tuple[int, ...]) -> np.ndarray:
-    """An observation of floats in [0, 1] as an array of its own, uint8 of the shape that its space declares.
+    """An observation of numbers in [0, 1] as an array of its own, uint8 of the shape that its space declares.
 
     Raises:
         EnvironmentFault: The observation is none of this; the message says what it is.
     """
-    wanted = f"the environment must return frames of floats in [0, 1] {shape}"
+    wanted = f"the environment must return frames of whole numbers or floats in [0, 1] {shape}"
     try:
         given = np.asarray(picture, dtype=np.float32)
     except (TypeError, ValueError):

@@ -38,6 +38,16 @@ def test_vectors_that_are_not_named_are_not_seen():
     assert env.spaces.vector_dim == 0 and "vectors" not in env.reset()[1]
 
 
+def test_vector_that_looks_like_a_picture_is_no_camera():
+    space = Dict({"camera": bytes_box(20, 30, 3), "grid": Box(0.0, 1.0, (3, 3), np.float32)})
+    accepted = accept_spaces(space, ACTIONS, EnvConfig(vectors=("grid",)))
+    assert (accepted.spaces.cameras, accepted.spaces.vector_dim) == (1, 9)
+    with pytest.raises(UserError, match="env.cameras and env.vectors both name 'grid'"):
+        accept_spaces(space, ACTIONS, EnvConfig(cameras=("camera", "grid"), vectors=("grid",)))
+    with pytest.raises(UserError, match="must hold a picture .*beside those that env.vectors names"):
+        accept_spaces(space, ACTIONS, EnvConfig(vectors=("grid", "camera")))
+
+
 @pytest.mark.parametrize(
     ("config", "message"),
     [
