@@ -27,6 +27,26 @@ def time_pictures(env: Any, config: EnvConfig) -> float:
     return 1e3 * (time.perf_counter() - started) / TIMED_PICTURES
 
 
+def draw(env: gymnasium.Env[Any, Any]) -> np.ndarray:
+    """The picture that an environment's `render()` draws of its present state, uint8 (height, width, 3).
+
+    Raises:
+        EnvironmentFault: `render()` failed, or returned anything but such a picture.
+        UserError: `render()` needs something that is not installed.
+    """
+    try:
+        given: Any = env.render()
+        picture = np.asarray(given)
+    except Exception as error:
+        raise describe_failure(error) from error
+    if picture.dtype != np.uint8 or picture.ndim != 3 or picture.shape[2] != 3 or 0 in picture.shape:
+        what = type(given).__name__ if picture.dtype == object else f"{picture.dtype} {picture.shape}"
+        raise EnvironmentFault(
+            f"render() must return pictures uint8 (height, width, 3), got {what}: correct the environment's render"
+        )
+    return picture
+
+
 class RenderedEnv(gymnasium.Wrapper[Any, Any, Any, Any]):
     """An environment whose observations are the pictures of its `render()`, uint8 (size, size, 3).
 
@@ -69,14 +89,4 @@ class _Picture:
         self._env = env
 
     def __array__(self, dtype: Any = None, copy: bool | None = None) -> np.ndarray:
-        try:
-            given = self._env.env.render()
-        except Exception as error:
-            raise describe_failure(error) from error
-        picture = np.asarray(given)
-        if picture.dtype != np.uint8 or picture.ndim != 3 or picture.shape[2] != 3 or 0 in picture.shape:
-            what = type(given).__name__ if picture.dtype == object else f"{picture.dtype} {picture.shape}"
-            raise EnvironmentFault(
-                f"render() must return pictures uint8 (height, width, 3), got {what}: correct the environment's render"
-            )
-        return resize(picture, self._env.observation_space.shape[0])  # type: ignore[index]
+        return resize(draw(self._env.env), self._env.observation_space.shape[0])  # type: ignore[index]

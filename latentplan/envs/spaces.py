@@ -16,6 +16,7 @@ from latentplan.config import EnvConfig, UserError
 from latentplan.config.spaces import MOST_CAMERAS, MOST_CATEGORIES, MOST_NUMBERS, Spaces
 from latentplan.envs.faults import check_picture, check_unit_picture, check_vector, take_keys
 
+LARGEST_RANGE = 1e6  # from the lowest to the highest value of an action; a longer one was not meant
 ONLY_PICTURE = "picture"  # name of the picture of an environment that shows one and no Dict
 CHANNELS = (1, 3, 4)  # gray, RGB, RGB with alpha, along the last axis of a picture
 FIRST_CHANNELS = (1, 3)  # along the first axis, where 4 pictures are a stack of gray ones and no alpha channel
@@ -71,7 +72,8 @@ class Actions:
         space: The action space of an environment.
 
     Raises:
-        UserError: The space is another, or is not bounded; the message names the remedy.
+        UserError: The space is another, is not bounded, or has a range above `LARGEST_RANGE`; the message names the
+            remedy.
 
     Attributes:
         dim: Numbers of an action.
@@ -435,6 +437,11 @@ def _read_box(space: spaces.Box, name: str) -> _Numbers:
             f"gymnasium.spaces.Box(-1.0, 1.0, {space.shape}))"
         )
     low, high = (np.ravel(bound).astype(np.float64) for bound in (space.low, space.high))
+    if (high - low).max(initial=0.0) > LARGEST_RANGE:
+        raise UserError(
+            f"{name} ranges from {low.min():g} to {high.max():g}, further than {LARGEST_RANGE:g}: declare the values "
+            "that move the body"
+        )
     return _Numbers(space, low, high, (0,) * len(low))
 
 

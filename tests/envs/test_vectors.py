@@ -62,10 +62,22 @@ def test_other_keys_are_refused_with_the_remedy(config, message):
         accept_spaces(SPACE["camera"], ACTIONS, config)
 
 
-@pytest.mark.parametrize("joints", [np.full((2, 2), np.nan), np.zeros(4), "text"])
-def test_vectors_that_are_not_as_declared_are_a_fault(joints):
-    with pytest.raises(EnvironmentFault, match="vectors of finite numbers"):
+@pytest.mark.parametrize(
+    ("joints", "remedy"),
+    [
+        (np.full((2, 2), np.nan), "return a finite number at every place"),
+        (np.zeros(4), "declare in observation_space what it returns"),
+        ("text", "return an array of numbers"),
+    ],
+)
+def test_vectors_that_are_not_as_declared_are_a_fault(joints, remedy):
+    with pytest.raises(EnvironmentFault, match=f"vectors of finite numbers.*: {remedy}"):
         wrap_user_env(Still(SPACE, VALUES | {"joints": joints}), config=BOTH).reset()
+
+
+def test_observations_without_a_declared_key_are_a_fault_with_a_remedy():
+    with pytest.raises(EnvironmentFault, match="got 'camera': return every key that observation_space declares"):
+        wrap_user_env(Still(SPACE, {"camera": RGB}), config=BOTH).reset()
 
 
 def test_vector_environment_reports_vectors_behind_the_labels():
