@@ -62,7 +62,8 @@ class EnvConfig:
         kwargs: Arguments of an environment of gymnasium's registry (suite `gymnasium`), as a JSON object; the argument
             `max_episode_steps` sets its time limit.
         pixels: Where the pictures of an environment outside of dm_control come from: `observation` takes its
-            observations, `render` takes what its `render()` draws, squeezed to a square; observations are then ignored.
+            observations, `render` takes what its `render()` draws, squeezed to a square; of the observations the agent
+            then sees what `vectors` names, and nothing else.
     """
 
     domain: str = "walker"

@@ -244,7 +244,7 @@ class Observations:
         self, space: gymnasium.Space[Any], frame_size: int, cameras: Sequence[str] = (), vectors: Sequence[str] = ()
     ) -> None:
         self._frame_size, self._keys, self._vectors = frame_size, list(cameras), list(vectors)
-        self._vector_shapes = [_read_vector(space, key) for key in vectors]
+        self._vector_shapes = [find_vector(space, key).shape for key in vectors]
         if not isinstance(space, spaces.Dict):
             if cameras:
                 raise _refuse_key(space, "cameras", cameras[0])
@@ -316,8 +316,16 @@ def _check_cameras(space: spaces.Dict, keys: Sequence[str], vectors: Sequence[st
         )
 
 
-def _read_vector(space: gymnasium.Space[Any], key: str) -> tuple[int, ...]:
-    """The shape of the vectors at a key of a Dict."""
+def find_vector(space: gymnasium.Space[Any], key: str) -> spaces.Box:
+    """The space of the vectors at a key of an observation space.
+
+    Args:
+        space: The observation space.
+        key: A key that `env.vectors` names.
+
+    Raises:
+        UserError: The space is no Dict, or holds no numbers at the key; the message names the remedy.
+    """
     if not isinstance(space, spaces.Dict) or key not in space.spaces:
         raise _refuse_key(space, "vectors", key)
     part = space[key]
@@ -326,7 +334,7 @@ def _read_vector(space: gymnasium.Space[Any], key: str) -> tuple[int, ...]:
             f"observation_space[{key!r}], which env.vectors names, must be a Box of numbers, got {_describe(part)}: "
             "convert it with gymnasium.wrappers.TransformObservation"
         )
-    return part.shape
+    return part
 
 
 def _refuse_key(space: gymnasium.Space[Any], setting: str, key: str) -> UserError:
@@ -356,8 +364,9 @@ def _has_picture_shape(shape: tuple[int, ...]) -> bool:
 
 def _has_unit_bounds(space: gymnasium.Space[Any]) -> bool:
     """Whether a space holds numbers, floats or whole ones, with the bounds 0 and 1."""
-    is_numbers = isinstance(space, spaces.Box) and np.issubdtype(space.dtype, np.number)
-    return is_numbers and bool((space.low == 0).all() and (space.high == 1).all())
+    if not isinstance(space, spaces.Box) or not np.issubdtype(space.dtype, np.number):
+        return False
+    return bool((space.low == 0).all() and (space.high == 1).all())
 
 
 def _find_remedy(space: gymnasium.Space[Any]) -> str:

@@ -58,7 +58,7 @@ def wrap_user_env(
         config: Size of the frames, names of cameras and vectors, such as `agent.config.env`; None takes the defaults.
             Its `action_repeat` is not read.
             With `pixels` "render" the frames are what `env.render()` draws, which needs `env.render_mode` "rgb_array",
-            and the observations may be anything.
+            and the observations may be anything, or a Dict with the vectors that `vectors` names.
 
     Returns:
         An environment with these properties:
@@ -81,7 +81,13 @@ def wrap_user_env(
     """
     _require_env(env, "wrap_user_env takes")
     config = config or EnvConfig()
-    env = RenderedEnv(env, config.frame_size) if config.pixels == "render" else env
+    if config.pixels == "render":
+        if config.cameras:
+            raise UserError(
+                "env.cameras has no effect with env.pixels render, which shows the one picture that render() draws: "
+                "leave env.cameras out"
+            )
+        env = RenderedEnv(env, config.frame_size, config.vectors)
     refuse_spaces(env, config)
     return PixelEnv(env, action_repeat, seed, config)
 
@@ -214,7 +220,7 @@ def _require_env(env: Any, where: str) -> None:
 
 
 def describe_refusals(env: gymnasium.Env[Any, Any], config: EnvConfig | None = None) -> list[str]:
-    """One line for each space that an environment lacks or agents cannot learn with, with its remedy; empty without one.
+    """One line for each space that an environment lacks or agents cannot learn with, with its remedy; may be empty.
 
     Args:
         env: The environment.
@@ -228,7 +234,7 @@ def describe_refusals(env: gymnasium.Env[Any, Any], config: EnvConfig | None = N
     try:
         Observations(env.observation_space, config.frame_size, config.cameras, config.vectors)
     except UserError as error:
-        can_render = MODE in env.metadata.get("render_modes", ())
+        can_render = config.pixels != "render" and MODE in env.metadata.get("render_modes", ())
         shows = f"; --env.pixels render takes what its render() draws instead (render_mode '{MODE}')"
         problems.append(f"{error}{shows if can_render else ''}")
     try:

@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from gymnasium.spaces import Dict, Discrete
 
 from latentplan.config import CollectionConfig, Config, EnvConfig, ModelConfig, RunConfig, UserError
 from latentplan.config.env_id import (
@@ -109,6 +110,43 @@ def test_rendered_pictures_are_squeezed_whole_and_drawn_once_per_decision():
     assert inner.num_drawn == 21
     assert right[:, -1].min() > 200 and right[:, :32].max() == 0  # nothing is cut off at the side
     assert env.render_large(128).shape == (128, 128, 3)
+
+
+class Sensed(odd.State):
+    """Shows vectors, and a picture that nobody sees where pictures are drawn."""
+
+    observation_space = Dict({"place": odd.STATE, "view": odd.PICTURE, "gear": Discrete(2)})
+
+    def observe(self):
+        return {"place": super().observe(), "view": self.draw(16, 16), "gear": 1}
+
+
+def test_rendered_pictures_may_have_vectors_beside_them():
+    inner = Sensed(render_mode="rgb_array")
+    config = EnvConfig(pixels="render", vectors=("place",))
+    env = wrap_user_env(inner, config=config)
+    assert (env.spaces.cameras, env.spaces.vector_dim) == (1, 4)
+    frame, info = env.reset(seed=0)
+    alone = wrap_user_env(Sensed(render_mode="rgb_array"), config=EnvConfig(pixels="render")).reset(seed=0)[0]
+    assert np.array_equal(frame, alone)
+    assert info["vectors"].tolist() == [np.float32(inner.place)] * 4
+    *_, info = env.step(np.ones(1))
+    assert info["vectors"].tolist() == [np.float32(inner.place)] * 4
+
+
+@pytest.mark.parametrize(
+    ("kind", "settings", "message"),
+    [
+        (odd.State, {"vectors": ("place",)}, "'place', but observation_space is Box.*or leave env.vectors empty"),
+        (Sensed, {"vectors": ("joints",)}, "'joints', which observation_space lacks; it has gear, place"),
+        (Sensed, {"vectors": ("gear",)}, r"observation_space\['gear'\].* must be a Box of numbers"),
+        (Sensed, {"cameras": ("view",)}, "env.cameras has no effect with env.pixels render.*leave env.cameras out"),
+    ],
+)
+def test_settings_that_do_not_fit_rendered_pictures_are_refused_without_naming_render_again(kind, settings, message):
+    with pytest.raises(UserError, match=message) as refusal:
+        wrap_user_env(kind(render_mode="rgb_array"), config=EnvConfig(pixels="render", **settings))
+    assert "--env.pixels render takes" not in str(refusal.value)
 
 
 def test_vector_environments_import_the_module_in_their_processes():
