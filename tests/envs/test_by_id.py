@@ -18,7 +18,7 @@ from latentplan.config.env_id import (
     repeat_flag,
     split_id,
 )
-from latentplan.envs import make_env, wrap_user_env
+from latentplan.envs import make_env, process, wrap_user_env
 from latentplan.envs.by_id import find_id
 from latentplan.envs.conformance import check_environment
 from latentplan.envs.vector import make_vector_env
@@ -45,6 +45,12 @@ def test_check_environment_refuses_odd_environments_in_one_line_with_a_remedy(na
     as_one_line(report.problems[0], words)
 
 
+@pytest.mark.parametrize("name", ["WrongStart", "WrongStartWithArguments"])
+def test_check_environment_shows_where_the_start_of_an_environment_fails(name):
+    report = check_environment(config_of(f"odd/{name}", **odd.REFUSED[name][1]), decisions=1, isolate=False)
+    assert "int([size])" in report.origin and "env-kwargs" not in report.problems[0]
+
+
 @pytest.mark.parametrize("name", odd.REFUSED)
 def test_train_refuses_odd_environments_before_it_learns(name, tmp_path):
     _, settings, words = odd.REFUSED[name]
@@ -63,7 +69,9 @@ def test_train_refuses_odd_environments_before_it_learns(name, tmp_path):
 
 
 @pytest.mark.parametrize("name", odd.CRASHING)
-def test_check_environment_survives_crashes_and_hangs(name):
+def test_check_environment_survives_crashes_and_hangs(name, monkeypatch):
+    if name == "HangAtStart":
+        monkeypatch.setattr(process, "START_SECONDS", 2.0)
     report = check_environment(config_of(f"odd/{name}"), decisions=5, step_timeout_s=1.0)
     assert len(report.problems) == 1
     as_one_line(report.problems[0], odd.CRASHING[name][1])
@@ -81,6 +89,13 @@ def test_check_environment_finds_nothing_to_note_in_a_good_environment():
     assert report.facts["own actions"] == "float32 (1,) in [-1, 1]" and report.facts["starts"] == "differ by seed"
     assert report.facts["episode"] == "at most 10 decisions of 2 steps"
     assert len(report.pictures) == 8 and report.pictures[0].shape == (64, 64, 3)
+
+
+def test_check_environment_says_that_a_fourth_channel_is_alpha():
+    for name, is_named in (("WithAlpha", True), ("Slider", False)):
+        report = check_environment(config_of(name), decisions=2, isolate=False)
+        assert report.problems == []
+        assert ("the fourth channel of a picture is read as alpha" in report.facts["observations"]) == is_named
 
 
 def test_refusal_names_both_spaces():
