@@ -91,6 +91,20 @@ def test_eval_refuses_environments_with_other_actions(checkpoint, assert_refused
     assert_refused(["eval", "--checkpoint", checkpoint, "--env-id", two], "takes actions of 2 numbers", "gives 1")
 
 
+@pytest.mark.parametrize(
+    ("name", "words"),
+    [
+        ("TwoViews", "shows 2 cameras, the agent sees 1"),
+        ("SixChoices", "takes actions of 6 categories, the agent gives continuous actions"),
+    ],
+)
+@pytest.mark.parametrize("command", ["eval", "view"])
+def test_environments_that_show_or_take_something_else_are_refused(command, name, words, checkpoint, assert_refused):
+    flags = ["--port", "0"] if command == "view" else []
+    line = [command, "--checkpoint", checkpoint, "--device", "cpu", "--env-id", f"{MODULE}:odd/{name}-v0", *flags]
+    assert_refused(line, words, "give the environment that it learned in")
+
+
 def test_eval_plays_an_agent_in_another_environment(checkpoint, tmp_path):
     flags = ["--checkpoint", str(checkpoint), "--mode", "actor", "--episodes", "1", "--device", "cpu"]
     assert main(["eval", *flags, "--env-id", f"{MODULE}:Slider-v0", "--json", str(tmp_path / "result.json")]) == 0

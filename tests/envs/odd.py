@@ -6,7 +6,7 @@ import time
 
 import gymnasium
 import numpy as np
-from gymnasium.spaces import Box, Dict, Text
+from gymnasium.spaces import Box, Dict, Discrete, Text
 
 PICTURE = Box(0, 255, (16, 16, 3), np.uint8)
 STATE = Box(-np.inf, np.inf, (4,), np.float64)
@@ -228,6 +228,18 @@ TWO_ACTIONS = with_spaces(actions=Box(-1.0, 1.0, (2,), np.float32))
 TWO_PROBLEMS = with_spaces(STATE, Text(8))
 
 gymnasium.register("Slider-v0", Slider, max_episode_steps=20)
+SIX_CHOICES = with_spaces(actions=Discrete(6))
+
+
+class TwoViews(Slider):
+    observation_space = Dict({"left": PICTURE, "right": PICTURE})
+
+    def observe(self):
+        return {"left": super().observe(), "right": super().observe()}
+
+
+gymnasium.register("odd/SixChoices-v0", SIX_CHOICES, max_episode_steps=20)
+gymnasium.register("odd/TwoViews-v0", TwoViews, max_episode_steps=20)
 gymnasium.register("WithAlpha-v0", WithAlpha, max_episode_steps=20)
 gymnasium.register("odd/State-v0", State, max_episode_steps=20)
 gymnasium.register("odd/TwoActions-v0", TWO_ACTIONS, max_episode_steps=20)
