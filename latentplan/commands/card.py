@@ -154,7 +154,7 @@ def _measure(request: Request, folder: Path, info: dict[str, Any], chosen: EnvCo
     device, found = request.use_device(), []
     given = "".join(f", env.{name} {value}" for name, value in request.env.items())
     origin = f"for this card, seed {request.seed}, latentplan {__version__}{given}"
-    env = open_env(chosen, info["action_dim"])
+    env = open_env(chosen, info)
     try:
         length = getattr(env.unwrapped, "decisions_per_episode", None) or 0
         for mode in MODES:

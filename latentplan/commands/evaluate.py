@@ -161,7 +161,7 @@ def run(request: Request) -> int:
 
     goals = read_goals(request.objective, request.constraint, chosen.domain)
     world = chosen if goals is None else goal_env(chosen)
-    env = open_env(world, info["action_dim"])
+    env = open_env(world, info)
     try:
         if request.keep_episodes is not None:
             from latentplan.training.collection.keeping import KeepingEnv
@@ -183,23 +183,31 @@ def run(request: Request) -> int:
         env.close()
 
 
-def open_env(config: EnvConfig, action_dim: int) -> Any:
+def open_env(config: EnvConfig, info: dict[str, Any]) -> Any:
     """The environment to play in; one of the user's, whose code may fail, gives an error of one line.
 
+    Args:
+        config: Settings of the environment.
+        info: Content of the `info.json` of the agent that plays.
+
     Raises:
-        UserError: The environment cannot be made, or takes actions of another size than the agent's.
+        UserError: The environment cannot be made, or its actions or observations have another form than the agent's.
     """
+    from latentplan.agents.info import read_spaces
     from latentplan.envs import make_env
     from latentplan.envs.vector import make_guarded_env
+    from latentplan.evaluation.compatibility import refuse_other_spaces
 
+    try:
+        spaces = read_spaces(info)
+    except (TypeError, ValueError) as error:
+        raise UserError(f"the agent's info.json cannot be used: {error}") from None
     env = make_guarded_env(config) if is_by_id(config) else make_env(config)
-    size = (env.action_space.shape or (0,))[0]
-    if size != action_dim:
+    try:
+        refuse_other_spaces(env, f"{config.domain}-{config.task}", info["action_dim"], spaces)
+    except UserError:
         env.close()
-        raise UserError(
-            f"{config.domain}-{config.task} takes actions of {size} numbers, the agent gives {action_dim}: give "
-            "--env-id of the environment that it learned in"
-        )
+        raise
     return env
 
 

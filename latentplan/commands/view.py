@@ -90,12 +90,12 @@ def run(request: Request) -> int:
 
     with contextlib.ExitStack() as stack:
         listening = stack.enter_context(listen(request.host, request.port))
-        _serve(request, chosen, info["action_dim"], listening, stack)
+        _serve(request, chosen, info, listening, stack)
     return 0
 
 
 def _serve(
-    request: Request, chosen: EnvConfig, action_dim: int, listening: socket.socket, stack: contextlib.ExitStack
+    request: Request, chosen: EnvConfig, info: dict[str, Any], listening: socket.socket, stack: contextlib.ExitStack
 ) -> None:
     """Make agent, environment and server, and run them until an interrupt; the stack closes them."""
     import tempfile
@@ -115,7 +115,7 @@ def _serve(
     stack.callback(server.stop)
     device = request.use_device(threads=1)  # the other cores draw the page
     world = goal_env(chosen)
-    env = open_env(world, action_dim)
+    env = open_env(world, info)
     stack.callback(env.close)
     pictures = GoalPictures(Path(stack.enter_context(tempfile.TemporaryDirectory())), request.objective)
     settings = Settings(request.mode, request.objective, request.constraint, request.planner)

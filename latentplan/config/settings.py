@@ -46,7 +46,8 @@ class EnvConfig:
         action_repeat: Simulator control steps per decision.
         camera: Camera id of the MuJoCo model.
         cameras: Several cameras, whose pictures the agent sees together: ids of the MuJoCo model, or image keys of a
-            `Dict` observation of your own environment. Empty takes `camera`, or all images of the `Dict`.
+            `Dict` observation of your own environment. Empty takes `camera`, or all images of the `Dict` that `vectors`
+            does not name.
         frame_size: Side of the pictures in pixels: 64, 84, 96 or 128.
         vectors: What the agent sees beside the pictures: keys of vectors in a `Dict` observation of your own
             environment; in `dm_control` keys of the task's observation, or `proprioception` for all of them.
@@ -61,7 +62,8 @@ class EnvConfig:
         kwargs: Arguments of an environment of gymnasium's registry (suite `gymnasium`), as a JSON object; the argument
             `max_episode_steps` sets its time limit.
         pixels: Where the pictures of an environment outside of dm_control come from: `observation` takes its
-            observations, `render` takes what its `render()` draws, squeezed to a square; observations are then ignored.
+            observations, `render` takes what its `render()` draws, squeezed to a square; of the observations the agent
+            then sees what `vectors` names, and nothing else.
     """
 
     domain: str = "walker"

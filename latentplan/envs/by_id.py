@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import re
+import traceback
 import warnings
 from typing import Any
 
 import gymnasium
+from gymnasium.envs import registration
 from gymnasium.error import DependencyNotInstalled, UnregisteredEnv
 
 from latentplan.config import EnvConfig, UserError
@@ -17,6 +20,8 @@ from latentplan.config.suites import check_task
 from latentplan.envs.faults import describe_failure
 from latentplan.envs.rendered import MODE
 from latentplan.envs.user import PixelEnv, make_from
+
+RAISED_BY_ENV = " was raised from the environment creator"  # what gymnasium adds to a TypeError of an environment
 
 
 def make(config: EnvConfig, seed: int | None = None) -> PixelEnv:
@@ -47,10 +52,12 @@ def make_inner(config: EnvConfig) -> gymnasium.Env[Any, Any]:
         raise UserError(f"cannot make {name}: {' '.join(str(error).split())}") from None
     except ModuleNotFoundError as error:
         raise UserError(describe_missing(str(error.name), f"cannot make {name}: it")) from None
+    except TypeError as error:
+        own = error.__cause__ if RAISED_BY_ENV in str(error) and error.__cause__ is not None else error
+        if blame := _blame_arguments(own, config):
+            raise UserError(f"cannot make {name}{blame}") from None
+        raise describe_failure(own) from error
     except Exception as error:
-        if isinstance(error, TypeError) and "argument" in str(error):
-            reason = str(error).partition(" was raised from")[0]
-            raise UserError(f"cannot make {name} with --env-kwargs {config.kwargs}: {reason}; correct them") from None
         raise describe_failure(error) from error
     if config.pixels == "render":
         _draw_small(env, kwargs, config.frame_size)
@@ -75,6 +82,27 @@ def find_id(config: EnvConfig) -> str:
             f"module:{name} imports the module that registers another"
         ) from None
     return name
+
+
+def _blame_arguments(error: BaseException, config: EnvConfig) -> str:
+    """What is wrong with the arguments of an environment and its remedy; empty for an error of another kind."""
+    given, text = read_kwargs(config.kwargs), str(error)
+    found = re.search(r"unexpected keyword argument '(\w+)'", text)
+    unknown, is_by_call = found and found[1], _is_raised_by_call(error)
+    if unknown in given or (given and unknown is None and is_by_call):
+        return f" with --env-kwargs {config.kwargs}: {text}; correct them"
+    if config.pixels == "render" and (unknown == "render_mode" or (is_by_call and "takes no arguments" in text)):
+        return (
+            f" with --env.pixels render: {text}; give its __init__ an argument render_mode that sets "
+            "self.render_mode, and the class a render() that returns uint8 pictures (height, width, 3)"
+        )
+    return f": {text}; give it with --env-kwargs" if is_by_call and "missing" in text else ""
+
+
+def _is_raised_by_call(error: BaseException) -> bool:
+    """Whether the call of the environment's class raised an error, and not the code of the class."""
+    frames = traceback.extract_tb(error.__traceback__)
+    return frames[-1].filename == registration.__file__
 
 
 def _draw_small(env: gymnasium.Env[Any, Any], kwargs: dict[str, Any], size: int) -> None:

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import importlib
 import time
 import warnings
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any
 
 import gymnasium
@@ -12,10 +14,12 @@ import numpy as np
 
 from latentplan.config import CollectionConfig, EnvConfig, UserError
 from latentplan.config.checks import EnvironmentFault
-from latentplan.config.env_id import is_by_id
+from latentplan.config.env_id import imported_modules, is_by_id
 from latentplan.envs.by_id import make_inner
 from latentplan.envs.faults import FrameCheck
+from latentplan.envs.process import LocalLane, ProcessLane
 from latentplan.envs.rendered import time_pictures
+from latentplan.envs.spaces import is_picture
 from latentplan.envs.user import MAX_DECISIONS, describe_refusals, wrap_user_env
 from latentplan.envs.vector import make_guarded_env
 
@@ -59,8 +63,10 @@ def check_environment(
     """
     report = Report()
     try:
-        if is_by_id(config) and not _accepts_spaces(config, report):
-            return report
+        if is_by_id(config):
+            report = _look_at_spaces(config, step_timeout_s, isolate)
+            if report.problems:
+                return report
         env = make_guarded_env(config, isolate=isolate, step_timeout_s=step_timeout_s)
         try:
             report.facts |= describe_spaces(env, config)
@@ -91,7 +97,7 @@ def describe_spaces(env: Any, config: EnvConfig) -> dict[str, str]:
 
 def describe_space(space: gymnasium.Space[Any]) -> str:
     """A space on one line, such as `float32 (3,) in [-1, 1]`; a Dict or Tuple by its parts."""
-    if isinstance(space, gymnasium.spaces.Box):
+    if isinstance(space, gymnasium.spaces.Box) and 0 not in space.shape:
         low, high = float(space.low.min()), float(space.high.max())
         bounds = f" in [{low:g}, {high:g}]" if np.isfinite([low, high]).all() else ", unbounded"
         return f"{space.dtype} {space.shape}{bounds}"
@@ -100,20 +106,57 @@ def describe_space(space: gymnasium.Space[Any]) -> str:
     return str(space)
 
 
-def _accepts_spaces(config: EnvConfig, report: Report) -> bool:
-    """Whether training accepts the environment's own observations and actions, which are noted."""
-    inner = make_inner(config)
+def _look_at_spaces(config: EnvConfig, step_timeout_s: float, isolate: bool) -> Report:
+    """The environment's own observations and actions, and a problem for each reason why training refuses them."""
+    factory = partial(_make_trial, config, imported_modules(config))
+    lane = ProcessLane(factory, step_timeout_s) if isolate else LocalLane(factory)
     try:
-        report.facts["observations"] = describe_space(inner.observation_space)
-        report.facts["own actions"] = describe_space(inner.action_space)
-        if config.pixels == "render":
-            report.facts["observations"] = f"pictures of render(), in place of {report.facts['observations']}"
-            wrap_user_env(inner, config.action_repeat, config=config)
-        else:
-            report.problems += describe_refusals(inner, config)
+        lane.ask("describe")
+        return lane.answer()  # type: ignore[no-any-return]
     finally:
-        inner.close()
-    return not report.problems
+        lane.ask_to_close()
+        lane.close()
+
+
+def _make_trial(config: EnvConfig, modules: tuple[str, ...]) -> _Trial:
+    for module in modules:
+        importlib.import_module(module)
+    return _Trial(config)
+
+
+class _Trial(gymnasium.Env[Any, Any]):
+    """An environment that nothing is known of yet, so that its spaces are looked at where it is made."""
+
+    def __init__(self, config: EnvConfig) -> None:
+        self._config, self._inner = config, make_inner(config)
+
+    def describe(self) -> Report:
+        """The spaces of the environment, whatever they are."""
+        report, inner, config = Report(), self._inner, self._config
+        for fact, name in (("observations", "observation_space"), ("own actions", "action_space")):
+            space = getattr(inner, name, None)
+            report.facts[fact] = "none" if space is None else describe_space(space)
+        if config.pixels == "observation":
+            report.problems += describe_refusals(inner, config)
+            if _has_alpha(getattr(inner, "observation_space", None)):
+                report.facts["observations"] += "; the fourth channel of a picture is read as alpha"
+            return report
+        report.facts["observations"] = f"pictures of render(), in place of {report.facts['observations']}"
+        try:
+            wrap_user_env(inner, config.action_repeat, config=config)
+        except UserError as error:
+            report.problems.append(str(error))
+        return report
+
+    def close(self) -> None:
+        """Closes the environment."""
+        self._inner.close()
+
+
+def _has_alpha(space: gymnasium.Space[Any] | None) -> bool:
+    """Whether a picture of an observation space has four channels along its last axis."""
+    parts = space.spaces.values() if isinstance(space, gymnasium.spaces.Dict) else [space]
+    return any(part is not None and is_picture(part) and (part.shape or ())[2:] == (4,) for part in parts)
 
 
 def _check_seeding(env: Any, report: Report) -> None:

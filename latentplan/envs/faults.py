@@ -50,12 +50,12 @@ def check_picture(picture: Any, shape: tuple[int, ...]) -> np.ndarray:
 
 
 def check_unit_picture(picture: Any, shape: tuple[int, ...]) -> np.ndarray:
-    """An observation of floats in [0, 1] as an array of its own, uint8 of the shape that its space declares.
+    """An observation of numbers in [0, 1] as an array of its own, uint8 of the shape that its space declares.
 
     Raises:
         EnvironmentFault: The observation is none of this; the message says what it is.
     """
-    wanted = f"the environment must return frames of floats in [0, 1] {shape}"
+    wanted = f"the environment must return frames of whole numbers or floats in [0, 1] {shape}"
     try:
         given = np.asarray(picture, dtype=np.float32)
     except (TypeError, ValueError):
@@ -79,11 +79,12 @@ def check_vector(vector: Any, shape: tuple[int, ...]) -> np.ndarray:
         with np.errstate(over="ignore"):
             given = np.array(vector, dtype=np.float32)
     except (TypeError, ValueError):
-        raise EnvironmentFault(f"{wanted}, got {shown(vector)}") from None
+        raise EnvironmentFault(f"{wanted}, got {shown(vector)}: return an array of numbers") from None
     if given.shape != shape:
-        raise EnvironmentFault(f"{wanted}, got shape {given.shape}")
+        raise EnvironmentFault(f"{wanted}, got shape {given.shape}: declare in observation_space what it returns")
     if not np.isfinite(given).all():
-        raise EnvironmentFault(f"{wanted}, got {given.dtype} {_describe_range(given)}")
+        remedy = "return a finite number at every place"
+        raise EnvironmentFault(f"{wanted}, got {given.dtype} {_describe_range(given)}: {remedy}")
     return given
 
 
@@ -94,11 +95,12 @@ def take_keys(observation: Any, keys: Sequence[str]) -> list[Any]:
         EnvironmentFault: The observation is none, or lacks a key.
     """
     wanted = f"the environment must return observations that are dictionaries with {', '.join(map(repr, keys))}"
+    remedy = "return every key that observation_space declares"
     if not isinstance(observation, Mapping):
-        raise EnvironmentFault(f"{wanted}, got {type(observation).__name__}")
+        raise EnvironmentFault(f"{wanted}, got {type(observation).__name__}: {remedy}")
     for key in keys:
         if key not in observation:
-            raise EnvironmentFault(f"{wanted}, got {', '.join(map(repr, observation)) or 'no key'}")
+            raise EnvironmentFault(f"{wanted}, got {', '.join(map(repr, observation)) or 'no key'}: {remedy}")
     return [observation[key] for key in keys]
 
 
@@ -111,13 +113,33 @@ def check_reward(reward: Any) -> float:
     try:
         value = float(reward)
     except (TypeError, ValueError, OverflowError):
-        raise EnvironmentFault(f"the environment must return rewards that are numbers, got {shown(reward)}") from None
+        raise EnvironmentFault(
+            f"the environment must return rewards that are numbers, got {shown(reward)}: return one number, such as 0.5"
+        ) from None
     with np.errstate(over="ignore"):
         if not np.isfinite(np.float32(value)):
             raise EnvironmentFault(
                 f"the environment returned a reward that is not finite: {value}; return a finite number at every step"
             )
     return value
+
+
+def check_end(end: Any, name: str) -> bool:
+    """One of the two ends that a step returns.
+
+    Args:
+        end: What the environment returned.
+        name: `terminated` or `truncated`.
+
+    Raises:
+        EnvironmentFault: The value is not one truth.
+    """
+    try:
+        return bool(end)
+    except (TypeError, ValueError):
+        raise EnvironmentFault(
+            f"the environment must return {name} as True or False, got {shown(end)}: return bool({name})"
+        ) from None
 
 
 def check_reset(result: Any, shape: tuple[int, ...]) -> tuple[np.ndarray, dict[str, Any]]:
@@ -151,13 +173,13 @@ def check_step(result: Any, shape: tuple[int, ...]) -> tuple[np.ndarray, float, 
     """
     try:
         frame, reward, terminated, truncated, info = result
-        ends = bool(terminated), bool(truncated)
         info = {**info, "env_frames": int(info["env_frames"])}
     except (KeyError, TypeError, ValueError):
         raise EnvironmentFault(
             "the environment's step must return a frame, a reward, terminated, truncated and an info with a number "
             f"env_frames, got {shown(result)}"
         ) from None
+    ends = check_end(terminated, "terminated"), check_end(truncated, "truncated")
     return check_picture(frame, shape), check_reward(reward), *ends, info
 
 

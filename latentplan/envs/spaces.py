@@ -13,11 +13,13 @@ import numpy as np
 from gymnasium import spaces
 
 from latentplan.config import EnvConfig, UserError
-from latentplan.config.spaces import MOST_CATEGORIES, MOST_NUMBERS, Spaces
+from latentplan.config.spaces import MOST_CAMERAS, MOST_CATEGORIES, MOST_NUMBERS, Spaces
 from latentplan.envs.faults import check_picture, check_unit_picture, check_vector, take_keys
 
+LARGEST_RANGE = 1e6  # from the lowest to the highest value of an action; a longer one was not meant
 ONLY_PICTURE = "picture"  # name of the picture of an environment that shows one and no Dict
-CHANNELS = (1, 3, 4)  # gray, RGB, RGB with alpha
+CHANNELS = (1, 3, 4)  # gray, RGB, RGB with alpha, along the last axis of a picture
+FIRST_CHANNELS = (1, 3)  # along the first axis, where 4 pictures are a stack of gray ones and no alpha channel
 PICTURES = "a picture (height, width, 3), gray or with alpha, of uint8 or of floats in [0, 1]"
 
 
@@ -70,7 +72,8 @@ class Actions:
         space: The action space of an environment.
 
     Raises:
-        UserError: The space is another, or is not bounded; the message names the remedy.
+        UserError: The space is another, is not bounded, or has a range above `LARGEST_RANGE`; the message names the
+            remedy.
 
     Attributes:
         dim: Numbers of an action.
@@ -183,9 +186,10 @@ def accept_spaces(
 class Picture:
     """Pictures of one space as RGB bytes.
 
-    Accepted are (height, width, channel) and (channel, height, width) with 1, 3 or 4 channels, and (height, width): of
-    whole numbers within 0 to 255, or of floats whose space has the bounds 0 and 1. Gray becomes RGB, and a picture with
-    an alpha channel is laid over black.
+    Accepted are (height, width, channel) with 1, 3 or 4 channels, (channel, height, width) with 1 or 3, and
+    (height, width): of whole numbers within 0 to 255, or of floats whose space has the bounds 0 and 1. Whole numbers
+    whose space has the bounds 0 and 1 become 0 and 255. Gray becomes RGB, and a picture with an alpha channel is laid
+    over black.
 
     Args:
         space: Space of the pictures.
@@ -199,7 +203,7 @@ class Picture:
         if not is_picture(space):
             raise UserError(f"{name} must be {PICTURES}, got {_describe(space)}: {_find_remedy(space)}")
         shape: tuple[int, ...] = space.shape or ()
-        self._shape, self._is_unit = shape, np.issubdtype(space.dtype, np.floating)
+        self._shape, self._is_unit = shape, _has_unit_bounds(space)
         self._is_channel_first = len(shape) == 3 and shape[2] not in CHANNELS
 
     def read(self, value: Any) -> np.ndarray:
@@ -225,7 +229,8 @@ class Observations:
     Args:
         space: The observation space: pictures (see `Picture`), or a Dict that holds some.
         frame_size: Side of the frames.
-        cameras: Keys of the pictures that the agent sees, in this order; empty takes all pictures of a Dict.
+        cameras: Keys of the pictures that the agent sees, in this order; empty takes all pictures of a Dict that
+            `vectors` does not name, at most 16.
         vectors: Keys of the vectors that the agent sees beside them, in this order: Boxes of any shape.
 
     Raises:
@@ -239,19 +244,14 @@ class Observations:
         self, space: gymnasium.Space[Any], frame_size: int, cameras: Sequence[str] = (), vectors: Sequence[str] = ()
     ) -> None:
         self._frame_size, self._keys, self._vectors = frame_size, list(cameras), list(vectors)
-        self._vector_shapes = [_read_vector(space, key) for key in vectors]
+        self._vector_shapes = [find_vector(space, key).shape for key in vectors]
         if not isinstance(space, spaces.Dict):
             if cameras:
                 raise _refuse_key(space, "cameras", cameras[0])
             self._pictures = [Picture(space, "observation_space")]
         else:
-            images = [key for key, part in space.spaces.items() if is_picture(part)]
-            self._keys = self._keys or images
-            if not self._keys:
-                raise UserError(f"observation_space must hold {PICTURES}, got {_describe(space)}: add one to the Dict")
-            for key in self._keys:
-                if key not in space.spaces:
-                    raise _refuse_key(space, "cameras", key)
+            self._keys = self._keys or _find_pictures(space, vectors)
+            _check_cameras(space, self._keys, vectors)
             self._pictures = [Picture(space[key], f"observation_space[{key!r}]") for key in self._keys]
         vector_dim = sum(math.prod(shape) for shape in self._vector_shapes)
         if vector_dim > MOST_NUMBERS:
@@ -294,8 +294,38 @@ class Observations:
         return np.concatenate([resize(picture, self._frame_size) for picture in pictures], axis=2), pictures[0]
 
 
-def _read_vector(space: gymnasium.Space[Any], key: str) -> tuple[int, ...]:
-    """The shape of the vectors at a key of a Dict."""
+def _find_pictures(space: spaces.Dict, vectors: Sequence[str]) -> list[str]:
+    """The keys of the pictures of a Dict that are not taken as vectors."""
+    found = [key for key, part in space.spaces.items() if is_picture(part) and key not in vectors]
+    if not found:
+        beside = " beside those that env.vectors names" if vectors else ""
+        raise UserError(f"observation_space must hold {PICTURES}{beside}, got {_describe(space)}: add one to the Dict")
+    return found
+
+
+def _check_cameras(space: spaces.Dict, keys: Sequence[str], vectors: Sequence[str]) -> None:
+    for key in keys:
+        if key not in space.spaces:
+            raise _refuse_key(space, "cameras", key)
+        if key in vectors:
+            raise UserError(f"env.cameras and env.vectors both name {key!r}: name it in one of them")
+    if len(keys) > MOST_CAMERAS:
+        raise UserError(
+            f"observation_space holds {len(keys)} pictures, and at most {MOST_CAMERAS} are allowed: name at most "
+            f"{MOST_CAMERAS} with env.cameras"
+        )
+
+
+def find_vector(space: gymnasium.Space[Any], key: str) -> spaces.Box:
+    """The space of the vectors at a key of an observation space.
+
+    Args:
+        space: The observation space.
+        key: A key that `env.vectors` names.
+
+    Raises:
+        UserError: The space is no Dict, or holds no numbers at the key; the message names the remedy.
+    """
     if not isinstance(space, spaces.Dict) or key not in space.spaces:
         raise _refuse_key(space, "vectors", key)
     part = space[key]
@@ -304,7 +334,7 @@ def _read_vector(space: gymnasium.Space[Any], key: str) -> tuple[int, ...]:
             f"observation_space[{key!r}], which env.vectors names, must be a Box of numbers, got {_describe(part)}: "
             "convert it with gymnasium.wrappers.TransformObservation"
         )
-    return part.shape
+    return part
 
 
 def _refuse_key(space: gymnasium.Space[Any], setting: str, key: str) -> UserError:
@@ -320,13 +350,23 @@ def _refuse_key(space: gymnasium.Space[Any], setting: str, key: str) -> UserErro
 
 def is_picture(space: gymnasium.Space[Any]) -> bool:
     """Whether values of a space are pictures that `Picture` reads."""
-    if not isinstance(space, spaces.Box) or not 2 <= len(space.shape) <= 3 or 0 in space.shape:
+    if not isinstance(space, spaces.Box) or not _has_picture_shape(space.shape):
         return False
-    if len(space.shape) == 3 and space.shape[2] not in CHANNELS and space.shape[0] not in CHANNELS:
+    is_whole = np.issubdtype(space.dtype, np.integer)
+    return _has_unit_bounds(space) or bool(is_whole and (space.low >= 0).all() and (space.high <= 255).all())
+
+
+def _has_picture_shape(shape: tuple[int, ...]) -> bool:
+    if not 2 <= len(shape) <= 3 or 0 in shape:
         return False
-    if np.issubdtype(space.dtype, np.floating):
-        return bool((space.low == 0.0).all() and (space.high == 1.0).all())
-    return bool(np.issubdtype(space.dtype, np.integer) and (space.low >= 0).all() and (space.high <= 255).all())
+    return len(shape) == 2 or shape[2] in CHANNELS or shape[0] in FIRST_CHANNELS
+
+
+def _has_unit_bounds(space: gymnasium.Space[Any]) -> bool:
+    """Whether a space holds numbers, floats or whole ones, with the bounds 0 and 1."""
+    if not isinstance(space, spaces.Box) or not np.issubdtype(space.dtype, np.number):
+        return False
+    return bool((space.low == 0).all() and (space.high == 1).all())
 
 
 def _find_remedy(space: gymnasium.Space[Any]) -> str:
@@ -335,11 +375,23 @@ def _find_remedy(space: gymnasium.Space[Any]) -> str:
         return "return pictures, for instance by gymnasium.wrappers.AddRenderObservation(env)"
     if len(space.shape) < 2:
         return "return pictures, for instance by gymnasium.wrappers.AddRenderObservation(env), or a Dict with a picture"
-    if len(space.shape) == 2 or (len(space.shape) == 3 and {space.shape[0], space.shape[2]} & set(CHANNELS)):
-        if space.is_bounded():
-            return "scale them, for instance by gymnasium.wrappers.RescaleObservation(env, 0.0, 1.0)"
+    if not _has_picture_shape(space.shape):
+        if len(space.shape) == 3 and space.shape[0] == 4:
+            return (
+                "return the newest picture of a stack alone, without gymnasium.wrappers.FrameStackObservation, because "
+                "an agent remembers earlier pictures; the channels of RGBA are the last axis, (height, width, 4)"
+            )
+        return "change their shape by gymnasium.wrappers.ReshapeObservation(env, shape), or return several in a Dict"
+    if not space.is_bounded():
         return "declare their range, Box(0, 255, shape, numpy.uint8) or Box(0.0, 1.0, shape, numpy.float32)"
-    return "change their shape by gymnasium.wrappers.ReshapeObservation(env, shape), or return several in a Dict"
+    if np.issubdtype(space.dtype, np.floating):
+        return "scale them, for instance by gymnasium.wrappers.RescaleObservation(env, 0.0, 1.0)"
+    low, high = int(space.low.min()), int(space.high.max())
+    return (
+        "scale them, for instance by gymnasium.wrappers.TransformObservation(env, lambda picture: "
+        f"numpy.interp(picture, ({low}, {high}), (0, 255)).astype('uint8'), "
+        f"gymnasium.spaces.Box(0, 255, {space.shape}, 'uint8'))"
+    )
 
 
 def resize(picture: np.ndarray, size: int) -> np.ndarray:
@@ -394,6 +446,11 @@ def _read_box(space: spaces.Box, name: str) -> _Numbers:
             f"gymnasium.spaces.Box(-1.0, 1.0, {space.shape}))"
         )
     low, high = (np.ravel(bound).astype(np.float64) for bound in (space.low, space.high))
+    if (high - low).max(initial=0.0) > LARGEST_RANGE:
+        raise UserError(
+            f"{name} ranges from {low.min():g} to {high.max():g}, further than {LARGEST_RANGE:g}: declare the values "
+            "that move the body"
+        )
     return _Numbers(space, low, high, (0,) * len(low))
 
 

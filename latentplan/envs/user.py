@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import warnings
 from typing import TYPE_CHECKING, Any
 
 import gymnasium
@@ -10,15 +11,14 @@ import numpy as np
 from gymnasium.error import ResetNeeded
 
 from latentplan.config import EnvConfig, UserError
-from latentplan.envs.faults import check_reward
-from latentplan.envs.rendered import MODE, RenderedEnv
+from latentplan.envs.faults import check_end, check_reward
+from latentplan.envs.rendered import MODE, RenderedEnv, draw
 from latentplan.envs.spaces import Actions, Interface, Observations, accept_spaces, resize
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
 
-LARGEST_RANGE = 1e6  # from the lowest to the highest value of an action; a longer one was not meant
 MAX_DECISIONS = 1000  # decisions of an episode without a time limit, as in the longest episodes of dm_control
 
 
@@ -36,8 +36,7 @@ def make_from(
 
     def build(config: EnvConfig, seed: int | None = None) -> PixelEnv:
         env = factory()
-        if not isinstance(env, gymnasium.Env):
-            raise UserError(f"make_env must return a gymnasium.Env, got {type(env).__name__}")
+        _require_env(env, "make_env must return")
         return wrap_user_env(env, config.action_repeat, seed, config=config)
 
     return build
@@ -59,7 +58,7 @@ def wrap_user_env(
         config: Size of the frames, names of cameras and vectors, such as `agent.config.env`; None takes the defaults.
             Its `action_repeat` is not read.
             With `pixels` "render" the frames are what `env.render()` draws, which needs `env.render_mode` "rgb_array",
-            and the observations may be anything.
+            and the observations may be anything, or a Dict with the vectors that `vectors` names.
 
     Returns:
         An environment with these properties:
@@ -70,17 +69,25 @@ def wrap_user_env(
           clipped. The interval is mapped linearly to the bounds of a Box. A choice of n categories is one number: the
           interval has n equal parts, one for each category.
         - `info["vectors"]` holds the numbers that `config.vectors` names, float32 (vector,), if it names any.
-        - `info["env_frames"]` of a step is the number of steps of `env` that it took; `info` of `env` is kept.
+        - `info["env_frames"]` of a step is the number of steps of `env` that it took; `info` of `env` is kept but for
+          entries `labels` and `vectors`, which are names of the program.
         - An environment without a time limit is truncated after 1000 decisions.
         - `step` raises `ResetNeeded` after the end of an episode, and `ValueError` for an action of another shape or
           with numbers that are not finite.
 
     Raises:
-        UserError: `action_repeat` is below 1, or a space is not as described; the message names the space and the
-            reason and the remedy.
+        UserError: `env` is no `gymnasium.Env`, `action_repeat` is below 1, or a space is not as described; the message
+            names the space and the reason and the remedy.
     """
+    _require_env(env, "wrap_user_env takes")
     config = config or EnvConfig()
-    env = RenderedEnv(env, config.frame_size) if config.pixels == "render" else env
+    if config.pixels == "render":
+        if config.cameras:
+            raise UserError(
+                "env.cameras has no effect with env.pixels render, which shows the one picture that render() draws: "
+                "leave env.cameras out"
+            )
+        env = RenderedEnv(env, config.frame_size, config.vectors)
     refuse_spaces(env, config)
     return PixelEnv(env, action_repeat, seed, config)
 
@@ -135,7 +142,7 @@ class PixelEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         super().reset(seed=seed)
         picture, info = self._env.reset(seed=seed, options=options)
         self._needs_reset, self._decisions = False, 0
-        return self._to_frame(picture), {**info, **self._to_vectors(picture), "env_frames": 0}
+        return self._to_frame(picture), self._to_info(info, picture, 0)
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
         """Holds an action (action,) in [-1, 1] for `action_repeat` steps of the inner environment.
@@ -146,7 +153,8 @@ class PixelEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         Raises:
             ResetNeeded: The episode is over.
             ValueError: The action has another shape or is not finite.
-            EnvironmentFault: A frame or a reward of the inner environment is not as its spaces declare.
+            EnvironmentFault: A frame or a reward of the inner environment is not as its spaces declare, or an end is
+                not one truth.
         """
         if self._needs_reset:
             raise ResetNeeded("the episode is over; call reset() first")
@@ -155,12 +163,12 @@ class PixelEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         while env_frames < self.action_repeat and not (terminated or truncated):
             picture, reward, terminated, truncated, info = self._env.step(scaled)
             total += check_reward(reward)
+            terminated, truncated = check_end(terminated, "terminated"), check_end(truncated, "truncated")
             env_frames += 1
         self._decisions += 1
         truncated = truncated or (self.decisions_per_episode is None and self._decisions == MAX_DECISIONS)
-        self._needs_reset = bool(terminated or truncated)
-        info = {**info, **self._to_vectors(picture), "env_frames": env_frames}
-        return self._to_frame(picture), total, bool(terminated), bool(truncated), info
+        self._needs_reset = terminated or truncated
+        return self._to_frame(picture), total, terminated, truncated, self._to_info(info, picture, env_frames)
 
     def inner_action(self, action: np.ndarray) -> Any:
         """The value of the inner environment's action space for an agent's action (action,) in [-1, 1].
@@ -177,44 +185,60 @@ class PixelEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         return resize(self._picture, self.spaces.frame_size)
 
     def render_large(self, size: int) -> np.ndarray:
-        """The inner environment's rendering where it has one, else its last observation, uint8 (size, size, 3)."""
-        rendered = self._env.render() if self._env.render_mode == "rgb_array" else None
-        return resize(self._picture if rendered is None else np.asarray(rendered), size)
+        """The inner environment's rendering where it has one, else its last observation, uint8 (size, size, 3).
+
+        A rendering that fails or is no picture uint8 (height, width, 3) gives a warning, and the last observation.
+        """
+        if self._env.render_mode == MODE:
+            try:
+                return resize(draw(self._env), size)
+            except UserError as error:
+                warnings.warn(f"{error}; films show observations instead", RuntimeWarning, stacklevel=2)
+        return resize(self._picture, size)
 
     def close(self) -> None:
         """Closes the inner environment."""
         self._env.close()
 
-    def _to_vectors(self, observation: Any) -> dict[str, np.ndarray]:
-        """The entry of an info with the numbers beside the frame, if the agent sees any."""
-        return {"vectors": self._observations.read_vectors(observation)} if self.spaces.vector_dim else {}
+    def _to_info(self, info: dict[str, Any], observation: Any, env_frames: int) -> dict[str, Any]:
+        """The inner environment's info, without entries of its own that have names of the program."""
+        kept = {name: value for name, value in {**info}.items() if name not in ("labels", "vectors")}
+        vectors = {"vectors": self._observations.read_vectors(observation)} if self.spaces.vector_dim else {}
+        return {**kept, **vectors, "env_frames": env_frames}
 
     def _to_frame(self, observation: Any) -> np.ndarray:
         frame, self._picture = self._observations.read(observation)
         return frame
 
 
+def _require_env(env: Any, where: str) -> None:
+    if not isinstance(env, gymnasium.Env):
+        raise UserError(
+            f"{where} a gymnasium.Env, got {type(env).__name__}: give one environment whose class derives from "
+            "gymnasium.Env (the package shimmy converts environments of gym and dm_env)"
+        )
+
+
 def describe_refusals(env: gymnasium.Env[Any, Any], config: EnvConfig | None = None) -> list[str]:
-    """One line for each space of an environment that agents cannot learn with, with its remedy; empty without one.
+    """One line for each space that an environment lacks or agents cannot learn with, with its remedy; may be empty.
 
     Args:
         env: The environment.
         config: Size of the frames, names of cameras and vectors; None takes the defaults.
     """
-    config, space, problems = config or EnvConfig(), env.action_space, []
+    missing = [name for name in ("observation_space", "action_space") if getattr(env, name, None) is None]
+    if missing:
+        advice = "set it in __init__ or in the class, as gymnasium.Env describes"
+        return [f"the environment has no {name}: {advice}" for name in missing]
+    config, problems = config or EnvConfig(), []
     try:
         Observations(env.observation_space, config.frame_size, config.cameras, config.vectors)
     except UserError as error:
-        can_render = MODE in env.metadata.get("render_modes", ())
+        can_render = config.pixels != "render" and MODE in env.metadata.get("render_modes", ())
         shows = f"; --env.pixels render takes what its render() draws instead (render_mode '{MODE}')"
         problems.append(f"{error}{shows if can_render else ''}")
     try:
-        Actions(space)
-        if isinstance(space, gymnasium.spaces.Box) and np.ptp([space.low, space.high], axis=0).max() > LARGEST_RANGE:
-            raise UserError(
-                f"actions range from {space.low.min():g} to {space.high.max():g}, further than {LARGEST_RANGE:g}: "
-                "declare in action_space the values that move the body"
-            )
+        Actions(env.action_space)
     except UserError as error:
         problems.append(str(error))
     return problems

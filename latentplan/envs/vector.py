@@ -17,7 +17,7 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from latentplan.config import CollectionConfig, EnvConfig, derive_seed
 from latentplan.config.checks import EnvironmentFault
 from latentplan.config.env_id import imported_modules, is_by_id
-from latentplan.envs.process import CLOSING_SECONDS, Lane, LocalLane, ProcessLane
+from latentplan.envs.process import CLOSING_SECONDS, Lane, LocalLane, ProcessLane, read_facts
 from latentplan.envs.registry import make_env
 from latentplan.envs.user import make_from
 
@@ -84,6 +84,11 @@ def make_guarded_env(
     """
     factory = EnvMaker(config, 0, make_env)
     return GuardedEnv(ProcessLane(factory, step_timeout_s) if isolate else LocalLane(factory), restarts)
+
+
+def read_own_facts(env: gymnasium.Env[Any, Any]) -> dict[str, Any]:
+    """The attributes of an environment, whether it is guarded or not; see `Lane.facts`."""
+    return env.facts if isinstance(env, GuardedEnv) else read_facts(env)
 
 
 class Restarts:

@@ -83,6 +83,12 @@ def check_env_settings(env: EnvConfig) -> None:
     if is_by_id(env) and env.domain != USER_DOMAIN:
         if env.objective is not None:
             raise UserError(f"env.objective needs a domain with named quantities; {env.task} returns its own reward")
+        for name in ("camera", "render_quality", "floor"):
+            if getattr(env, name) != getattr(EnvConfig, name):
+                raise UserError(
+                    f"--env.{name} has no effect in {env.task or env.domain}, which draws its own pictures: leave it "
+                    "out, and give the environment's own arguments with --env-kwargs"
+                )
         from latentplan.envs.by_id import find_id
 
         find_id(env)

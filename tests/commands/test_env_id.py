@@ -91,6 +91,20 @@ def test_eval_refuses_environments_with_other_actions(checkpoint, assert_refused
     assert_refused(["eval", "--checkpoint", checkpoint, "--env-id", two], "takes actions of 2 numbers", "gives 1")
 
 
+@pytest.mark.parametrize(
+    ("name", "words"),
+    [
+        ("TwoViews", "shows 2 cameras, the agent sees 1"),
+        ("SixChoices", "takes actions of 6 categories, the agent gives continuous actions"),
+    ],
+)
+@pytest.mark.parametrize("command", ["eval", "view"])
+def test_environments_that_show_or_take_something_else_are_refused(command, name, words, checkpoint, assert_refused):
+    flags = ["--port", "0"] if command == "view" else []
+    line = [command, "--checkpoint", checkpoint, "--device", "cpu", "--env-id", f"{MODULE}:odd/{name}-v0", *flags]
+    assert_refused(line, words, "give the environment that it learned in")
+
+
 def test_eval_plays_an_agent_in_another_environment(checkpoint, tmp_path):
     flags = ["--checkpoint", str(checkpoint), "--mode", "actor", "--episodes", "1", "--device", "cpu"]
     assert main(["eval", *flags, "--env-id", f"{MODULE}:Slider-v0", "--json", str(tmp_path / "result.json")]) == 0
@@ -113,6 +127,9 @@ def test_id_names_suite_domain_and_task():
         ("--env-id Reacher-v5 --env-kwargs {", "kwargs must be a JSON object such as"),
         ("--env-id Reacher-v5 --env.pixels video", "--env.pixels must be one of observation, render"),
         ("--env-id Reacher-v5 --env.objective speed", "Reacher-v5 returns its own reward"),
+        ("--env-id Reacher-v5 --env.camera 1", "--env.camera has no effect in Reacher-v5"),
+        ("--env-id Reacher-v5 --env.render_quality exact", "--env.render_quality has no effect in Reacher-v5"),
+        ("--env-id Reacher-v5 --env.floor endless", "own arguments with --env-kwargs"),
         ("--env-id Reachr-v5", "unknown environment 'Reachr-v5'; did you mean 'Reacher-v5'"),
         ("--env-id no_robot:Reach-v0", "there is no module no_robot to import"),
         ("--env-id a:b:c", "--env-id must be an id"),

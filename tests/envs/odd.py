@@ -6,7 +6,7 @@ import time
 
 import gymnasium
 import numpy as np
-from gymnasium.spaces import Box, Dict, Text
+from gymnasium.spaces import Box, Dict, Discrete, Text
 
 PICTURE = Box(0, 255, (16, 16, 3), np.uint8)
 STATE = Box(-np.inf, np.inf, (4,), np.float64)
@@ -70,6 +70,13 @@ def with_step(change):
     return Odd
 
 
+class WithAlpha(Slider):
+    observation_space = Box(0, 255, (16, 16, 4), np.uint8)
+
+    def observe(self):
+        return np.concatenate([super().observe(), np.full((16, 16, 1), 255, np.uint8)], axis=2)
+
+
 class NoSeed(Slider):
     def reset(self):
         return super().reset()
@@ -93,6 +100,30 @@ class FailingStart(Slider):
 class MissingLibrary(Slider):
     def __init__(self):
         import a_library_that_nobody_has  # noqa: F401
+
+
+class NeedsSize(Slider):
+    def __init__(self, size):
+        self.size = size
+
+
+class WrongStart(Slider):
+    def __init__(self, size=3):
+        int([size])
+
+
+class NoSpace(gymnasium.Env):
+    observation_space = PICTURE
+
+
+class ExitAtStart(Slider):
+    def __init__(self):
+        os._exit(7)
+
+
+class HangAtStart(Slider):
+    def __init__(self):
+        time.sleep(3600)
 
 
 class NoPicture(State):
@@ -164,6 +195,18 @@ REFUSED = {
     "FailingStart": (FailingStart, {}, ["raised RuntimeError: the motor does not answer"]),
     "MissingLibrary": (MissingLibrary, {}, ["run: pip install a_library_that_nobody_has"]),
     "WrongArguments": (State, {"kwargs": '{"colour": 3}'}, ["--env-kwargs", "'colour'", "correct them"]),
+    "MissingArgument": (NeedsSize, {}, ["missing 1 required positional argument: 'size'", "give it with --env-kwargs"]),
+    "OtherArgument": (NeedsSize, {"kwargs": '{"colour": 3}'}, ["with --env-kwargs", "'colour'", "correct them"]),
+    "WrongStart": (WrongStart, {}, ["raised TypeError: int() argument must be"]),
+    "WrongStartWithArguments": (WrongStart, {"kwargs": '{"size": 4}'}, ["raised TypeError: int() argument must be"]),
+    "NoRender": (Slider, {"pixels": "render"}, ["with --env.pixels render", "__init__ an argument render_mode"]),
+    "NoRenderArgument": (
+        NeedsSize,
+        {"pixels": "render", "kwargs": '{"size": 3}'},
+        ["with --env.pixels render", "__init__ an argument render_mode"],
+    ),
+    "NoSpace": (NoSpace, {}, ["the environment has no action_space", "set it in __init__"]),
+    "NoNumbers": (with_spaces(actions=Box(-1.0, 1.0, (0,), np.float32)), {}, ["leaves a choice"]),
     "NoRenderMode": (Slider, {"pixels": "render", "kwargs": '{"render_mode": null}'}, ["render_mode"]),
     "NoPicture": (NoPicture, {"pixels": "render"}, ["render() must return pictures uint8", "NoneType"]),
     "FloatPicture": (FloatPicture, {"pixels": "render"}, ["render() must return pictures uint8", "float64"]),
@@ -176,6 +219,8 @@ NOTED = {
 CRASHING = {
     "Exit": (with_step(lambda result: os._exit(7)), ["ended unexpectedly (exit code 7)", "look for os._exit"]),
     "SysExit": (with_step(lambda result: sys.exit(3)), ["raised SystemExit"]),
+    "ExitAtStart": (ExitAtStart, ["ended unexpectedly (exit code 7)", "look for os._exit"]),
+    "HangAtStart": (HangAtStart, ["has not answered for"]),
     "Hang": (with_step(lambda result: time.sleep(3600)), ["has not answered for 1 s", "--collection.step_timeout_s"]),
 }
 
@@ -183,6 +228,19 @@ TWO_ACTIONS = with_spaces(actions=Box(-1.0, 1.0, (2,), np.float32))
 TWO_PROBLEMS = with_spaces(STATE, Text(8))
 
 gymnasium.register("Slider-v0", Slider, max_episode_steps=20)
+SIX_CHOICES = with_spaces(actions=Discrete(6))
+
+
+class TwoViews(Slider):
+    observation_space = Dict({"left": PICTURE, "right": PICTURE})
+
+    def observe(self):
+        return {"left": super().observe(), "right": super().observe()}
+
+
+gymnasium.register("odd/SixChoices-v0", SIX_CHOICES, max_episode_steps=20)
+gymnasium.register("odd/TwoViews-v0", TwoViews, max_episode_steps=20)
+gymnasium.register("WithAlpha-v0", WithAlpha, max_episode_steps=20)
 gymnasium.register("odd/State-v0", State, max_episode_steps=20)
 gymnasium.register("odd/TwoActions-v0", TWO_ACTIONS, max_episode_steps=20)
 gymnasium.register("odd/TwoProblems-v0", TWO_PROBLEMS, max_episode_steps=20)

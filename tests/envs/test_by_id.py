@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from gymnasium.spaces import Dict, Discrete
 
 from latentplan.config import CollectionConfig, Config, EnvConfig, ModelConfig, RunConfig, UserError
 from latentplan.config.env_id import (
@@ -17,7 +18,7 @@ from latentplan.config.env_id import (
     repeat_flag,
     split_id,
 )
-from latentplan.envs import make_env, wrap_user_env
+from latentplan.envs import make_env, process, wrap_user_env
 from latentplan.envs.by_id import find_id
 from latentplan.envs.conformance import check_environment
 from latentplan.envs.vector import make_vector_env
@@ -44,6 +45,12 @@ def test_check_environment_refuses_odd_environments_in_one_line_with_a_remedy(na
     as_one_line(report.problems[0], words)
 
 
+@pytest.mark.parametrize("name", ["WrongStart", "WrongStartWithArguments"])
+def test_check_environment_shows_where_the_start_of_an_environment_fails(name):
+    report = check_environment(config_of(f"odd/{name}", **odd.REFUSED[name][1]), decisions=1, isolate=False)
+    assert "int([size])" in report.origin and "env-kwargs" not in report.problems[0]
+
+
 @pytest.mark.parametrize("name", odd.REFUSED)
 def test_train_refuses_odd_environments_before_it_learns(name, tmp_path):
     _, settings, words = odd.REFUSED[name]
@@ -62,7 +69,9 @@ def test_train_refuses_odd_environments_before_it_learns(name, tmp_path):
 
 
 @pytest.mark.parametrize("name", odd.CRASHING)
-def test_check_environment_survives_crashes_and_hangs(name):
+def test_check_environment_survives_crashes_and_hangs(name, monkeypatch):
+    if name == "HangAtStart":
+        monkeypatch.setattr(process, "START_SECONDS", 2.0)
     report = check_environment(config_of(f"odd/{name}"), decisions=5, step_timeout_s=1.0)
     assert len(report.problems) == 1
     as_one_line(report.problems[0], odd.CRASHING[name][1])
@@ -80,6 +89,13 @@ def test_check_environment_finds_nothing_to_note_in_a_good_environment():
     assert report.facts["own actions"] == "float32 (1,) in [-1, 1]" and report.facts["starts"] == "differ by seed"
     assert report.facts["episode"] == "at most 10 decisions of 2 steps"
     assert len(report.pictures) == 8 and report.pictures[0].shape == (64, 64, 3)
+
+
+def test_check_environment_says_that_a_fourth_channel_is_alpha():
+    for name, is_named in (("WithAlpha", True), ("Slider", False)):
+        report = check_environment(config_of(name), decisions=2, isolate=False)
+        assert report.problems == []
+        assert ("the fourth channel of a picture is read as alpha" in report.facts["observations"]) == is_named
 
 
 def test_refusal_names_both_spaces():
@@ -109,6 +125,43 @@ def test_rendered_pictures_are_squeezed_whole_and_drawn_once_per_decision():
     assert inner.num_drawn == 21
     assert right[:, -1].min() > 200 and right[:, :32].max() == 0  # nothing is cut off at the side
     assert env.render_large(128).shape == (128, 128, 3)
+
+
+class Sensed(odd.State):
+    """Shows vectors, and a picture that nobody sees where pictures are drawn."""
+
+    observation_space = Dict({"place": odd.STATE, "view": odd.PICTURE, "gear": Discrete(2)})
+
+    def observe(self):
+        return {"place": super().observe(), "view": self.draw(16, 16), "gear": 1}
+
+
+def test_rendered_pictures_may_have_vectors_beside_them():
+    inner = Sensed(render_mode="rgb_array")
+    config = EnvConfig(pixels="render", vectors=("place",))
+    env = wrap_user_env(inner, config=config)
+    assert (env.spaces.cameras, env.spaces.vector_dim) == (1, 4)
+    frame, info = env.reset(seed=0)
+    alone = wrap_user_env(Sensed(render_mode="rgb_array"), config=EnvConfig(pixels="render")).reset(seed=0)[0]
+    assert np.array_equal(frame, alone)
+    assert info["vectors"].tolist() == [np.float32(inner.place)] * 4
+    *_, info = env.step(np.ones(1))
+    assert info["vectors"].tolist() == [np.float32(inner.place)] * 4
+
+
+@pytest.mark.parametrize(
+    ("kind", "settings", "message"),
+    [
+        (odd.State, {"vectors": ("place",)}, "'place', but observation_space is Box.*or leave env.vectors empty"),
+        (Sensed, {"vectors": ("joints",)}, "'joints', which observation_space lacks; it has gear, place"),
+        (Sensed, {"vectors": ("gear",)}, r"observation_space\['gear'\].* must be a Box of numbers"),
+        (Sensed, {"cameras": ("view",)}, "env.cameras has no effect with env.pixels render.*leave env.cameras out"),
+    ],
+)
+def test_settings_that_do_not_fit_rendered_pictures_are_refused_without_naming_render_again(kind, settings, message):
+    with pytest.raises(UserError, match=message) as refusal:
+        wrap_user_env(kind(render_mode="rgb_array"), config=EnvConfig(pixels="render", **settings))
+    assert "--env.pixels render takes" not in str(refusal.value)
 
 
 def test_vector_environments_import_the_module_in_their_processes():

@@ -188,7 +188,7 @@ def test_check_reward_returns_a_number(reward):
 
 @pytest.mark.parametrize("reward", [None, "much", np.nan, -np.inf, 1e39, 10**400, [1.0], np.ones(2)])
 def test_check_reward_refuses_what_replay_cannot_hold(reward):
-    with pytest.raises(EnvironmentFault, match="reward"):
+    with pytest.raises(EnvironmentFault, match="reward.*return (a finite|one) number"):
         check_reward(reward)
 
 

@@ -48,6 +48,7 @@ def bytes_box(*shape):
         (Box(0.0, 1.0, (20, 30, 3), np.float32), RGB / np.float32(255), RGB),
         (Box(0.0, 1.0, (3, 20, 30), np.float64), RGB.transpose(2, 0, 1) / 255.0, RGB),
         (Box(0, 255, (20, 30, 3), np.int64), RGB.astype(np.int64), RGB),
+        (Box(0, 1, (20, 30), np.uint8), GRAY // 128, np.stack([GRAY // 128 * 255] * 3, 2)),
     ],
 )
 def test_pictures_of_any_layout_become_rgb(space, value, expected):
@@ -64,7 +65,8 @@ def test_pictures_of_any_layout_become_rgb(space, value, expected):
         (Box(-1.0, 1.0, (64, 64, 3), np.float32), "RescaleObservation"),
         (Box(0.0, 255.0, (64, 64, 3), np.float32), "RescaleObservation"),
         (Box(-np.inf, np.inf, (64, 64, 3), np.float32), "declare their range"),
-        (Box(0, 1000, (64, 64, 3), np.int32), "RescaleObservation"),
+        (Box(0, 1000, (64, 64, 3), np.int32), "TransformObservation"),
+        (bytes_box(4, 64, 64), "without gymnasium.wrappers.FrameStackObservation.*RGBA"),
         (bytes_box(64, 64, 2), "ReshapeObservation"),
         (bytes_box(4, 64, 64, 3), "ReshapeObservation"),
         (Dict({"joints": Box(-1.0, 1.0, (4,))}), "add one to the Dict"),
@@ -81,6 +83,28 @@ def test_the_remedy_for_other_ranges_works():
         Still(Box(-1.0, 1.0, (8, 8, 3), np.float32), np.zeros((8, 8, 3), np.float32)), np.float32(0.0), np.float32(1.0)
     )
     assert wrap_user_env(env).reset()[0].max() in (127, 128)
+
+
+@pytest.mark.parametrize(
+    ("low", "high", "dtype"), [(0, 1000, np.uint16), (-128, 127, np.int8), (-5, 5, np.int32), (0, 1, bool)]
+)
+def test_remedy_for_other_whole_numbers_keeps_the_whole_range(low, high, dtype):
+    picture = np.linspace(low, high, 64).reshape(8, 8).round().astype(dtype)
+    still = Still(Box(low, high, (8, 8), dtype), picture)
+    with pytest.raises(UserError) as refusal:
+        wrap_user_env(still)
+    remedy = str(refusal.value).split("for instance by ")[1]
+    env = eval(remedy, {"gymnasium": gymnasium, "numpy": np, "env": still})
+    frame = env.reset()[0]
+    expected = (picture.astype(float) - low) * 255.0 / (high - low)
+    assert frame.dtype == np.uint8 and np.abs(frame - expected).max() <= 1.0
+    assert wrap_user_env(env).reset()[0].max() == 255
+
+
+def test_frame_stack_of_gray_pictures_is_refused():
+    stack = gymnasium.wrappers.FrameStackObservation(Still(bytes_box(20, 30), GRAY), 4)
+    with pytest.raises(UserError, match="FrameStackObservation"):
+        wrap_user_env(stack)
 
 
 @pytest.mark.parametrize("value", [1.5, -0.1, float("nan")])
@@ -129,6 +153,13 @@ def test_cameras_that_do_not_exist_are_refused():
         accept_spaces(bytes_box(8, 8, 3), ACTIONS, EnvConfig(cameras=("left",)))
     with pytest.raises(ValueError, match="different ones"):
         EnvConfig(cameras=("left", "left"))
+
+
+def test_more_pictures_than_an_agent_can_see_are_refused_until_some_are_named():
+    many = Dict({f"view{number:02d}": bytes_box(8, 8, 3) for number in range(17)})
+    with pytest.raises(UserError, match="holds 17 pictures, and at most 16 are allowed: name .* env.cameras"):
+        accept_spaces(many, ACTIONS)
+    assert accept_spaces(many, ACTIONS, EnvConfig(cameras=tuple(many)[:16])).spaces.cameras == 16
 
 
 @pytest.mark.parametrize(("views", "message"), [({"left": RGB}, "got 'left'"), (RGB, "got ndarray")])

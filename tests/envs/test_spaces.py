@@ -95,12 +95,18 @@ def test_a_choice_of_one_category_needs_no_number():
         (Box(-1.0, 1.0, (0,), np.float32), "leaves a choice"),
         (Box(-1.0, 1.0, (9000,), np.float32), "1 to 4096 numbers"),
         (Box(0, 1, (2,), bool), "MultiBinary"),
+        (Box(-1e30, 1e30, (2,), np.float32), r"ranges from -1e\+30 to 1e\+30, further than 1e\+06: declare"),
+        (Dict({"arm": Box(-1e30, 1e30, (1,))}), r"action_space\['arm'\] ranges from"),
+        (Tuple((ARM, Box(-1e30, 1e30, (1,)))), r"action_space\[1\] ranges from"),
+        (Box(-(2**63), 2**63 - 1, (2,), np.int64), "action_space ranges from"),
+        (Box(-(2**31), 2**31 - 1, (2,), np.int32), "action_space ranges from"),
     ],
 )
 def test_other_action_spaces_are_refused_with_the_remedy(space, message):
-    with pytest.raises(UserError, match=message) as refusal:
-        wrap_user_env(Recorder(space))
-    assert "\n" not in str(refusal.value)
+    for check in (lambda: wrap_user_env(Recorder(space)), lambda: accept_spaces(IMAGE, space)):
+        with pytest.raises(UserError, match=message) as refusal:
+            check()
+        assert "\n" not in str(refusal.value)
 
 
 def test_the_remedy_for_an_unbounded_box_works():

@@ -1,13 +1,15 @@
 """A user's environment gets frames of 64 x 64 and actions in [-1, 1], or is refused with a reason."""
 
+from types import SimpleNamespace
+
 import gymnasium
 import numpy as np
 import pytest
 from gymnasium.spaces import Box
 from gymnasium.wrappers import TimeLimit
 
-from latentplan.config import USER_DOMAIN, EnvConfig, UserError
-from latentplan.envs import make_env, make_from, user, wrap_user_env
+from latentplan.config import USER_DOMAIN, EnvConfig, EnvironmentFault, UserError
+from latentplan.envs import make_env, make_from, make_vector_env, user, wrap_user_env
 
 IMAGE = Box(0, 255, (48, 96, 3), np.uint8)
 ACTIONS = Box(np.array([0.0, -4.0], np.float32), np.array([2.0, 4.0], np.float32))
@@ -116,6 +118,99 @@ def test_step_refuses_actions_of_another_shape_or_not_finite(action):
     env.reset()
     with pytest.raises(ValueError, match="finite numbers"):
         env.step(action)
+
+
+class Shown(Clock):
+    """Renders what it is given, or raises it; its observations have the brightness of the steps."""
+
+    metadata, render_mode = {"render_modes": ["rgb_array"]}, "rgb_array"
+
+    def __init__(self, rendered):
+        super().__init__()
+        self.rendered = rendered
+
+    def render(self):
+        if isinstance(self.rendered, Exception):
+            raise self.rendered
+        return self.rendered
+
+
+def test_render_large_draws_by_the_users_render():
+    env = wrap_user_env(Shown(np.full((20, 20, 3), 9, np.uint8)))
+    env.reset()
+    assert (env.render_large(96) == 9).all() and env.render_large(96).shape == (96, 96, 3)
+
+
+@pytest.mark.parametrize(
+    "rendered",
+    [np.zeros((20, 20), np.uint8), np.full((20, 20, 3), 0.5), None, [[1], [1, 2]], RuntimeError("no display")],
+    ids=["gray", "floats", "nothing", "ragged", "error"],
+)
+def test_render_large_warns_and_shows_the_observation_in_place_of_anything_but_a_picture(rendered):
+    env = wrap_user_env(Shown(rendered))
+    env.reset()
+    env.step(np.zeros(2))
+    with pytest.warns(RuntimeWarning, match="films show observations instead"):
+        large = env.render_large(96)
+    assert large.shape == (96, 96, 3) and large.dtype == np.uint8 and (large == 1).all()
+
+
+class Talking(Clock):
+    """Has entries of its own in its info."""
+
+    def reset(self, *, seed=None, options=None):
+        return super().reset(seed=seed)[0], self.own_info()
+
+    def step(self, action):
+        return *super().step(action)[:4], self.own_info()
+
+    def own_info(self):
+        return {"vectors": "abc", "labels": [1.0, 2.0], "env_frames": "many", "start": 3}
+
+
+def test_infos_entries_of_the_program_are_never_the_users():
+    env = wrap_user_env(Talking(), action_repeat=2)
+    assert env.reset()[1] == {"start": 3, "env_frames": 0}
+    assert env.step(np.zeros(2))[4] == {"start": 3, "env_frames": 2}
+    envs = make_vector_env(EnvConfig(), 1, 0, Talking)
+    assert "labels" not in envs.reset()[1]
+    assert "labels" not in envs.step(np.zeros((1, 2)))[4]
+
+
+class Ending(Clock):
+    def __init__(self, terminated=False, truncated=False):
+        super().__init__()
+        self.ends = terminated, truncated
+
+    def step(self, action):
+        picture, reward, *_, info = super().step(action)
+        return picture, reward, *self.ends, info
+
+
+@pytest.mark.parametrize("name", ["terminated", "truncated"])
+def test_ends_that_are_no_single_truth_are_a_fault_with_a_remedy(name):
+    env = wrap_user_env(Ending(**{name: np.zeros(2, bool)}))
+    env.reset()
+    with pytest.raises(EnvironmentFault, match=f"return {name} as True or False, got .*: return bool"):
+        env.step(np.zeros(2))
+    env = wrap_user_env(Ending(**{name: np.array([True])}))
+    env.reset()
+    assert env.step(np.zeros(2))[2:4] == (name == "terminated", name == "truncated")
+
+
+@pytest.mark.parametrize("pixels", ["observation", "render"])
+@pytest.mark.parametrize("env", [None, SimpleNamespace(observation_space=IMAGE, action_space=ACTIONS)])
+def test_wrap_user_env_refuses_what_is_no_environment_of_gymnasium(env, pixels):
+    with pytest.raises(UserError, match="wrap_user_env takes a gymnasium.Env, got .*: .*shimmy"):
+        wrap_user_env(env, config=EnvConfig(pixels=pixels))
+
+
+@pytest.mark.parametrize("name", ["observation_space", "action_space"])
+def test_wrap_user_env_refuses_an_environment_without_a_space(name):
+    clock = Clock()
+    delattr(clock, name)
+    with pytest.raises(UserError, match=f"the environment has no {name}: set it in __init__"):
+        wrap_user_env(TimeLimit(clock, 5))
 
 
 def test_wrap_user_env_refuses_an_action_repeat_below_1():

@@ -38,6 +38,16 @@ def test_vectors_that_are_not_named_are_not_seen():
     assert env.spaces.vector_dim == 0 and "vectors" not in env.reset()[1]
 
 
+def test_vector_that_looks_like_a_picture_is_no_camera():
+    space = Dict({"camera": bytes_box(20, 30, 3), "grid": Box(0.0, 1.0, (3, 3), np.float32)})
+    accepted = accept_spaces(space, ACTIONS, EnvConfig(vectors=("grid",)))
+    assert (accepted.spaces.cameras, accepted.spaces.vector_dim) == (1, 9)
+    with pytest.raises(UserError, match="env.cameras and env.vectors both name 'grid'"):
+        accept_spaces(space, ACTIONS, EnvConfig(cameras=("camera", "grid"), vectors=("grid",)))
+    with pytest.raises(UserError, match="must hold a picture .*beside those that env.vectors names"):
+        accept_spaces(space, ACTIONS, EnvConfig(vectors=("grid", "camera")))
+
+
 @pytest.mark.parametrize(
     ("config", "message"),
     [
@@ -52,10 +62,22 @@ def test_other_keys_are_refused_with_the_remedy(config, message):
         accept_spaces(SPACE["camera"], ACTIONS, config)
 
 
-@pytest.mark.parametrize("joints", [np.full((2, 2), np.nan), np.zeros(4), "text"])
-def test_vectors_that_are_not_as_declared_are_a_fault(joints):
-    with pytest.raises(EnvironmentFault, match="vectors of finite numbers"):
+@pytest.mark.parametrize(
+    ("joints", "remedy"),
+    [
+        (np.full((2, 2), np.nan), "return a finite number at every place"),
+        (np.zeros(4), "declare in observation_space what it returns"),
+        ("text", "return an array of numbers"),
+    ],
+)
+def test_vectors_that_are_not_as_declared_are_a_fault(joints, remedy):
+    with pytest.raises(EnvironmentFault, match=f"vectors of finite numbers.*: {remedy}"):
         wrap_user_env(Still(SPACE, VALUES | {"joints": joints}), config=BOTH).reset()
+
+
+def test_observations_without_a_declared_key_are_a_fault_with_a_remedy():
+    with pytest.raises(EnvironmentFault, match="got 'camera': return every key that observation_space declares"):
+        wrap_user_env(Still(SPACE, {"camera": RGB}), config=BOTH).reset()
 
 
 def test_vector_environment_reports_vectors_behind_the_labels():

@@ -10,9 +10,8 @@ import numpy as np
 
 from latentplan.config import EnvConfig, UserError, make_folder
 from latentplan.config.extras import require_extra
-from latentplan.envs.process import read_facts
 from latentplan.envs.spaces import Actions, Interface
-from latentplan.envs.vector import GuardedEnv
+from latentplan.envs.vector import read_own_facts
 from latentplan.training.demonstrations.episode_file import write_episode
 from latentplan.training.demonstrations.fitting import read_interface
 from latentplan.training.demonstrations.kinds import SUFFIX, list_episode_files
@@ -114,7 +113,7 @@ class KeepingEnv(gymnasium.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarra
     def __init__(self, env: gymnasium.Env[np.ndarray, np.ndarray], folder: Path | str, config: EnvConfig) -> None:
         super().__init__(env)
         refuse_used_folder(Path(folder))
-        facts = env.facts if isinstance(env, GuardedEnv) else read_facts(env)
+        facts = read_own_facts(env)
         self._keeper = EpisodeKeeper(Path(folder), config, read_interface(facts), tuple(facts["labels"] or ()), 1)
         self._number = 0
 

@@ -116,8 +116,9 @@ class FittedRecording:
 
     def _match_pictures(self) -> list[str]:
         """The pictures of the recording that stand for those of the environment, in its order."""
-        has = [name for name, part in self.recording.space.spaces.items() if is_picture(part)]
-        wanted = self.target.interface.pictures
+        wanted, vectors = self.target.interface.pictures, dict(self.target.interface.vectors)
+        parts = self.recording.space.spaces.items()
+        has = [name for name, part in parts if is_picture(part) and name not in vectors]
         if set(wanted) <= set(has):
             return list(wanted)
         if len(has) == len(wanted) == 1 and (not self.recording.is_own or ONLY_PICTURE in (*has, *wanted)):
@@ -129,9 +130,9 @@ class FittedRecording:
 
     def _match_vectors(self) -> list[str]:
         """The vectors of the recording that stand for those of the environment, in its order."""
-        spaces = self.recording.space.spaces
-        has = {name: int(np.prod(part.shape or ())) for name, part in spaces.items() if not is_picture(part)}
         wanted = dict(self.target.interface.vectors)
+        parts = self.recording.space.spaces.items()
+        has = {name: int(np.prod(part.shape or ())) for name, part in parts if name in wanted or not is_picture(part)}
         if all(has.get(name) == size for name, size in wanted.items()):
             return list(wanted)
         if not self.recording.is_own and len(has) == 1 and list(has.values()) == list(wanted.values()):

@@ -32,6 +32,7 @@ from latentplan.config.commit import Saves
 from latentplan.config.env_id import choose_env, repeat_flag
 from latentplan.config.run_folder import SAVES_FOLDER, lock_folder, require_saves
 from latentplan.envs import make_env, make_from
+from latentplan.evaluation.compatibility import refuse_other_spaces
 from latentplan.evaluation.episodes import OnStep, Step, episode_seed, iterate_episodes
 from latentplan.evaluation.statistics import confidence_interval
 from latentplan.models import Gaussian, State
@@ -235,7 +236,9 @@ class _Distillation:
         self.planning = PlanningAgent(self.model, self.config, self.info["discount"], planner=self.planner_config)
         self.acting = ActorAgent(self.model, self.config)
         build = make_env if make_user_env is None else make_from(make_user_env)
-        self.env = build(choose_env(self.config.env, env or {}, must_match=True), 0)
+        chosen = choose_env(self.config.env, env or {}, must_match=True)
+        self.env = build(chosen, 0)
+        refuse_other_spaces(self.env, f"{chosen.domain}-{chosen.task}", self.model.action_dim, self.model.spaces)
         self.state, self.demonstrations = DistillationState(), Demonstrations()
         self.student = Student(cast(Actor, self.model.actor), settings)
         self.initial = self.best = copy.deepcopy(self.model.actor.state_dict())

@@ -39,6 +39,18 @@ def test_minari_dataset_with_vectors_becomes_rows_in_the_range_of_an_agent(tmp_p
     assert np.allclose(rows.labels, [each["place"] for each in observations])
 
 
+def test_vector_of_a_minari_dataset_that_looks_like_a_picture_stays_a_vector(tmp_path):
+    class Grid(TwoParts):
+        observation_space = spaces.Dict({"camera": PICTURE, "place": spaces.Box(0.0, 1.0, (2, 2), np.float32)})
+
+        def picture(self):
+            seen = super().picture()
+            return {**seen, "place": np.full((2, 2), 0.5 + 0.5 * seen["place"][0], np.float32)}
+
+    rows = read(write_minari(tmp_path / "minari", Grid), Grid, vectors=("place",))
+    assert np.allclose(rows.labels, [each["place"].ravel() for each in play(Grid)[0]])
+
+
 def test_terminal_state_ends_the_rows_of_an_episode(tmp_path):
     rows = read(write_minari(tmp_path / "minari", terminated=True))
     assert np.flatnonzero(rows.continues == 0.0).tolist() == [19]
