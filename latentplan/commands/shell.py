@@ -20,8 +20,8 @@ from latentplan.config.env_id import as_file_name
 from latentplan.config.estimates import check_parts, estimate_model, estimate_search
 from latentplan.config.extras import describe_missing, extra_of
 from latentplan.config.files import build_config, has_cuda
-from latentplan.config.parsing import option, raise_unknown
-from latentplan.config.planner import METHODS, override_planner
+from latentplan.config.parsing import option
+from latentplan.config.planner import override_planner
 
 
 def run_guarded(command: Callable[[Sequence[str]], int], argv: Sequence[str]) -> int:
@@ -126,9 +126,10 @@ def search_settings(saved: Config, given: Mapping[str, Any]) -> PlannerConfig:
     Raises:
         UserError: A given value is not allowed beside the saved ones, or there is no such planner.
     """
+    from latentplan.training.checks import check_planner
+
     planner = build_config({"planner": override_planner(to_dict(saved.planner), given)}).planner
-    if planner.method not in METHODS:
-        raise_unknown("planner", planner.method, METHODS)
+    check_planner(planner.method)
     return planner
 
 

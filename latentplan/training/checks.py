@@ -6,11 +6,12 @@ import os
 from collections.abc import Mapping
 from pathlib import Path
 
-from latentplan.config import USER_DOMAIN, Config, EnvConfig, PlannerConfig, RunConfig, UserError
+from latentplan.config import USER_DOMAIN, Config, EnvConfig, RunConfig, UserError
 from latentplan.config.checks import shown
 from latentplan.config.env_id import is_by_id
 from latentplan.config.extras import EXTRAS, require_extra
 from latentplan.config.parsing import raise_unknown
+from latentplan.config.planner import METHODS
 from latentplan.config.quantities import TASK_PREFIX, scales
 from latentplan.config.suites import DEFAULT_SUITE, check_task
 from latentplan.objectives.expression import Name, Node
@@ -46,11 +47,21 @@ def check_settings(config: Config) -> None:
             parse_objective(goal, known)
         if learning.curriculum_task not in (None, env.task) and learning.curriculum_frames > 0:
             parse_curriculum_task(str(learning.curriculum_task), known)
-    if config.planner.method != PlannerConfig.method:
-        from latentplan.planning.search.registry import PLANNERS
+    check_planner(config.planner.method)
 
-        if config.planner.method not in PLANNERS:
-            raise_unknown("planner", config.planner.method, PLANNERS)
+
+def check_planner(method: str) -> None:
+    """Refuses a planner that is not registered; torch is imported only for a name that `METHODS` does not list.
+
+    Raises:
+        UserError: There is no such planner.
+    """
+    if method in METHODS:
+        return
+    from latentplan.planning.search.registry import PLANNERS
+
+    if method not in PLANNERS:
+        raise_unknown("planner", method, PLANNERS)
 
 
 def check_machines(run: RunConfig) -> None:
