@@ -118,6 +118,8 @@ def read_request(request: type[Request], argv: Sequence[str]) -> Request:
     values = read_values([flag.setting for flag in flags], _read_texts(flags, argv), names)
     _check_resumed(request, [names[key] for key in values])
     _check_outputs(flags, values)
+    if "resume" in values and hasattr(request, "RESUMABLE"):
+        _refuse_nulls({names[key]: value for key, value in values.items()})
     for flag in flags:
         if flag.is_required and flag.setting.key not in values:
             kind = "word" if flag.is_positional else "flag"
@@ -269,6 +271,15 @@ def _check_resumed(request: type, given: Sequence[str]) -> None:
         for name in given:
             if name not in ("--resume", *resumable):
                 raise UserError(f"{name} cannot be given with --resume; only {', '.join(resumable)} can")
+
+
+def _refuse_nulls(given: Mapping[str, Any]) -> None:
+    """Refuses `null` beside --resume, where a setting without a value is one that was not given."""
+    for name, value in given.items():
+        if value is None:
+            raise UserError(
+                f"{name} cannot be null with --resume: leave it out to keep the saved value, or give another value"
+            )
 
 
 def _check_outputs(flags: Sequence[Flag], values: dict[str, Any]) -> None:

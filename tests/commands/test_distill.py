@@ -49,6 +49,7 @@ def test_distill_refuses_settings_of_another_version(checkpoint, tmp_path, asser
         (("--checkpoint", "{checkpoint}", "--out", "{checkpoint}"), ("--out",)),
         (("--checkpoint", "nothing"), ("nothing",)),
         (("--resume", "nothing"), ("nothing to resume in nothing",)),
+        (("--resume", "nothing", "--minutes", "null"), ("--minutes cannot be null with --resume",)),
         (("--resume", "nothing", "--episodes", "3"), ("--episodes", "--rounds")),
     ],
 )

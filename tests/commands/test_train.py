@@ -126,6 +126,13 @@ def test_resume_names_a_setting_once_when_settings_contradict_each_other(assert_
     assert_refused(["train", "--resume", tmp_path, "--frames", "100"], "error: run.frames counts")
 
 
+@pytest.mark.parametrize("flag", ["--frames", "--minutes", "--updates", "--run.ray-address"])
+def test_resume_refuses_null_which_would_keep_the_saved_value(flag, assert_refused, tmp_path):
+    save_settings(Config(), tmp_path)
+    assert_refused(["train", "--resume", tmp_path, flag, "null"], f"{flag} cannot be null with --resume: leave it out")
+    assert_refused(["train", "--resume", tmp_path, flag, "null", "--print-config"], "cannot be null")
+
+
 def test_resume_refuses_bad_changes(assert_refused, tmp_path):
     save_settings(Config(), tmp_path)
     assert_refused(["train", "--resume", tmp_path, "--frames", "0"], "run.frames must be above 0, got 0")
