@@ -65,22 +65,58 @@ def check_planner(method: str) -> None:
 
 
 def check_machines(run: RunConfig) -> None:
-    """Refuses several machines that do not know of each other.
+    """Refuses processes or machines that cannot find each other, from the variables of the environment alone.
 
     Raises:
-        UserError: The environment of the process does not say where the other machines are.
+        UserError: A variable is missing or wrong; Lightning reads a wrong one when it is imported, or waits for ever.
     """
-    is_known = is_started_outside() or "SLURM_JOB_ID" in os.environ or {"MASTER_ADDR", "NODE_RANK"} <= set(os.environ)
-    if run.nodes > 1 and not is_known:
+    for rank, size in (("RANK", "WORLD_SIZE"), ("LOCAL_RANK", "LOCAL_WORLD_SIZE")):
+        if rank in os.environ:
+            number = read_number(rank)
+            if size in os.environ:
+                _check_below(rank, number, size, read_number(size))
+    nodes, needed = run.nodes, ["MASTER_ADDR", "MASTER_PORT"]
+    if is_started_outside():
+        nodes = read_number("WORLD_SIZE") // read_number("LOCAL_WORLD_SIZE", os.environ["WORLD_SIZE"])
+    elif "SLURM_JOB_ID" in os.environ:  # Lightning reads the numbers of Slurm
+        return
+    else:
+        needed.append("NODE_RANK")
+        if run.num_ranks > 1:
+            _check_below("NODE_RANK", read_number("NODE_RANK", "0"), "run.nodes", run.nodes)
+    if nodes > 1 and not set(needed) <= set(os.environ):
         raise UserError(
-            f"run.nodes {run.nodes} needs MASTER_ADDR, MASTER_PORT and NODE_RANK in the environment of each machine, "
-            "or torchrun, which sets them"
+            f"run.nodes {nodes} needs {', '.join(needed[:-1])} and {needed[-1]} in the environment of each machine, or "
+            "torchrun, which sets them"
         )
+
+
+def _check_below(name: str, number: int, limit_name: str, limit: int) -> None:
+    if number >= limit:
+        raise UserError(f"{name} ({number}) must be below {limit_name} ({limit}): the first has number 0")
 
 
 def is_started_outside() -> bool:
     """Whether torchrun or another launcher has started this process as one of several."""
     return {"RANK", "WORLD_SIZE"} <= set(os.environ)
+
+
+def read_number(name: str, default: str | None = None) -> int:
+    """The number in a variable of the environment that a launcher sets; a rank is at least 0, a size at least 1.
+
+    Args:
+        name: The variable.
+        default: Its text where it is not set.
+
+    Raises:
+        UserError: The variable holds something else.
+    """
+    text = os.environ.get(name, default or "")
+    is_rank = name.endswith("RANK")
+    if not text.isdecimal() or (int(text) == 0 and not is_rank):
+        allowed = "a whole number, at least 0" if is_rank else "a number above 0"
+        raise UserError(f"the environment variable {name} must be {allowed}, got {shown(text)}")
+    return int(text)
 
 
 def check_env_settings(env: EnvConfig) -> None:
