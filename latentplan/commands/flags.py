@@ -218,6 +218,8 @@ class _Parser(argparse.ArgumentParser):
         name = arg_string.partition("=")[0]
         if name in self._option_string_actions:
             return super()._parse_optional(arg_string)
+        if name in (*GENERAL_FLAGS, "--version"):  # without a value `call` has taken them away
+            raise UserError(f"{name} takes no value: give {name} alone")
         removed = REMOVED.get(name[2:])
         if removed is not None:
             raise UserError(f"{name} no longer exists: {removed.advice}")
@@ -308,4 +310,6 @@ def _spelled(key: str) -> str:
 
 
 def _begin_small(sentence: str) -> str:
-    return sentence[:1].lower() + sentence[1:].rstrip(".")
+    """A sentence without its dot that goes on in another sentence; a first word in capitals, such as YAML, stays."""
+    keeps = sentence[1:2].isupper()
+    return (sentence if keeps else sentence[:1].lower() + sentence[1:]).rstrip(".")
