@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import sys
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -51,17 +52,15 @@ def check_settings(config: Config) -> None:
 
 
 def check_planner(method: str) -> None:
-    """Refuses a planner that is not registered; torch is imported only for a name that `METHODS` does not list.
+    """Refuses a planner that is not registered, without importing torch.
 
     Raises:
         UserError: There is no such planner.
     """
-    if method in METHODS:
-        return
-    from latentplan.planning.search.registry import PLANNERS
-
-    if method not in PLANNERS:
-        raise_unknown("planner", method, PLANNERS)
+    registry = sys.modules.get("latentplan.planning.search.registry")  # imported where a program has added a planner
+    known = METHODS if registry is None else registry.PLANNERS
+    if method not in known:
+        raise_unknown("planner", method, known)
 
 
 def check_machines(run: RunConfig) -> None:
