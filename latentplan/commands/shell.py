@@ -133,6 +133,21 @@ def search_settings(saved: Config, given: Mapping[str, Any]) -> PlannerConfig:
     return planner
 
 
+def read_search(checkpoint: Path, given: Mapping[str, Any]) -> PlannerConfig:
+    """The settings of the search of a checkpoint on disk with the given ones in their place.
+
+    Args:
+        checkpoint: Folder of a trained agent, or of a run.
+        given: Settings of the search that were given, by name.
+
+    Raises:
+        UserError: The checkpoint cannot be read, or as for `search_settings`.
+    """
+    from latentplan.agents.info import read_info
+
+    return search_settings(saved_config(checkpoint, read_info(checkpoint)), given)
+
+
 def check_search(planner: PlannerConfig, model: ModelConfig) -> None:
     """Refuses a search that this machine cannot serve, before torch is imported.
 
