@@ -71,6 +71,7 @@ def test_resume_takes_saved_settings_with_the_given_changes(tmp_path):
         ("--planer.horizon 3", "did you mean '--planner.horizon'?"),
         ("--domian walker", "did you mean '--domain'?"),
         ("--domain walkr", "unknown domain 'walkr'; did you mean 'walker'?"),
+        ("--domain walker --task fly --print-config", "unknown task of walker 'fly'; available: run, stand, walk"),
         ("--domain=", "unknown domain ''; available: acrobot, "),
         ("--preset gpuu", "did you mean 'gpu'?"),
         ("--planner.num_elites 999", "planner.num_elites (999)"),
@@ -100,6 +101,7 @@ def test_train_refuses_bad_flags_in_one_line(line, expected, assert_refused, tmp
     ("text", "expected"),
     [
         ("env: {domain: walkr}", "did you mean 'walker'?"),
+        ("env: {domain: walker, task: 3}", "unknown task of walker 3; available: run, stand, walk"),
         ("env: {domain: [1]}", "unknown domain [1]; available:"),
         ("planner: {horizn: 3}", "unknown setting in {path}: 'planner.horizn'; did you mean 'planner.horizon'?"),
         ("planner: {horizon: [1]}", "planner.horizon must be a whole number, got [1]"),
