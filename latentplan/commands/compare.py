@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -25,8 +26,16 @@ class Request:
     report: Path | None = option(None, metavar="FILE.html", is_output=True)
 
     def __post_init__(self) -> None:
-        if len(set(self.folders)) < 2:
+        if len(self.distinct) < 2:
             raise UserError("a comparison needs two runs or more: give their folders")
+
+    @property
+    def distinct(self) -> tuple[Path, ...]:
+        """The folders in order; one that several paths name stands once, by the first path."""
+        found: dict[str, Path] = {}
+        for folder in self.folders:
+            found.setdefault(os.path.realpath(folder), folder)
+        return tuple(found.values())
 
 
 def run(request: Request) -> int:
@@ -39,7 +48,7 @@ def run(request: Request) -> int:
     from latentplan.reporting.compare import group_runs, render_comparison, setting_rows, summary_rows
     from latentplan.reporting.runs import format_table, read_run
 
-    runs = [read_run(folder) for folder in dict.fromkeys(request.folders)]
+    runs = [read_run(folder) for folder in request.distinct]
     groups, differ = group_runs(runs)
     print(format_table(summary_rows(groups, confidence_interval), right=range(3, 7)))
     settings = setting_rows(groups, differ)

@@ -6,10 +6,17 @@ from dataclasses import dataclass
 from typing import Any
 
 from latentplan.commands.flags import overrides
-from latentplan.commands.shell import LearningRequest, check_search, name_folder, saved_config, search_settings
+from latentplan.commands.shell import (
+    LearningRequest,
+    check_search,
+    name_folder,
+    read_search,
+    saved_config,
+    search_settings,
+)
 from latentplan.config import DistillConfig, PlannerConfig
 from latentplan.config.env_id import ENV_FLAGS, EnvChoice
-from latentplan.config.run_folder import require_saves
+from latentplan.config.run_folder import DISTILLATION, require_saves
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -35,14 +42,20 @@ class Request(LearningRequest):
 
 
 def resolve(request: Request) -> dict[str, Any]:
-    """The fields of the request, with every setting of the distillation and of the search that labels."""
-    from latentplan.agents.info import read_info
+    """The fields of the request, with every setting of the distillation and of the search that labels.
 
-    asked = {**vars(request), "settings": DistillConfig(**request.settings)}
-    if request.checkpoint is None:
-        return asked
-    saved = saved_config(request.checkpoint, read_info(request.checkpoint))
-    return {**asked, "planner": search_settings(saved, request.planner)}
+    Raises:
+        UserError: The agent cannot be read, a setting is not allowed, or there is nothing to resume.
+    """
+    if request.resume is not None:
+        require_saves(request.resume, DISTILLATION)  # before torch is imported
+        from latentplan.training.distillation.run import read_resumed
+
+        _, settings, planner = read_resumed(request.resume, **request.settings)
+    else:
+        assert request.checkpoint is not None
+        settings, planner = DistillConfig(**request.settings), read_search(request.checkpoint, request.planner)
+    return {**vars(request), "settings": settings, "planner": planner}
 
 
 def run(request: Request) -> int:
@@ -56,7 +69,7 @@ def run(request: Request) -> int:
         planner = search_settings(saved, request.planner)
         check_search(planner, saved.model)
     if request.resume is not None:  # before torch is imported
-        require_saves(request.resume)
+        require_saves(request.resume, DISTILLATION)
     device = request.use_device()
     from latentplan.training import distill, resume_distillation
 

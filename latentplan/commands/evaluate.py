@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from latentplan.commands.flags import overrides
-from latentplan.commands.shell import ComputeRequest, check_search, saved_config, search_settings
+from latentplan.commands.shell import ComputeRequest, check_search, read_search, saved_config, search_settings
 from latentplan.config import EnvConfig, PlannerConfig, UserError, to_dict
 from latentplan.config.checks import MAX_EPISODES, above_zero, at_least, one_of, within
 from latentplan.config.env_id import ENV_FLAGS, EnvChoice, choose_env, is_by_id
@@ -125,10 +125,7 @@ def planning_modes() -> tuple[str, ...]:
 
 def resolve(request: Request) -> dict[str, Any]:
     """The fields of the request, with every setting of the search that the agent would use."""
-    from latentplan.agents.info import read_info
-
-    saved = saved_config(request.checkpoint, read_info(request.checkpoint))
-    return {**vars(request), "planner": search_settings(saved, request.planner)}
+    return {**vars(request), "planner": read_search(request.checkpoint, request.planner)}
 
 
 def run(request: Request) -> int:

@@ -119,6 +119,8 @@ def read_request(request: type[Request], argv: Sequence[str]) -> Request:
     _check_lists(flags, values)
     _check_resumed(request, [names[key] for key in values])
     _check_outputs(flags, values)
+    if "resume" in values and hasattr(request, "RESUMABLE"):
+        _refuse_nulls({names[key]: value for key, value in values.items()})
     for flag in flags:
         if flag.is_required and flag.setting.key not in values:
             kind = "word" if flag.is_positional else "flag"
@@ -217,6 +219,8 @@ class _Parser(argparse.ArgumentParser):
         name = arg_string.partition("=")[0]
         if name in self._option_string_actions:
             return super()._parse_optional(arg_string)
+        if name in (*GENERAL_FLAGS, "--version"):  # without a value `call` has taken them away
+            raise UserError(f"{name} takes no value: give {name} alone")
         removed = REMOVED.get(name[2:])
         if removed is not None:
             raise UserError(f"{name} no longer exists: {removed.advice}")
@@ -284,6 +288,15 @@ def _check_resumed(request: type, given: Sequence[str]) -> None:
                 raise UserError(f"{name} cannot be given with --resume; only {', '.join(resumable)} can")
 
 
+def _refuse_nulls(given: Mapping[str, Any]) -> None:
+    """Refuses `null` beside --resume, where a setting without a value is one that was not given."""
+    for name, value in given.items():
+        if value is None:
+            raise UserError(
+                f"{name} cannot be null with --resume: leave it out to keep the saved value, or give another value"
+            )
+
+
 def _check_outputs(flags: Sequence[Flag], values: dict[str, Any]) -> None:
     """Try every file that is to be written, before any work is spent on it."""
     checked: dict[Path, str] = {}
@@ -314,4 +327,6 @@ def _spelled(key: str) -> str:
 
 
 def _begin_small(sentence: str) -> str:
-    return sentence[:1].lower() + sentence[1:].rstrip(".")
+    """A sentence without its dot that goes on in another sentence; a first word in capitals, such as YAML, stays."""
+    keeps = sentence[1:2].isupper()
+    return (sentence if keeps else sentence[:1].lower() + sentence[1:]).rstrip(".")

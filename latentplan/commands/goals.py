@@ -8,7 +8,7 @@ from typing import Any
 from latentplan.commands.flags import overrides
 from latentplan.commands.shell import LearningRequest, name_folder
 from latentplan.config import GoalsConfig
-from latentplan.config.run_folder import require_saves
+from latentplan.config.run_folder import GOALS, require_saves
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -33,7 +33,20 @@ class Request(LearningRequest):
 
 
 def resolve(request: Request) -> dict[str, Any]:
-    """The fields of the request, with every setting of the learning."""
+    """The fields of the request, with every setting of the learning.
+
+    Raises:
+        UserError: The agent cannot be read, or there is nothing to resume.
+    """
+    if request.resume is not None:
+        require_saves(request.resume, GOALS)  # before torch is imported
+        from latentplan.training.goal_conditioning.run import read_resumed
+
+        return {**vars(request), "settings": read_resumed(request.resume, **request.settings)[1]}
+    from latentplan.agents.info import read_info
+
+    assert request.checkpoint is not None
+    read_info(request.checkpoint)
     return {**vars(request), "settings": GoalsConfig(**request.settings)}
 
 
@@ -43,7 +56,7 @@ def run(request: Request) -> int:
 
     info = {} if request.checkpoint is None else read_info(request.checkpoint)
     if request.resume is not None:  # before torch is imported
-        require_saves(request.resume)
+        require_saves(request.resume, GOALS)
     device = request.use_device()
     from latentplan.training import learn_goals, resume_goals
 

@@ -21,8 +21,8 @@ from latentplan.config.env_id import as_file_name
 from latentplan.config.estimates import check_parts, estimate_model, estimate_search
 from latentplan.config.extras import describe_missing, extra_of
 from latentplan.config.files import build_config, has_cuda
-from latentplan.config.parsing import option, raise_unknown
-from latentplan.config.planner import METHODS, override_planner
+from latentplan.config.parsing import option
+from latentplan.config.planner import override_planner
 
 
 def run_guarded(command: Callable[[Sequence[str]], int], argv: Sequence[str]) -> int:
@@ -130,10 +130,26 @@ def search_settings(saved: Config, given: Mapping[str, Any]) -> PlannerConfig:
     Raises:
         UserError: A given value is not allowed beside the saved ones, or there is no such planner.
     """
+    from latentplan.training.checks import check_planner
+
     planner = build_config({"planner": override_planner(to_dict(saved.planner), given)}).planner
-    if planner.method not in METHODS:
-        raise_unknown("planner", planner.method, METHODS)
+    check_planner(planner.method)
     return planner
+
+
+def read_search(checkpoint: Path, given: Mapping[str, Any]) -> PlannerConfig:
+    """The settings of the search of a checkpoint on disk with the given ones in their place.
+
+    Args:
+        checkpoint: Folder of a trained agent, or of a run.
+        given: Settings of the search that were given, by name.
+
+    Raises:
+        UserError: The checkpoint cannot be read, or as for `search_settings`.
+    """
+    from latentplan.agents.info import read_info
+
+    return search_settings(saved_config(checkpoint, read_info(checkpoint)), given)
 
 
 def check_search(planner: PlannerConfig, model: ModelConfig) -> None:

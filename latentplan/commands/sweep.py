@@ -65,7 +65,7 @@ def run(request: Request) -> int:
     from latentplan.config.estimates import count_cores
     from latentplan.config.extras import require_extra
     from latentplan.training.checks import check_settings
-    from latentplan.training.sweep.space import ends_of, read_space
+    from latentplan.training.sweep.space import check_space, read_space
 
     space = read_space(request.space)
     given = {**request.settings}
@@ -92,12 +92,11 @@ def run(request: Request) -> int:
         request.env_id,
         request.ray_address,
     )
-    for values in ({}, *ends_of(space)):
-        check_settings(config := sweep.resolve(values))
-    if config.run.frames is None:
+    shared = sweep.resolve(check_space(space, lambda values: check_settings(sweep.resolve(values)))).run
+    if shared.frames is None:
         raise UserError("a sweep needs --frames, the budget of a trial")
     require_extra("latentplan sweep", "ray", "optuna")
-    trials, number = run_sweep(sweep)
+    trials, number = run_sweep(sweep, shared)
     print()
     _print_table(trials, list(space))
     if number:

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 from latentplan.commands.evaluate import check_expressions, list_modes, open_env
 from latentplan.commands.flags import overrides
-from latentplan.commands.shell import ComputeRequest, check_search, saved_config, search_settings
+from latentplan.commands.shell import ComputeRequest, check_search, read_search, saved_config, search_settings
 from latentplan.config import PlannerConfig
 from latentplan.config.checks import above_zero, at_least, one_of, within
 from latentplan.config.env_id import ENV_FLAGS, EnvChoice, choose_env
@@ -69,6 +69,11 @@ class Request(ComputeRequest):
         one_of(self, mode=list_modes())
         above_zero(self, "control_hz")
         within(self, port=(0, LARGEST_PORT))
+
+
+def resolve(request: Request) -> dict[str, Any]:
+    """The fields of the request, with every setting of the search that the agent would use."""
+    return {**vars(request), "planner": read_search(request.checkpoint, request.planner)}
 
 
 def run(request: Request) -> int:

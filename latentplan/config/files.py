@@ -34,7 +34,7 @@ def compose(config_file: Layer, flags: Layer, preset: str = "auto") -> Config:
     """Lay defaults, domain, task, preset, the user's file and the flags over one another.
 
     Raises:
-        UserError: The suite or the domain is unknown or a value is not allowed.
+        UserError: The suite, the domain or the task is unknown or a value is not allowed.
     """
     default = read_layer(config_folder() / "default.yaml")
     chosen = _overlay(default, config_file, flags)
@@ -44,7 +44,9 @@ def compose(config_file: Layer, flags: Layer, preset: str = "auto") -> Config:
     if domain not in domains:
         raise_unknown("domain", domain, domains)
     domain_layer = _read_optional(domain)
-    task = chosen["env"].get("task") or check_task(suite, domain)[0]
+    given = chosen["env"].get("task") or None
+    usual, *_ = check_task(suite, domain, given)
+    task = given or usual
     if preset == "auto":
         preset = "gpu" if chosen.get("run", {}).get("device") != "cpu" and has_cuda() else "cpu"
     preset_layer = read_layer(config_folder() / f"{preset}.yaml")

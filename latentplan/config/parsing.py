@@ -261,6 +261,11 @@ def _wrong_type(setting: Setting, values: Mapping[str, Any], names: Mapping[str,
         similar = nearest(value, words)
         hint = f"; did you mean {similar!r}?" if similar else ""
         return UserError(f"{name} must be one of {', '.join(words)}, got {shown(value)}{hint}")
+    literals = [kind for kind in typing.get_args(setting.hint) if typing.get_origin(kind) is typing.Literal]
+    if literals:  # a list of words
+        items = typing.get_args(literals[0])
+        wrong = next((item for item in value if item not in items), value) if isinstance(value, list) else value
+        return UserError(f"each of {name} must be one of {', '.join(items)}, got {shown(wrong)}")
     separator = setting.options.get("separator")
     if separator:
         text = separator.join(map(str, value)) if isinstance(value, list | tuple) else value

@@ -17,7 +17,7 @@ WIDEST_STD = 1e15  # the square of this std, and sums of such squares, are finit
 STEEPEST_NOISE = 100.0  # far below this exponent all steps share one cosine; from 150 on powers overflow
 NUM_POLICY_SAMPLES = 24
 ELITE_SHARE = 0.125
-METHODS = ("cem", "cem_gradient", "icem", "mppi")  # the registered planners, known without torch
+METHODS = ("cem", "cem_gradient", "icem", "mppi")  # the names in `PLANNERS`, known without torch
 TAKING_DEFAULT_ELITES = ("cem", "cem_gradient", "icem")  # planners without a number of elites of their own
 
 

@@ -18,6 +18,12 @@ RUN_FILE = "config.yaml"
 LOCK_FILE = ".lock"
 SAVES_FOLDER = "resume"
 RUN_FORMAT = 3  # 1 was `resume/state.pt`, from which a run could not continue exactly; 2 kept other counts
+RUN, DISTILLATION, GOALS = "run", "distillation", "goals"  # kinds of saves
+RESUMED_BY = {  # by kind: what the saves hold, and the command that continues it
+    RUN: ("a training run", "train"),
+    DISTILLATION: ("a distillation", "distill"),
+    GOALS: ("learned goals", "goals"),
+}
 
 
 def run_saves(folder: Path) -> Saves:
@@ -26,7 +32,7 @@ def run_saves(folder: Path) -> Saves:
     Raises:
         UserError: The run was saved in the format of an earlier version.
     """
-    saves = Saves(folder / SAVES_FOLDER, "run", RUN_FORMAT)
+    saves = Saves(folder / SAVES_FOLDER, RUN, RUN_FORMAT)
     if (folder / SAVES_FOLDER / "state.pt").exists() and not saves.exist():
         raise UserError(
             f"{folder} was saved by latentplan 0.2.0 or earlier, from whose saves a run does not continue exactly: "
@@ -35,13 +41,28 @@ def run_saves(folder: Path) -> Saves:
     return saves
 
 
-def require_saves(folder: Path) -> None:
-    """Raises UserError if there is no save in the folder of a run, of a distillation or of goals that were learned."""
-    if not Saves(folder / SAVES_FOLDER, "any", 0).exist():
+def require_saves(folder: Path, kind: str) -> None:
+    """Refuses a folder from which nothing can be resumed.
+
+    Args:
+        folder: The folder.
+        kind: What was saved, one of `RESUMED_BY`.
+
+    Raises:
+        UserError: The folder holds no save, or saves of another kind alone.
+    """
+    saves = Saves(folder / SAVES_FOLDER, kind, 0)
+    if not saves.exist():
         raise UserError(
             f"nothing to resume in {folder}: {folder / SAVES_FOLDER} holds no save; what latentplan 0.2.0 or earlier "
             "saved is continued by that version"
         )
+    kinds = saves.kinds()
+    for other, (content, command) in RESUMED_BY.items():
+        if other in kinds and kind not in kinds:
+            raise UserError(
+                f"{folder} holds {content}, not {RESUMED_BY[kind][0]}: continue it with latentplan {command} --resume"
+            )
 
 
 def read_run_config(folder: Path) -> tuple[Config, str | None]:
@@ -55,6 +76,7 @@ def read_run_config(folder: Path) -> tuple[Config, str | None]:
     """
     path, copy = folder / RUN_FILE, run_saves(folder).find(RUN_FILE)
     if copy is None:
+        require_saves(folder, RUN)
         raise UserError(f"nothing to resume in {folder}: it holds no save of a run that is whole")
     saved = read_config(copy)
     try:

@@ -14,6 +14,7 @@ from typing import Any, Literal, NamedTuple
 
 from latentplan.config.checks import UserError, cut
 from latentplan.config.files import read_config
+from latentplan.config.reading import LARGEST_DATA, read_text
 from latentplan.config.run_folder import LOCK_FILE, RUN_FILE, run_saves
 from latentplan.config.settings import Config, RunConfig, to_dict
 from latentplan.config.suites import check_task
@@ -45,7 +46,7 @@ def read_evaluations(folder: Path) -> list[Evaluation]:
     try:
         found = {_moment(each): each for each in _read_metrics(folder / METRICS_FILE)}
         if (folder / FINAL_FILE).exists():
-            final = json.loads((folder / FINAL_FILE).read_text())
+            final = json.loads(read_text(folder / FINAL_FILE, LARGEST_DATA))
             last = _to_evaluation(*(final[name] for name in Evaluation._fields))
             found[_moment(last)] = last
     except KeyError as error:
@@ -63,18 +64,22 @@ def read_log(info: Mapping[str, Any]) -> list[Evaluation]:
 
 
 def read_progress(folder: Path) -> tuple[float, float]:
-    """Frames and minutes of the latest row of metrics of a run; zeros before the first row."""
+    """Largest frames and minutes among the rows of metrics of a run; zeros before the first row.
+
+    The row of an evaluation has the clocks of its beginning, and may come after a later row of learning.
+    """
     try:
-        *_, last = read_rows(folder / METRICS_FILE)
-        return float(last["env_frames"]), float(last["minutes"])
-    except _DAMAGES:  # no row yet, or a damaged file, which the run itself reports
+        clocks = [(float(row["env_frames"]), float(row["minutes"])) for row in read_rows(folder / METRICS_FILE)]
+    except _DAMAGES:  # a damaged file, which the run itself reports
         return 0.0, 0.0
+    frames, minutes = zip(*clocks, strict=True) if clocks else ((0.0,), (0.0,))
+    return max(frames), max(minutes)
 
 
 def read_rows(path: Path) -> Iterator[dict[str, str]]:
     """The rows of a file of metrics, without a last line that is still being written."""
     if path.exists():
-        text = path.read_text(encoding="utf-8")
+        text = read_text(path, LARGEST_DATA)
         yield from csv.DictReader(io.StringIO(text[: text.rfind("\n") + 1], newline=""))
 
 
@@ -118,7 +123,7 @@ def note_state(folder: Path, state: StateName, **facts: Any) -> None:
 def read_facts(folder: Path) -> dict[str, Any]:
     """What a run has noted about itself: `state`, `reason`, `command`, `commit` and others; empty without a note."""
     try:
-        facts = json.loads((folder / STATUS_FILE).read_text())
+        facts = json.loads(read_text(folder / STATUS_FILE, LARGEST_DATA))
     except _DAMAGES:
         return {}
     return facts if isinstance(facts, dict) else {}
@@ -155,7 +160,7 @@ def _is_whole(entry: Mapping[str, Any]) -> bool:
 def _has_final_evaluation(folder: Path) -> bool:
     """Whether the run was evaluated finally after the last frames that it has collected."""
     try:
-        return bool(json.loads((folder / FINAL_FILE).read_text())["env_frames"] >= read_progress(folder)[0])
+        return bool(json.loads(read_text(folder / FINAL_FILE, LARGEST_DATA))["env_frames"] >= read_progress(folder)[0])
     except _DAMAGES:
         return False
 

@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import os
+import sys
 from collections.abc import Mapping
 from pathlib import Path
 
-from latentplan.config import USER_DOMAIN, Config, EnvConfig, PlannerConfig, RunConfig, UserError
+from latentplan.config import USER_DOMAIN, Config, EnvConfig, RunConfig, UserError
 from latentplan.config.checks import shown
 from latentplan.config.env_id import is_by_id
 from latentplan.config.extras import EXTRAS, require_extra
 from latentplan.config.parsing import raise_unknown
+from latentplan.config.planner import METHODS
 from latentplan.config.quantities import TASK_PREFIX, scales
 from latentplan.config.suites import DEFAULT_SUITE, check_task
 from latentplan.objectives.expression import Name, Node
@@ -46,30 +48,74 @@ def check_settings(config: Config) -> None:
             parse_objective(goal, known)
         if learning.curriculum_task not in (None, env.task) and learning.curriculum_frames > 0:
             parse_curriculum_task(str(learning.curriculum_task), known)
-    if config.planner.method != PlannerConfig.method:
-        from latentplan.planning.search.registry import PLANNERS
+    check_planner(config.planner.method)
 
-        if config.planner.method not in PLANNERS:
-            raise_unknown("planner", config.planner.method, PLANNERS)
+
+def check_planner(method: str) -> None:
+    """Refuses a planner that is not registered, without importing torch.
+
+    Raises:
+        UserError: There is no such planner.
+    """
+    registry = sys.modules.get("latentplan.planning.search.registry")  # imported where a program has added a planner
+    known = METHODS if registry is None else registry.PLANNERS
+    if method not in known:
+        raise_unknown("planner", method, known)
 
 
 def check_machines(run: RunConfig) -> None:
-    """Refuses several machines that do not know of each other.
+    """Refuses processes or machines that cannot find each other, from the variables of the environment alone.
 
     Raises:
-        UserError: The environment of the process does not say where the other machines are.
+        UserError: A variable is missing or wrong; Lightning reads a wrong one when it is imported, or waits for ever.
     """
-    is_known = is_started_outside() or "SLURM_JOB_ID" in os.environ or {"MASTER_ADDR", "NODE_RANK"} <= set(os.environ)
-    if run.nodes > 1 and not is_known:
+    for rank, size in (("RANK", "WORLD_SIZE"), ("LOCAL_RANK", "LOCAL_WORLD_SIZE")):
+        if rank in os.environ:
+            number = read_number(rank)
+            if size in os.environ:
+                _check_below(rank, number, size, read_number(size))
+    nodes, needed = run.nodes, ["MASTER_ADDR", "MASTER_PORT"]
+    if is_started_outside():
+        nodes = read_number("WORLD_SIZE") // read_number("LOCAL_WORLD_SIZE", os.environ["WORLD_SIZE"])
+    elif "SLURM_JOB_ID" in os.environ:  # Lightning reads the numbers of Slurm
+        return
+    else:
+        needed.append("NODE_RANK")
+        if run.num_ranks > 1:
+            _check_below("NODE_RANK", read_number("NODE_RANK", "0"), "run.nodes", run.nodes)
+    if nodes > 1 and not set(needed) <= set(os.environ):
         raise UserError(
-            f"run.nodes {run.nodes} needs MASTER_ADDR, MASTER_PORT and NODE_RANK in the environment of each machine, "
-            "or torchrun, which sets them"
+            f"run.nodes {nodes} needs {', '.join(needed[:-1])} and {needed[-1]} in the environment of each machine, or "
+            "torchrun, which sets them"
         )
+
+
+def _check_below(name: str, number: int, limit_name: str, limit: int) -> None:
+    if number >= limit:
+        raise UserError(f"{name} ({number}) must be below {limit_name} ({limit}): the first has number 0")
 
 
 def is_started_outside() -> bool:
     """Whether torchrun or another launcher has started this process as one of several."""
     return {"RANK", "WORLD_SIZE"} <= set(os.environ)
+
+
+def read_number(name: str, default: str | None = None) -> int:
+    """The number in a variable of the environment that a launcher sets; a rank is at least 0, a size at least 1.
+
+    Args:
+        name: The variable.
+        default: Its text where it is not set.
+
+    Raises:
+        UserError: The variable holds something else.
+    """
+    text = os.environ.get(name, default or "")
+    is_rank = name.endswith("RANK")
+    if not text.isdecimal() or (int(text) == 0 and not is_rank):
+        allowed = "a whole number, at least 0" if is_rank else "a number above 0"
+        raise UserError(f"the environment variable {name} must be {allowed}, got {shown(text)}")
+    return int(text)
 
 
 def check_env_settings(env: EnvConfig) -> None:

@@ -20,7 +20,7 @@ import torch
 from torch import Tensor
 
 from latentplan.config import Config, UserError, derive_seed
-from latentplan.training.checks import is_started_outside
+from latentplan.training.checks import is_started_outside, read_number
 from latentplan.training.collection.episodes import Stopped
 from latentplan.training.resources import choose_device
 
@@ -206,8 +206,8 @@ def place_ranks(config: Config) -> Config:
     """
     if not is_started_outside():
         return config
-    size, run = _read_number("WORLD_SIZE"), config.run
-    devices = _read_number("LOCAL_WORLD_SIZE") if "LOCAL_WORLD_SIZE" in os.environ else size
+    size, run = read_number("WORLD_SIZE"), config.run
+    devices = read_number("LOCAL_WORLD_SIZE", os.environ["WORLD_SIZE"])
     if size % devices:
         raise UserError(f"WORLD_SIZE ({size}) must be a multiple of LOCAL_WORLD_SIZE ({devices})")
     return replace(config, run=replace(run, devices=devices, nodes=size // devices))
@@ -238,7 +238,7 @@ def join_ranks(config: Config) -> Ranks:
     for name in ("lightning.fabric", "lightning.pytorch"):
         logging.getLogger(name).setLevel(logging.ERROR)
     if is_outside:
-        os.environ.setdefault("LOCAL_RANK", str(_read_number("RANK") % run.devices))
+        os.environ.setdefault("LOCAL_RANK", str(read_number("RANK") % run.devices))
     fabric = Fabric(
         accelerator="gpu" if device.type == "cuda" else "cpu",
         devices=run.devices,
@@ -263,10 +263,3 @@ def _outcome(function: Callable[[], Any]) -> tuple[Any, Any]:
         except Exception:
             return None, RuntimeError(f"{type(error).__name__}: {error}")
         return None, error
-
-
-def _read_number(name: str) -> int:
-    text = os.environ[name]
-    if not text.isdecimal() or (int(text) == 0 and name not in ("RANK", "LOCAL_RANK")):
-        raise UserError(f"the environment variable {name} must be a number above 0, got {text[:60]!r}")
-    return int(text)

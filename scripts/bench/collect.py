@@ -20,6 +20,7 @@ from bench.options import ComposeRequest
 from bench.report import format_number, format_table, write_json
 from latentplan.config import UserError
 from latentplan.config.checks import above_zero, at_least
+from latentplan.config.extras import require_extra
 from latentplan.config.learning import COLLECTION_BACKENDS, MAX_WORKERS, CollectionBackend
 from latentplan.config.parsing import option, raise_unknown
 from latentplan.config.settings import RenderQuality
@@ -42,7 +43,7 @@ class Request(ComposeRequest):
         decisions: Decisions of a round, one measurement for each.
         rounds: Timed rounds of each measurement.
         quality: Render quality.
-        ray_address: Address of a Ray cluster as HOST:PORT; None starts Ray on this machine.
+        ray_address: Address of a Ray cluster as HOST:PORT, for the workers of `ray`; None starts Ray on this machine.
         learners: Learning processes of the cluster to predict.
         collectors: Workers of that cluster, one core each.
         update_ms: Milliseconds of an update on one of its learners, from `benchmark.py train`.
@@ -78,12 +79,16 @@ class Request(ComposeRequest):
         for backend in self.backends:
             if backend not in COLLECTION_BACKENDS:
                 raise_unknown("backend", backend, COLLECTION_BACKENDS)
+        if self.ray_address is not None and "ray" not in self.backends:
+            raise UserError("--ray-address has no effect here: name ray in --backends too")
 
 
 def run(request: Request) -> int:
     """Measures every number of workers, fits the model, and prints both."""
     from latentplan.config.estimates import count_cores
 
+    if "ray" in request.backends:
+        require_extra("--backends ray", "ray")
     request.use_device(1)
     composed = request.compose({})
     config = replace(composed, env=replace(composed.env, render_quality=request.quality))
@@ -107,7 +112,8 @@ def measure(config: Config, request: Request, backend: CollectionBackend) -> Ite
 
     for workers in (*request.workers, *request.held_out):
         collection = replace(config.collection, backend=backend, workers=workers, overlap=True)
-        settings = replace(config, collection=collection, run=replace(config.run, ray_address=request.ray_address))
+        address = request.ray_address if backend == "ray" else None
+        settings = replace(config, collection=collection, run=replace(config.run, ray_address=address))
         worker = make_worker(settings, None, torch.device("cpu"), lambda: False)
         try:
             worker.submit("describe")

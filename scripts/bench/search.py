@@ -185,7 +185,11 @@ def run(request: Request) -> int:
 
 
 def start_libraries(request: Request, stack: ExitStack, left_out: dict[str, str]) -> dict[str, JsonProcess]:
-    """The process of each library that can take part; the reason is printed for each that cannot."""
+    """The process of each library that can take part; the reason is printed for each that cannot.
+
+    Raises:
+        UserError: A planner of this library is unknown.
+    """
     from bench.peers.client import JsonProcess
 
     FOLDER.parent.mkdir(parents=True, exist_ok=True)
@@ -193,6 +197,7 @@ def start_libraries(request: Request, stack: ExitStack, left_out: dict[str, str]
     own = ["-m", "bench.controllers.own", threads]
     libraries = {OURS: JsonProcess(Path(sys.executable), own, FOLDER.parent / f"{OURS}.log")}
     stack.callback(libraries[OURS].close)
+    select_planners(request, libraries[OURS].ask({"do": "list"})["planners"])  # before others are installed
     for name in () if request.peers == ("none",) else request.peers:
         with _left_out_on_error(name, left_out):
             python = install(name, FOLDER)

@@ -4,6 +4,7 @@ import json
 import shutil
 
 import pytest
+import yaml
 
 from latentplan.agents.checkpoint import read_info
 from latentplan.commands.main import main
@@ -14,13 +15,21 @@ def test_distill_teaches_an_agent_and_resumes(checkpoint, tmp_path, capsys):
     flags = ["--rounds", "1", "--episodes", "1", "--updates", "3", "--evaluation-episodes", "2", "--seed", "4"]
     command = ["distill", "--checkpoint", checkpoint, "--out", out, "--device", "cpu", *flags, "--planner.horizon", 2]
     assert main([str(word) for word in command]) == 0
+    assert "round  1" in capsys.readouterr().out
     facts = read_info(out)["distilled"]
     assert (facts["rounds"], facts["decisions"], facts["planner"]["horizon"]) == (1, 10, 2)
     assert (facts["settings"]["updates"], facts["settings"]["seed"]) == (3, 4)
+    assert main(["distill", "--resume", str(out), "--rounds", "2", "--print-config"]) == 0
+    shown = yaml.safe_load(capsys.readouterr().out)
+    assert shown["settings"] == facts["settings"] | {"rounds": 2} and shown["planner"] == facts["planner"]
+    for other in ("train", "goals"):
+        assert main([other, "--resume", str(out)]) == 2
+        assert f"{out} holds a distillation, not " in (line := capsys.readouterr().err)
+        assert "continue it with latentplan distill --resume" in line
     assert main(["distill", "--resume", str(out), "--rounds", "2", "--device", "cpu"]) == 0
     assert read_info(out)["distilled"]["rounds"] == 2
     printed = capsys.readouterr().out
-    assert "round  1" in printed and "round  2" in printed and "95 % interval" in printed
+    assert "round  2" in printed and "95 % interval" in printed
 
 
 @pytest.mark.parametrize("config", ["x", {"planner": {"horizons": 3}}])
@@ -49,6 +58,7 @@ def test_distill_refuses_settings_of_another_version(checkpoint, tmp_path, asser
         (("--checkpoint", "{checkpoint}", "--out", "{checkpoint}"), ("--out",)),
         (("--checkpoint", "nothing"), ("nothing",)),
         (("--resume", "nothing"), ("nothing to resume in nothing",)),
+        (("--resume", "nothing", "--minutes", "null"), ("--minutes cannot be null with --resume",)),
         (("--resume", "nothing", "--episodes", "3"), ("--episodes", "--rounds")),
     ],
 )

@@ -122,6 +122,9 @@ def test_read_request_tries_outputs_and_takes_where_links_lead(tmp_path):
         ("--planner {{horizon:3}}", "unknown flag '--planner'"),
         ("--num-episodes.x 3", "unknown flag '--num-episodes.x'; did you mean '--num-episodes'?"),
         ("--hlp", "unknown flag '--hlp'; did you mean '--help'?"),
+        ("--help=1", "--help takes no value: give --help alone"),
+        ("--print-config=true", "--print-config takes no value: give --print-config alone"),
+        ("--version=", "--version takes no value: give --version alone"),
         ("--qqq 1", "unknown flag '--qqq'; --help-all lists all"),
         ("--num-episodes", "flag --num-episodes needs a value"),
         ("--num-episodes --seeds 3", "flag --num-episodes needs a value"),
@@ -155,6 +158,11 @@ def test_read_request_refuses_bad_flags(line, expected):
 def test_read_request_names_a_flag_that_is_missing():
     with pytest.raises(UserError, match="^flag --checkpoint is missing; give the folder of something$"):
         read_request(Request, [])
+
+
+def test_read_request_keeps_a_first_word_in_capitals_of_a_flag_that_is_missing():
+    with pytest.raises(UserError, match="^flag --space is missing; give the YAML file of the settings"):
+        read_request(importlib.import_module(COMMANDS["sweep"].module).Request, [])
 
 
 def test_format_flags_shows_meaning_value_and_default_of_each_common_flag():

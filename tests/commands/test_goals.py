@@ -17,6 +17,7 @@ import pytest
         (("--checkpoint", "nothing", "--threads", "0"), ("--threads", "[1, 1024]", "got 0")),
         (("--checkpoint", "nothing", "--device", "cud"), ("'cud'", "'cuda'")),
         (("--resume", "nothing"), ("nothing to resume in nothing",)),
+        (("--resume", "nothing", "--minutes", "null"), ("--minutes cannot be null with --resume",)),
         (("--resume", "nothing", "--starts", "3"), ("--starts", "--updates")),
     ],
 )

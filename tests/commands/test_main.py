@@ -14,7 +14,8 @@ from latentplan import __version__
 from latentplan.agents.files import write_files
 from latentplan.commands.flags import GENERAL_FLAGS
 from latentplan.commands.main import COMMANDS, SHELLS, main
-from latentplan.config import DistillConfig
+from latentplan.config import GoalsConfig
+from tests.commands.conftest import CONFIG
 
 HEAVY = "{'torch', 'lightning', 'mujoco', 'dm_control', 'gymnasium', 'cv2', 'numpy'}"
 
@@ -150,15 +151,25 @@ def test_print_config_prints_the_resolved_settings_and_does_nothing_else(checkpo
     assert main(["train", "--domain", "cartpole", "--planner.horizon", "3", "--preset", "cpu", "--print-config"]) == 0
     printed = yaml.safe_load(capsys.readouterr().out)
     assert (printed["env"]["task"], printed["planner"]["horizon"]) == ("swingup", 3)
-    assert main(["distill", "--resume", "x", "--rounds", "3", "--print-config"]) == 0
-    printed = yaml.safe_load(capsys.readouterr().out)
-    assert (printed["resume"], printed["settings"]["rounds"]) == ("x", 3)
-    assert printed["settings"]["updates"] == DistillConfig().updates
-    for command in ("eval", "distill"):  # settings that this machine cannot serve can still be printed
+    assert main(["goals", "--checkpoint", str(checkpoint), "--updates", "3", "--print-config"]) == 0
+    settings = yaml.safe_load(capsys.readouterr().out)["settings"]
+    assert (settings["updates"], settings["starts"]) == (3, GoalsConfig().starts)
+    for command in ("eval", "view", "distill"):  # settings that this machine cannot serve can still be printed
         words = [command, "--checkpoint", str(checkpoint), "--planner.num_samples", "1e12", "--print-config"]
         assert main(words) == 0
-        assert yaml.safe_load(capsys.readouterr().out)["planner"]["num_samples"] == 10**12
+        search = yaml.safe_load(capsys.readouterr().out)["planner"]
+        assert (search["num_samples"], search["horizon"]) == (10**12, CONFIG.planner.horizon)
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("command", ["eval", "view", "distill", "goals"])
+def test_print_config_refuses_an_agent_that_does_not_exist(command, assert_refused):
+    assert_refused([command, "--checkpoint", "nowhere", "--print-config"], "no checkpoint at nowhere")
+
+
+@pytest.mark.parametrize("command", ["train", "distill", "goals"])
+def test_print_config_refuses_a_folder_from_which_nothing_resumes(command, assert_refused):
+    assert_refused([command, "--resume", "nowhere", "--print-config"], "nothing to resume in nowhere")
 
 
 def test_print_config_output_is_a_config_file_that_gives_the_same_settings(capsys, tmp_path):

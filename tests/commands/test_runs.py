@@ -11,6 +11,7 @@ from pathlib import Path
 
 import pytest
 
+from latentplan.commands import compare
 from latentplan.commands.main import main
 from latentplan.config import Config, EnvConfig, PlannerConfig, RunConfig
 from latentplan.config.files import dump_config
@@ -203,6 +204,19 @@ def test_mean_curve_of_one_seed_is_its_evaluations_and_of_several_their_mean(mak
     assert (both.x[0], both.x[-1], both.y[0], both.y[-1]) == (1000, 3000, 150, 250)
     low, high = confidence_interval([200.0, 300.0])
     assert (both.low[-1], both.high[-1]) == pytest.approx((low, high))
+
+
+def test_a_run_that_two_paths_name_is_compared_once(make_run, tmp_path, capsys):
+    one, two = make_run("one"), make_run("two", seed=1)
+    (tmp_path / "link").symlink_to(one)
+    folders = (one, two, tmp_path / "link", two / ".." / "two")
+    assert compare.Request(folders=folders).distinct == (one, two)
+    assert main(["compare", *map(str, folders)]) == 0
+    twice = capsys.readouterr().out
+    assert main(["compare", str(one), str(two)]) == 0
+    assert capsys.readouterr().out == twice
+    assert main(["compare", str(one), str(tmp_path / "link")]) == 2
+    assert "a comparison needs two runs or more" in capsys.readouterr().err
 
 
 def test_a_run_that_is_compared_alone_is_refused(make_run, capsys):

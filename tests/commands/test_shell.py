@@ -9,8 +9,10 @@ import sys
 import pytest
 import torch
 
-from latentplan.commands.shell import ComputeRequest, run_guarded
-from latentplan.config import UserError
+from latentplan.commands.shell import ComputeRequest, run_guarded, search_settings
+from latentplan.config import Config, UserError
+from latentplan.config.planner import METHODS
+from latentplan.planning.search.registry import PLANNERS
 
 REFUSED = "error: the system refused a file or a process"
 ALLOCATOR = "error: not enough memory on the device"
@@ -94,3 +96,11 @@ def test_use_device_takes_cuda_where_it_is_usable(monkeypatch):
 def test_compute_request_refuses_thread_counts_out_of_range(threads):
     with pytest.raises(ValueError, match=rf"threads must be in \[1, 1024\], got {threads}"):
         ComputeRequest(threads=threads)
+
+
+def test_search_settings_take_every_registered_planner(monkeypatch):
+    assert set(METHODS) == set(PLANNERS)
+    monkeypatch.setitem(PLANNERS, "mine", PLANNERS["cem"])
+    assert [search_settings(Config(), {"method": name}).method for name in PLANNERS] == list(PLANNERS)
+    with pytest.raises(UserError, match="unknown planner 'mppy'; did you mean 'mppi'"):
+        search_settings(Config(), {"method": "mppy"})

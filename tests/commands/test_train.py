@@ -71,6 +71,7 @@ def test_resume_takes_saved_settings_with_the_given_changes(tmp_path):
         ("--planer.horizon 3", "did you mean '--planner.horizon'?"),
         ("--domian walker", "did you mean '--domain'?"),
         ("--domain walkr", "unknown domain 'walkr'; did you mean 'walker'?"),
+        ("--domain walker --task fly --print-config", "unknown task of walker 'fly'; available: run, stand, walk"),
         ("--domain=", "unknown domain ''; available: acrobot, "),
         ("--preset gpuu", "did you mean 'gpu'?"),
         ("--planner.num_elites 999", "planner.num_elites (999)"),
@@ -100,6 +101,7 @@ def test_train_refuses_bad_flags_in_one_line(line, expected, assert_refused, tmp
     ("text", "expected"),
     [
         ("env: {domain: walkr}", "did you mean 'walker'?"),
+        ("env: {domain: walker, task: 3}", "unknown task of walker 3; available: run, stand, walk"),
         ("env: {domain: [1]}", "unknown domain [1]; available:"),
         ("planner: {horizn: 3}", "unknown setting in {path}: 'planner.horizn'; did you mean 'planner.horizon'?"),
         ("planner: {horizon: [1]}", "planner.horizon must be a whole number, got [1]"),
@@ -124,6 +126,13 @@ def test_resume_names_a_setting_once_when_settings_contradict_each_other(assert_
     with pytest.raises(UserError, match=r"^run\.frames counts"):
         resolve(read_request(Request, ["--resume", str(tmp_path), "--frames", "100"]))
     assert_refused(["train", "--resume", tmp_path, "--frames", "100"], "error: run.frames counts")
+
+
+@pytest.mark.parametrize("flag", ["--frames", "--minutes", "--updates", "--run.ray-address"])
+def test_resume_refuses_null_which_would_keep_the_saved_value(flag, assert_refused, tmp_path):
+    save_settings(Config(), tmp_path)
+    assert_refused(["train", "--resume", tmp_path, flag, "null"], f"{flag} cannot be null with --resume: leave it out")
+    assert_refused(["train", "--resume", tmp_path, flag, "null", "--print-config"], "cannot be null")
 
 
 def test_resume_refuses_bad_changes(assert_refused, tmp_path):

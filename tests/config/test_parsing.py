@@ -39,11 +39,13 @@ class Outer:
     Attributes:
         name: Any text.
         weights: Numbers.
+        shades: Words.
         mode: A word.
     """
 
     name: str
     weights: tuple[float, ...] = option((1.0,), separator=",")
+    shades: tuple[Literal["light", "dark"], ...] = option(("light",), separator=",")
     mode: str = option("fast", choices=lambda: ["fast", "slow"])
     inner: Inner = field(default_factory=Inner)
 
@@ -53,6 +55,7 @@ def test_list_settings_takes_keys_defaults_and_meanings_from_dataclasses_and_the
     assert found == {
         "outer.name": (MISSING, "Any text."),
         "outer.weights": ((1.0,), "Numbers."),
+        "outer.shades": (("light",), "Words."),
         "outer.mode": ("fast", "A word."),
         "outer.inner.size": (3, "Size of everything."),
         "outer.inner.colour": (None, "One word."),
@@ -84,6 +87,8 @@ def test_read_values_gives_values_the_types_of_their_fields(key, text, value):
         ("inner.size", "", "inner.size must be a whole number, got ''"),
         ("inner.size", "1e18", "inner.size must be a whole number, got '1e18'"),
         ("inner.size", "[1", "inner.size must be a whole number, got '[1'"),
+        ("shades", ["light", "drak"], "each of shades must be one of light, dark, got 'drak'"),
+        ("shades", "[light, 3]", "each of shades must be one of light, dark, got '[light, 3]'"),
         ("weights", ["1", "nan"], "weights must be finite numbers, separated by ',', got '1,nan'"),
         ("inner.colour", "gren", "inner.colour must be one of red, green, got 'gren'; did you mean 'green'?"),
         ("inner.sise", "1", "unknown setting 'inner.sise'; did you mean 'inner.size'?"),
@@ -104,7 +109,8 @@ def test_read_values_uses_given_names_in_errors():
 
 def test_choices_are_those_of_a_literal_or_an_option():
     found = {setting.key: setting.choices for setting in list_settings(Outer)}
-    expected = {"name": (), "weights": (), "mode": ("fast", "slow"), "inner.size": (), "inner.colour": ("red", "green")}
+    expected = {"name": (), "weights": (), "shades": (), "mode": ("fast", "slow")}
+    expected |= {"inner.size": (), "inner.colour": ("red", "green")}
     assert found == expected
 
 

@@ -6,9 +6,11 @@ from types import SimpleNamespace
 
 import benchmark
 import pytest
+from bench import collect
 from bench.collect import fit, predict, predict_cluster, print_cluster
 
-from latentplan.config import Config
+from latentplan.config import Config, extras
+from latentplan.training.collection import crew
 
 MODEL = {"round": 0.02, "worker": 0.003, "decision": 0.001}
 ROW = {"row_bytes": 10_000.0, "weight_bytes": 1_000_000}
@@ -74,6 +76,39 @@ def test_collect_refuses_counts_out_of_range(capsys, flags, named):
     assert benchmark.main(["collect", *flags.split()]) == 2
     captured = capsys.readouterr()
     assert named in captured.err and captured.out == ""
+
+
+def test_collect_refuses_a_kind_of_worker_that_does_not_exist(capsys):
+    assert benchmark.main(["collect", "--backends", "process,dask"]) == 2
+    assert capsys.readouterr().err == "error: each of --backends must be one of process, ray, got 'dask'\n"
+
+
+def test_collect_refuses_an_address_that_no_worker_uses(capsys):
+    assert benchmark.main(["collect", "--backends", "process", "--ray-address", "10.0.0.1:6379"]) == 2
+    assert "--ray-address has no effect here: name ray in --backends too" in capsys.readouterr().err
+
+
+def test_collect_asks_for_ray_before_it_measures(capsys, monkeypatch):
+    found = extras.util.find_spec
+    monkeypatch.setattr(extras.util, "find_spec", lambda name: None if name == "ray" else found(name))
+    monkeypatch.setattr(collect, "measure", lambda *_: pytest.fail("measured"))
+    assert benchmark.main(["collect", "--domain", "cartpole"]) == 2
+    assert "--backends ray needs ray, which is not installed" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(("backend", "expected"), [("process", None), ("ray", "10.0.0.1:6379")])
+def test_only_workers_of_ray_get_the_address_of_the_cluster(monkeypatch, backend, expected):
+    class Made(Exception):
+        pass
+
+    def make_worker(config, *_):
+        raise Made(config.run.ray_address)
+
+    monkeypatch.setattr(crew, "make_worker", make_worker)
+    request = collect.Request(ray_address="10.0.0.1:6379")
+    with pytest.raises(Made) as made:
+        next(collect.measure(Config(), request, backend))
+    assert made.value.args == (expected,)
 
 
 @pytest.mark.slow

@@ -250,6 +250,12 @@ def test_library_that_cannot_be_installed_is_left_out_in_one_line(tmp_path, monk
     assert re.search(r"^mbrl left out: .*; to install it: .* -m pip install .* mbrl ", capsys.readouterr().out, re.M)
 
 
+def test_search_refuses_an_unknown_planner_before_it_installs_others(monkeypatch, capsys):
+    monkeypatch.setattr(search, "install", lambda name, _: pytest.fail(f"installs {name}"))
+    assert benchmark.main(["search", "--planners", "icme", "--peers", "mbrl"]) == 2
+    assert "unknown planner 'icme'; did you mean 'icem" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize(
     ("arguments", "named"),
     [

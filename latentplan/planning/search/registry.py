@@ -1,6 +1,7 @@
 """Planners by name, and the protocol of a planner.
 
-A new planner is one module with a class that satisfies `Planner`, and one line in `PLANNERS`.
+A new planner is one module with a class that satisfies `Planner`, one line in `PLANNERS`, and its name in `METHODS` of
+`latentplan.config.planner`, from which commands know it before they import torch.
 """
 
 from __future__ import annotations

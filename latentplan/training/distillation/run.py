@@ -30,7 +30,7 @@ from latentplan.agents.planning import PlanningAgent
 from latentplan.config import USER_DOMAIN, DistillConfig, PlannerConfig, UserError, derive_seed, from_dict, to_dict
 from latentplan.config.commit import Saves
 from latentplan.config.env_id import choose_env, repeat_flag
-from latentplan.config.run_folder import SAVES_FOLDER, lock_folder, require_saves
+from latentplan.config.run_folder import DISTILLATION, SAVES_FOLDER, lock_folder, require_saves
 from latentplan.envs import make_env, make_from
 from latentplan.evaluation.compatibility import refuse_other_spaces
 from latentplan.evaluation.episodes import OnStep, Step, episode_seed, iterate_episodes
@@ -45,7 +45,7 @@ from latentplan.training.run import Result
 from latentplan.training.signals import Signals, exit_code, raise_interrupt
 from latentplan.training.state import load_values, refuse_used, save_values
 
-KIND, FORMAT = "distillation", 2
+KIND, FORMAT = DISTILLATION, 2
 NUM_STAGES = 3  # per round: collect, train, select
 NO_ROUND = -1  # value of `best_round` while the actor before distillation is the best
 # Names of random streams, from which the starts of episodes derive; other names would change the results.
@@ -108,16 +108,32 @@ def resume_distillation(
     Raises:
         UserError: The folder holds no distillation, or the agent that it started from has changed.
     """
-    require_saves(Path(folder))
+    saved, settings, planner = read_resumed(folder, rounds=rounds, minutes=minutes)
+    run = _Distillation(Path(saved["source"]), Path(folder), settings, planner, device, make_env, env)
+    run.load(saved)
+    return run.run()
+
+
+def read_resumed(
+    folder: Path | str, *, rounds: int | None = None, minutes: float | None = None
+) -> tuple[dict[str, Any], DistillConfig, PlannerConfig]:
+    """What a distillation continues with: its last save, its settings and those of its search.
+
+    Args:
+        folder: As for `resume_distillation`, and so are the others.
+        rounds: New total number of rounds.
+        minutes: New total budget of minutes.
+
+    Raises:
+        UserError: The folder holds no distillation, or the agent that it started from has changed.
+    """
+    require_saves(Path(folder), KIND)
     saved = _load_distillation(Path(folder))
     if read_info(saved["source"])["sha256"] != saved["sha256"]:
         raise UserError(f"{saved['source']} is not the agent from which the distillation in {folder} started")
     settings = DistillConfig(**saved["settings"])
     settings = replace(settings, rounds=rounds or settings.rounds, minutes=minutes or settings.minutes)
-    planner = from_dict({"planner": saved["planner"]}).planner
-    run = _Distillation(Path(saved["source"]), Path(folder), settings, planner, device, make_env, env)
-    run.load(saved)
-    return run.run()
+    return saved, settings, from_dict({"planner": saved["planner"]}).planner
 
 
 @dataclass

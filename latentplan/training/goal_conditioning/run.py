@@ -16,7 +16,7 @@ import torch
 from latentplan.agents.checkpoint import load_model, read_info, resolve_checkpoint, save_checkpoint
 from latentplan.config import USER_DOMAIN, Config, GoalsConfig, UserError, derive_seed, to_dict
 from latentplan.config.commit import Save, Saves
-from latentplan.config.run_folder import RUN_FILE, SAVES_FOLDER, lock_folder, require_saves, run_saves
+from latentplan.config.run_folder import GOALS, RUN_FILE, SAVES_FOLDER, lock_folder, require_saves, run_saves
 from latentplan.models import WorldModel
 from latentplan.replay.buffer import Replay
 from latentplan.replay.dealing import DealtRows, count_ranks
@@ -31,7 +31,7 @@ from latentplan.training.state import load_values, refuse_used, save_values, war
 
 ROUND_DECISIONS = 125
 SAVE_SECONDS = 300.0
-KIND, FORMAT = "goals", 2
+KIND, FORMAT = GOALS, 2
 PLAYED_FOLDER = "replay"
 
 
@@ -73,15 +73,31 @@ def resume_goals(
     Raises:
         UserError: The folder holds nothing to resume, or the agent that the learning started from has changed.
     """
-    require_saves(Path(folder))
-    saves = _saves(Path(folder))
+    require_saves(Path(folder), KIND)
     with lock_folder(Path(folder)):
-        saved = load_values(saves, ("run", "source", "sha256", "settings", "minutes", "learner"))
-        if read_info(saved["source"])["sha256"] != saved["sha256"]:
-            raise UserError(f"{saved['source']} is not the agent from which {folder} started")
-        settings = GoalsConfig(**saved["settings"])
-        settings = replace(settings, updates=updates or settings.updates, minutes=minutes or settings.minutes)
+        saved, settings = read_resumed(folder, updates=updates, minutes=minutes)
         return _learn(Path(saved["run"]), Path(folder), settings, device, saved)
+
+
+def read_resumed(
+    folder: Path | str, *, updates: int | None = None, minutes: float | None = None
+) -> tuple[dict[str, Any], GoalsConfig]:
+    """What goal-conditioned learning continues with: its last save and its settings.
+
+    Args:
+        folder: As for `resume_goals`, and so are the others.
+        updates: New total number of updates.
+        minutes: New total budget of minutes.
+
+    Raises:
+        UserError: The folder holds nothing to resume, or the agent that the learning started from has changed.
+    """
+    require_saves(Path(folder), KIND)
+    saved = load_values(_saves(Path(folder)), ("run", "source", "sha256", "settings", "minutes", "learner"))
+    if read_info(saved["source"])["sha256"] != saved["sha256"]:
+        raise UserError(f"{saved['source']} is not the agent from which {folder} started")
+    settings = GoalsConfig(**saved["settings"])
+    return saved, replace(settings, updates=updates or settings.updates, minutes=minutes or settings.minutes)
 
 
 def load_replay(save: Save, model: WorldModel) -> Replay:

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import itertools
 import math
+import random
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -11,6 +14,8 @@ from latentplan.config import Config, UserError
 from latentplan.config.checks import shown
 from latentplan.config.files import Layer, read_layer
 from latentplan.config.parsing import alternatives, list_settings
+
+MOST_COMBINATIONS = 64  # that are tried beside one value
 
 
 @dataclass(frozen=True)
@@ -59,12 +64,47 @@ def read_space(path: Path) -> Space:
 
 
 def ends_of(space: Space) -> list[Layer]:
-    """Values that show whether the whole space is allowed: for each setting its ends, or all of its choices."""
-    found = []
-    for key, values in space.items():
-        each = (values.low, values.high) if isinstance(values, Range) else values
-        found += [as_layer({key: int(value) if _is_whole(values) else value}) for value in each]
-    return found
+    """For each setting in turn its ends, or all of its choices, as sections."""
+    return [as_layer({key: value}) for key, values in space.items() for value in _ends(values)]
+
+
+def check_space(space: Space, check: Callable[[Layer], object]) -> Layer:
+    """Values of all settings that are allowed; refuses a space where an end or a choice has no such values beside it.
+
+    Of the combinations of ends and choices, all are tried, or 64 that are drawn where there are more.
+
+    Args:
+        space: The space.
+        check: Raises UserError for values that no trial may have.
+
+    Raises:
+        UserError: An end or a choice is allowed in no combination; the message is that of the first one tried.
+    """
+    allowed: Layer = {}
+    for end in ends_of(space):
+        reason = None
+        for others in _combinations(space):
+            allowed = {**others, **{section: {**others[section], **fields} for section, fields in end.items()}}
+            try:
+                check(allowed)
+                break
+            except UserError as error:
+                reason = reason or error
+        else:
+            assert reason is not None
+            raise reason
+    return allowed
+
+
+def _combinations(space: Space) -> Iterator[Layer]:
+    """Values of all settings, each an end of its range or one of its choices."""
+    keys, ends = list(space), [_ends(values) for values in space.values()]
+    if math.prod(map(len, ends)) <= MOST_COMBINATIONS:
+        combinations: Iterable[tuple[Any, ...]] = itertools.product(*ends)
+    else:
+        draw = random.Random(0)
+        combinations = (tuple(map(draw.choice, ends)) for _ in range(MOST_COMBINATIONS))
+    return (as_layer(dict(zip(keys, values, strict=True))) for values in combinations)
 
 
 def as_layer(values: dict[str, Any]) -> Layer:
@@ -76,8 +116,10 @@ def as_layer(values: dict[str, Any]) -> Layer:
     return layer
 
 
-def _is_whole(values: Range | tuple[Any, ...]) -> bool:
-    return isinstance(values, Range) and values.is_whole
+def _ends(values: Range | tuple[Any, ...]) -> tuple[Any, ...]:
+    if not isinstance(values, Range):
+        return values
+    return tuple(int(end) if values.is_whole else end for end in (values.low, values.high))
 
 
 def _read_values(value: Any, kinds: tuple[Any, ...]) -> Range | tuple[Any, ...]:

@@ -15,13 +15,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from latentplan.config import Config, UserError, make_folder
+from latentplan.config import Config, RunConfig, UserError, make_folder
 from latentplan.config.extras import MissingExtra, import_extra
 from latentplan.config.files import Layer, compose, dump_config
 from latentplan.config.run_folder import run_saves
-from latentplan.config.run_results import Evaluation, find_state, is_locked, read_evaluations
+from latentplan.config.run_results import Evaluation, find_state, is_locked, note_state, read_evaluations
 from latentplan.config.writing import write_whole
-from latentplan.training.child_run import ChildRun, last_line
+from latentplan.training.child_run import LOG, ChildRun, last_line
 from latentplan.training.cluster import join_cluster
 from latentplan.training.signals import Signals
 from latentplan.training.sweep.space import Range, Space, as_layer
@@ -91,8 +91,12 @@ class Trial(NamedTuple):
     last: Evaluation | None
 
 
-def run_sweep(sweep: Sweep) -> tuple[list[Trial], int]:
+def run_sweep(sweep: Sweep, shared: RunConfig) -> tuple[list[Trial], int]:
     """Runs the trials of a sweep that have not ended; a sweep that was stopped goes on.
+
+    Args:
+        sweep: The sweep.
+        shared: Frames, device and seed, which all trials share.
 
     Returns:
         The trials that have begun, and the number of the signal that stopped the sweep or 0.
@@ -109,14 +113,14 @@ def run_sweep(sweep: Sweep) -> tuple[list[Trial], int]:
         tune = import_extra("ray.tune", PART)
     except ImportError as error:  # of Ray without its part `tune`
         raise MissingExtra(f"{PART} needs ray[tune]; run: pip install 'latentplan[ray]'") from error
-    _note(sweep)
+    _note(sweep, shared)
     ray = join_cluster(sweep.address, sweep.jobs, log_to_driver=False)
     logging.getLogger("ray.tune").setLevel(logging.CRITICAL)  # `Lines` says what happens
     import_extra("optuna", PART).logging.set_verbosity(logging.ERROR)
     warnings.filterwarnings("ignore", module="optuna")
     signal.signal(signal.SIGUSR1, signal.SIG_IGN)  # until Tune takes it as the request to stop
     with Signals(lambda _: os.kill(os.getpid(), signal.SIGUSR1)) as signals:
-        results = _make_tuner(tune, sweep).fit()
+        results = _make_tuner(tune, sweep, shared).fit()
     ray.shutdown()
     _await_saves(sweep.folder)
     if any(result.error for result in results) and not signals.received:
@@ -152,16 +156,15 @@ def best_of(trials: list[Trial]) -> Trial | None:
     return max(finished, key=lambda pair: pair[0])[1] if finished else None
 
 
-def _make_tuner(tune: Any, sweep: Sweep) -> Any:
+def _make_tuner(tune: Any, sweep: Sweep, shared: RunConfig) -> Any:
     """The tuner of a new sweep, or of one that was begun."""
-    config = sweep.resolve({})
-    resources = {"cpu": 1, "gpu": int(config.run.device == "cuda")}
+    resources = {"cpu": 1, "gpu": int(shared.device == "cuda")}
     trainable = tune.with_resources(tune.with_parameters(run_trial, sweep=sweep), resources)
     path = str((sweep.folder / TUNE_FOLDER).absolute())
     if tune.Tuner.can_restore(path):
         return tune.Tuner.restore(path, trainable, resume_unfinished=True, resume_errored=True)
-    frames = int(config.run.frames or 0)
-    search = import_extra("ray.tune.search.optuna", PART).OptunaSearch(seed=config.run.seed)
+    frames = int(shared.frames or 0)
+    search = import_extra("ray.tune.search.optuna", PART).OptunaSearch(seed=shared.seed)
     scheduler = import_extra("ray.tune.schedulers", PART).ASHAScheduler(
         time_attr="spent",
         max_t=frames,
@@ -225,10 +228,15 @@ def run_trial(values: dict[str, Any], sweep: Sweep) -> None:
     folder, settings = sweep.folder / name, sweep.folder / SETTINGS_FOLDER / f"{name}.yaml"
     for path in (folder, settings.parent):
         make_folder(path)
-    config = sweep.resolve(as_layer(values))
+    write_whole(folder / TRIAL_FILE, json.dumps([number, values]) + "\n")
+    try:
+        config = sweep.resolve(as_layer(values))
+    except UserError as error:  # of values that are not allowed beside each other
+        (folder / LOG).write_text(f"error: {error}\n")
+        note_state(folder, "failed", reason=str(error))
+        raise
     budget = int(config.run.frames or 0)
     dump_config(config, settings)
-    write_whole(folder / TRIAL_FILE, json.dumps([number, values]) + "\n")
     reported = len(_evaluations(folder)) - 1  # a trial that goes on repeats its latest report
     with _training(sweep, folder, settings) as process:
         while True:
@@ -267,7 +275,7 @@ def _training(sweep: Sweep, folder: Path, settings: Path) -> Iterator[ChildRun |
             process.wait(SAVING_S)
 
 
-def _note(sweep: Sweep) -> None:
+def _note(sweep: Sweep, shared: RunConfig) -> None:
     """Notes what the sweep is, or checks that the folder holds the same one."""
     make_folder(sweep.folder)
     facts: dict[str, Any] = {
@@ -278,7 +286,7 @@ def _note(sweep: Sweep) -> None:
         "file": sweep.file,
         "given": {name: fields for name, fields in sweep.given.items() if name != "run"},
         "preset": sweep.preset,
-        "frames": sweep.resolve({}).run.frames,
+        "frames": shared.frames,
         "env_id": sweep.env_id,
     }
     facts = json.loads(json.dumps(facts, default=str))

@@ -4,15 +4,18 @@ import math
 import os
 import shutil
 import signal
+from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
+import yaml
 
 from latentplan.agents.checkpoint import load_agent, load_model, read_info, save_checkpoint
 from latentplan.agents.gated import GatedAgent
 from latentplan.agents.planning import PlanningAgent
-from latentplan.config import GoalsConfig, UserError
+from latentplan.commands.main import main
+from latentplan.config import GoalsConfig, UserError, to_dict
 from latentplan.config.commit import Saves
 from latentplan.config.files import dump_config
 from latentplan.config.quantities import QUANTITIES
@@ -27,7 +30,7 @@ from latentplan.training import learn_goals, resume_goals
 from latentplan.training.goal_conditioning import learner as goal_learner
 from latentplan.training.goal_conditioning import run as goal_run
 from latentplan.training.goal_conditioning.learner import Boxes, BoxSource, GoalLearner
-from latentplan.training.goal_conditioning.run import describe_box, load_replay
+from latentplan.training.goal_conditioning.run import describe_box, load_replay, read_resumed
 from latentplan.training.learner.optimization import descend
 
 LABELS = {"height": 0.5, "speed": 1.0, "task.walk": 0.5}
@@ -121,6 +124,16 @@ def test_resume_goals_ends_with_the_agent_of_an_uninterrupted_learning(run, fini
     assert all(torch.equal(value, weights[1][name]) for name, value in weights[0].items())
 
 
+def test_read_resumed_takes_saved_settings_with_a_new_budget(finished):
+    assert read_resumed(finished.run_dir)[1] == SETTINGS
+    assert read_resumed(finished.run_dir, updates=99, minutes=2.0)[1] == replace(SETTINGS, updates=99, minutes=2.0)
+
+
+def test_goals_prints_the_settings_with_which_it_resumes(finished, capsys):
+    assert main(["goals", "--resume", str(finished.run_dir), "--updates", "99", "--print-config"]) == 0
+    assert yaml.safe_load(capsys.readouterr().out)["settings"] == to_dict(SETTINGS) | {"updates": 99}
+
+
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 def test_learn_goals_finishes_the_running_update_when_a_signal_arrives(run, finished, tmp_path, monkeypatch, number):
     def interrupted(optimizer, loss, max_norm, update):
@@ -212,7 +225,7 @@ def test_learn_goals_refuses_folders_and_agents_it_cannot_use(run, finished, tin
     refused(lambda: learn_goals(tmp_path / "mine", tmp_path / "a"), "no replay", "the folder of its run")
     with lock_folder(finished.run_dir):
         refused(lambda: resume_goals(finished.run_dir), "another process learns")
-    refused(lambda: resume_goals(run), "a run, not a goals")
+    refused(lambda: resume_goals(run), "holds a training run, not learned goals", "latentplan train --resume")
     unnamed = make_run(tmp_path / "unnamed", tiny(""), {})
     refused(lambda: learn_goals(unnamed, tmp_path / "b"), "without named quantities")
     other = make_run(tmp_path / "other", tiny("", env={"domain": "walker"}), LABELS)

@@ -10,6 +10,7 @@ import sys
 
 import pytest
 
+from latentplan.commands.main import main
 from latentplan.config import Config, LearningConfig, ReplayConfig, RunConfig, UserError
 from latentplan.training.checks import check_machines
 from latentplan.training.learner.registry import BEHAVIOUR_LOSSES, WORLD_MODEL_LOSSES
@@ -107,14 +108,71 @@ def test_config_refuses_wrong_numbers_of_processes_and_other_strategies(value):
         RunConfig(**value)
 
 
-def test_several_machines_need_an_address(monkeypatch):
-    for name in ("MASTER_ADDR", "NODE_RANK", "SLURM_JOB_ID", "RANK", "WORLD_SIZE"):
+@pytest.fixture
+def unset(monkeypatch):
+    """No variable of a launcher is set."""
+    names = "MASTER_ADDR MASTER_PORT NODE_RANK SLURM_JOB_ID RANK WORLD_SIZE LOCAL_RANK LOCAL_WORLD_SIZE"
+    for name in names.split():
         monkeypatch.delenv(name, raising=False)
+
+
+def test_several_machines_need_an_address(unset):
     with pytest.raises(UserError, match=r"run\.nodes 2 needs MASTER_ADDR, MASTER_PORT and NODE_RANK"):
         check_machines(RunConfig(nodes=2, device="cpu"))
 
 
-def test_processes_of_torchrun_decide_the_numbers(monkeypatch):
+ADDRESS = {"MASTER_ADDR": "10.0.0.1", "MASTER_PORT": "29500"}
+NODES_2, SIZES = {"nodes": 2}, {"WORLD_SIZE": "4", "LOCAL_WORLD_SIZE": "2"}
+
+
+@pytest.mark.parametrize(
+    ("run", "variables", "message"),
+    [
+        (NODES_2, {"MASTER_ADDR": "10.0.0.1", "NODE_RANK": "0"}, "run.nodes 2 needs MASTER_ADDR, MASTER_PORT and NODE"),
+        (NODES_2, ADDRESS | {"NODE_RANK": "2"}, r"NODE_RANK \(2\) must be below run.nodes \(2\)"),
+        (NODES_2, ADDRESS | {"NODE_RANK": "-1"}, "NODE_RANK must be a whole number, at least 0, got '-1'"),
+        ({"devices": 2}, {"NODE_RANK": "1"}, r"NODE_RANK \(1\) must be below run.nodes \(1\)"),
+        ({}, {"RANK": "a"}, "RANK must be a whole number, at least 0, got 'a'"),
+        ({}, {"LOCAL_RANK": "a"}, "LOCAL_RANK must be a whole number, at least 0, got 'a'"),
+        ({}, {"RANK": "0", "WORLD_SIZE": "0"}, "WORLD_SIZE must be a number above 0, got '0'"),
+        ({}, {"RANK": "5", "WORLD_SIZE": "2"}, r"RANK \(5\) must be below WORLD_SIZE \(2\)"),
+        ({}, SIZES | ADDRESS | {"RANK": "3", "LOCAL_RANK": "2"}, r"LOCAL_RANK \(2\) must be below LOCAL_WORLD_SIZE"),
+        ({}, SIZES | {"RANK": "3", "MASTER_PORT": "1"}, "run.nodes 2 needs MASTER_ADDR and MASTER_PORT in the"),
+    ],
+)
+def test_wrong_variables_of_a_launcher_are_refused(unset, monkeypatch, run, variables, message):
+    for name, value in variables.items():
+        monkeypatch.setenv(name, value)
+    with pytest.raises(UserError, match=message):
+        check_machines(RunConfig(device="cpu", **run))
+
+
+@pytest.mark.parametrize(
+    ("run", "variables"),
+    [
+        ({}, {"NODE_RANK": "7"}),  # of one process alone
+        ({"devices": 2}, {"LOCAL_RANK": "1", "NODE_RANK": "0", "WORLD_SIZE": "2"}),  # as Lightning sets them
+        (NODES_2, ADDRESS | {"NODE_RANK": "1"}),
+        (NODES_2, {"SLURM_JOB_ID": "1"}),
+        ({}, {"RANK": "1", "WORLD_SIZE": "2"}),
+        ({}, SIZES | ADDRESS | {"RANK": "3", "LOCAL_RANK": "1"}),
+    ],
+)
+def test_variables_of_a_launcher_are_accepted(unset, monkeypatch, run, variables):
+    for name, value in variables.items():
+        monkeypatch.setenv(name, value)
+    check_machines(RunConfig(device="cpu", **run))
+
+
+def test_train_refuses_a_wrong_rank_before_lightning_reads_it(unset, monkeypatch, tmp_path, capsys):
+    monkeypatch.setenv("RANK", "a")
+    monkeypatch.setenv("WORLD_SIZE", "2")
+    assert main(["train", "--frames", "10", "--device", "cpu", "--run-dir", str(tmp_path / "run")]) == 2
+    assert capsys.readouterr().err.startswith("error: the environment variable RANK must be a whole number")
+    assert not (tmp_path / "run").exists()
+
+
+def test_processes_of_torchrun_decide_the_numbers(unset, monkeypatch):
     assert place_ranks(Config()) == Config()
     for name, value in {"RANK": "3", "WORLD_SIZE": "4", "LOCAL_WORLD_SIZE": "2"}.items():
         monkeypatch.setenv(name, value)

@@ -6,7 +6,7 @@ import pytest
 
 from latentplan.commands.main import main
 from latentplan.config import UserError, extras
-from latentplan.training.sweep.space import Range, as_layer, ends_of, read_space
+from latentplan.training.sweep.space import Range, as_layer, check_space, ends_of, read_space
 
 SPACE = """
 learning:
@@ -77,12 +77,43 @@ def test_sweep_without_ray_says_what_to_install(tmp_path, capsys, no_optuna):
 
 
 @pytest.mark.parametrize(
+    ("flags", "text"),
+    [
+        ([], "planner: {action_spline: [linear, cubic], num_knots: [3, 4]}"),
+        (["--planner.num_knots", "3"], "planner: {action_spline: [linear, cubic]}"),
+        ([], "planner: {num_elites: [16, 100], num_samples: [64, 128]}"),  # 64 goes with 16, and 100 with 128
+        ([], "planner: {action_spline: [null, cubic], num_knots: [null, 4]}"),
+    ],
+)
+def test_sweep_accepts_values_that_are_allowed_in_some_combination(tmp_path, capsys, flags, text):
+    assert sweep(tmp_path, *flags, text=text) == 2  # for want of a budget, which is asked for after the space
+    assert capsys.readouterr().err == "error: a sweep needs --frames, the budget of a trial\n"
+
+
+def test_check_space_finds_a_refused_choice_among_very_many_combinations():
+    space = {f"planner.x{number}": (0, 1, 2) for number in range(20)}
+    tried = []
+
+    def check(values):
+        tried.append(values["planner"])
+        if values["planner"]["x7"] == 2:
+            raise UserError("x7 cannot be 2")
+
+    with pytest.raises(UserError, match="x7 cannot be 2"):
+        check_space(space, check)
+    assert len(tried) < 200
+    assert check_space({**space, "planner.x7": (0, 1)}, check)["planner"].keys() == {f"x{n}" for n in range(20)}
+
+
+@pytest.mark.parametrize(
     ("flags", "text", "message"),
     [
         ([], SPACE, "a sweep needs --frames, the budget of a trial"),
         (["--planner.horizon", "4"], SPACE, "--planner.horizon is a setting that .* varies"),
         ([], "planner: {horizon: {low: 0, high: 4}}", "planner.horizon must be a whole number, at least 1, got 0"),
         ([], "collection: {behaviour: [planner, sleep]}", "collection.behaviour must be one of"),
+        ([], "planner: {num_elites: [100], num_samples: [64]}", r"num_elites \(100\) must not exceed num_samples \(64"),
+        ([], "planner: {num_elites: [9, 300], num_samples: {low: 64, high: 128}}", r"num_elites \(300\) must not exce"),
         (["--run-dir", "x"], SPACE, "give --out"),
         (["--trials", "0"], SPACE, "--trials must be at least 1, got 0"),
     ],

@@ -6,9 +6,10 @@ from types import SimpleNamespace
 
 import pytest
 
+from latentplan.config import UserError
 from latentplan.config.run_results import note_state
 from latentplan.training.sweep import trials
-from latentplan.training.sweep.trials import Sweep
+from latentplan.training.sweep.trials import Sweep, Trial
 
 HEADER = "env_frames,updates,minutes,planner_return,actor_return\n"
 
@@ -37,6 +38,16 @@ def test_trial_reports_each_evaluation_once_when_a_file_cannot_be_read_for_a_whi
     monkeypatch.setattr(trials, "POLL_S", 0.0)
     trials.run_trial({}, sweep)
     assert [report["env_frames"] for report in reports] == [10, 20, 30]
+
+
+def test_trial_whose_values_contradict_each_other_fails_with_the_reason(sweep, monkeypatch):
+    context = SimpleNamespace(get_trial_id=lambda: "abc", get_trial_dir=lambda: "tune/run_trial_abc_1_x")
+    monkeypatch.setattr(trials, "import_extra", lambda *_: SimpleNamespace(get_context=lambda: context))
+    values = {"planner.num_elites": 100, "planner.num_samples": 64}
+    with pytest.raises(UserError, match=r"num_elites \(100\) must not exceed num_samples \(64\)"):
+        trials.run_trial(values, sweep)
+    assert trials.last_line(sweep.folder / "abc").startswith("error: planner.num_elites (100) must not exceed")
+    assert trials.list_trials(sweep.folder) == [Trial(1, values, "failed", None)]
 
 
 @pytest.mark.parametrize("state", ["running", "stopped", "failed", "finished"])  # running: of a run that was killed
