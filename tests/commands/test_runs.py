@@ -4,6 +4,7 @@ import csv
 import errno
 import io
 import json
+import os
 import re
 import sys
 from dataclasses import replace
@@ -16,7 +17,7 @@ from latentplan.commands.main import main
 from latentplan.config import Config, EnvConfig, PlannerConfig, RunConfig
 from latentplan.config.files import dump_config
 from latentplan.config.run_folder import lock_folder
-from latentplan.config.run_results import find_state, note_state
+from latentplan.config.run_results import find_state, note_state, read_progress
 from latentplan.evaluation.statistics import confidence_interval
 from latentplan.reporting.compare import group_runs, mean_curve
 from latentplan.reporting.runs import find_runs, read_run
@@ -94,6 +95,24 @@ def test_damaged_results_of_one_run_are_one_line_beside_the_other_runs(make_run,
     assert output.err.startswith(f"no run: the results in {damaged} cannot be read: ") and output.err.count("\n") == 1
     assert main(["compare", str(good), str(damaged)]) == 2
     assert capsys.readouterr().err.count("\n") == 1
+
+
+@pytest.mark.parametrize("name", ["metrics.csv", "final.json", "status.json"])
+def test_a_pipe_in_the_folder_of_a_run_makes_no_command_wait(make_run, tmp_path, capsys, name):
+    make_run("good")
+    odd = make_run("odd")
+    (odd / name).unlink(missing_ok=True)
+    os.mkfifo(odd / name)
+    assert main(["runs", str(tmp_path)]) == 0
+    output = capsys.readouterr()
+    assert "good" in output.out and output.err.count("\n") == (0 if name == "status.json" else 1)
+
+
+def test_progress_is_the_largest_clock_of_any_row(tmp_path):
+    rows = [(",".join(COLUMNS)), "2000,0,0.7,,", "2000,0,0.2,5,5"]  # an evaluation has the clock of its beginning
+    (tmp_path / "metrics.csv").write_text("\n".join(rows) + "\n")
+    assert read_progress(tmp_path) == (2000.0, 0.7)
+    assert read_progress(tmp_path / "none") == (0.0, 0.0)
 
 
 @pytest.mark.parametrize("method", ["iterdir", "exists"])
