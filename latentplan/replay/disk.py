@@ -6,6 +6,7 @@ rows of all of them to another number of processes.
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -14,7 +15,8 @@ import numpy as np
 import torch
 
 from latentplan.config import UserError
-from latentplan.config.commit import Extent, Log, Save, Saves
+from latentplan.config.commit import Log, Save, Saves
+from latentplan.config.manifest import Extent
 from latentplan.replay.buffer import COLUMNS, Replay, read_saved
 
 ROWS_FILE = "rows.pt"
@@ -52,6 +54,8 @@ class ReplayFiles:
     def write(self, part: Path) -> dict[str, Extent]:
         """Appends new frames, and writes the other columns into the folder of a save.
 
+        Frames whose log another program has changed are written again, and a warning names the log.
+
         Returns:
             The committed part of each log.
         """
@@ -59,6 +63,12 @@ class ReplayFiles:
         extents: dict[str, Extent] = {}
         for lane, log in enumerate(self._logs):
             first, end = int(replay.first[lane]), int(replay.written[lane])
+            if (changed := log.forget_changed()) is not None:
+                warnings.warn(
+                    f"{changed} was changed by another program: its frames are written again",
+                    RuntimeWarning,
+                    stacklevel=2,
+                )
             if (start := max(first, log.end)) < end:
                 log.append(start, self._blocks(lane, start, end))
             log.drop_before(first)

@@ -15,8 +15,9 @@ import torch
 
 from latentplan.agents.checkpoint import save_checkpoint
 from latentplan.config import Config
-from latentplan.config.commit import PART, Extent, Saves
+from latentplan.config.commit import PART, Saves
 from latentplan.config.files import dump_config
+from latentplan.config.manifest import Extent
 from latentplan.config.run_folder import RUN_FILE
 from latentplan.config.run_results import METRICS_FILE
 from latentplan.models import WorldModel

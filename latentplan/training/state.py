@@ -13,7 +13,8 @@ import torch
 
 from latentplan.agents.checkpoint import INFO
 from latentplan.config import UserError
-from latentplan.config.commit import DamageError, Extent, Save, Saves, write_synced
+from latentplan.config.commit import Save, Saves
+from latentplan.config.manifest import DamageError, Extent, write_synced
 from latentplan.config.run_folder import RUN_FILE, SAVES_FOLDER
 from latentplan.config.run_results import METRICS_FILE
 from latentplan.config.writing import replaced_whole

@@ -118,6 +118,25 @@ def test_save_that_fails_leaves_the_save_before(tmp_path, monkeypatch):
     assert_same(disk.replay, Disk(tmp_path, make_replay()).load().replay)
 
 
+@pytest.mark.parametrize("damage", [os.unlink, lambda path: os.truncate(path, 10)])
+@pytest.mark.parametrize("capacity", [60, 12])
+def test_save_writes_frames_again_whose_log_was_changed(tmp_path, damage, capacity):
+    disk, numbered = Disk(tmp_path, make_replay(capacity)), NumberedRows(0, (99,))
+    disk.files._logs[0].rows_per_file = 10
+    for start in range(0, 24, 8):
+        disk.replay.add(0, numbered.rows(start, start + 8))
+        disk.save()
+    path = sorted((tmp_path / "logs").iterdir())[-2]
+    damage(path)
+    disk.replay.add(0, numbered.rows(24, 32))
+    with pytest.warns(RuntimeWarning, match=f"{path.name} was changed by another program"):
+        disk.save()
+    assert_same(disk.replay, Disk(tmp_path, make_replay(capacity)).load().replay)
+    disk.replay.add(0, numbered.rows(32, 40))
+    disk.save()
+    assert_same(disk.replay, Disk(tmp_path, make_replay(capacity)).load().replay)
+
+
 @pytest.mark.parametrize(("before", "after"), [(60, 100), (12, 60), (60, 14), (12, 8)])
 def test_read_keeps_the_newest_rows_in_another_capacity(before, after, tmp_path):
     replay = make_filled_replay(capacity=before)
