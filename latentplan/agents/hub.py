@@ -19,8 +19,8 @@ from latentplan.agents.files import CARD, FILM, INFO, LARGEST, WEIGHTS, read_fil
 from latentplan.agents.info import resolve_checkpoint
 from latentplan.config import UserError
 from latentplan.config.checks import make_folder, shown
-from latentplan.config.commit import MANIFEST
 from latentplan.config.extras import import_extra
+from latentplan.config.manifest import MANIFEST
 from latentplan.config.reading import read_bytes
 
 CLIENT = "huggingface_hub"
