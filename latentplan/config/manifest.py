@@ -164,7 +164,7 @@ def measure_file(path: Path, size: int | None = None) -> Extent:
     return Extent(count, hasher.hexdigest())
 
 
-def write_synced(path: Path, content: bytes) -> None:
+def write_synced(path: Path, content: bytes | memoryview) -> None:
     """Writes a new file in place of whatever has its name, and flushes the file to the disk; no link is followed."""
     path.unlink(missing_ok=True)
     with path.open("xb") as file:

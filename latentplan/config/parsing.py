@@ -127,20 +127,22 @@ def take_values(settings: Sequence[Setting], values: Mapping[str, Any]) -> dict[
         values: Plain values, by key.
 
     Raises:
-        UserError: A value has the wrong type; the message names the setting, the value and what is allowed.
+        UserError: A key is unknown or a value has the wrong type; the message names the setting, the value and what is
+            allowed.
     """
-    taken = {}
-    for setting in settings:
-        if setting.key not in values:
-            continue
-        value, kinds = _spell_numbers(setting, values[setting.key]), alternatives(setting.hint)
+    known, taken = {setting.key: setting for setting in settings}, {}
+    for key in values:
+        if key not in known:
+            raise_unknown("setting", key, known)
+        setting = known[key]
+        value, kinds = _spell_numbers(setting, values[key]), alternatives(setting.hint)
         if isinstance(value, list):
             value = tuple(value)
         elif isinstance(value, float) and value.is_integer() and int in kinds and float not in kinds:
             value = int(value)
         if not fits(value, setting.hint):
             raise _wrong_type(setting, values, {})
-        taken[setting.key] = value
+        taken[key] = value
     return taken
 
 
@@ -149,14 +151,18 @@ def fits(value: Any, hint: Any) -> bool:
 
     Args:
         value: The value.
-        hint: A class, a `Literal`, a `tuple`, `list` or `dict` of such types, or several of them. A whole number is a
-            number too. A number has an absolute value below 10**18, or is a float.
+        hint: A class, a `Literal`, a `TypedDict`, a `tuple`, `list` or `dict` of such types, or several of them. Whole
+            numbers have absolute values below 10**18, and are numbers too.
     """
     origin, inner = typing.get_origin(hint), typing.get_args(hint)
     if origin in (typing.Union, types.UnionType):
         return any(fits(value, kind) for kind in inner)
     if origin is typing.Literal:
         return isinstance(value, str) and value in inner
+    if typing.is_typeddict(hint):
+        hints = typing.get_type_hints(hint)
+        is_whole = isinstance(value, dict) and hint.__required_keys__ <= set(value)
+        return is_whole and all(name not in value or fits(value[name], kind) for name, kind in hints.items())
     if origin is dict:
         return isinstance(value, dict) and all(fits(key, inner[0]) and fits(value[key], inner[1]) for key in value)
     if origin in (tuple, list):

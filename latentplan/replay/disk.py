@@ -16,8 +16,8 @@ import torch
 
 from latentplan.config import UserError
 from latentplan.config.commit import Log, Save, Saves
-from latentplan.config.manifest import Extent
-from latentplan.replay.buffer import COLUMNS, Replay, read_saved
+from latentplan.config.manifest import DamageError, Extent
+from latentplan.replay.buffer import COLUMNS, Replay, read_saved, write_saved
 
 ROWS_FILE = "rows.pt"
 FORMAT = 1
@@ -78,7 +78,7 @@ class ReplayFiles:
         episode = torch.from_numpy(replay.episode)[index.cpu()]
         bounds = {name: torch.from_numpy(getattr(replay, name).copy()) for name in ("first", "written")}
         recorded = {"num_recorded": replay.num_recorded} if replay.num_recorded else {}
-        torch.save(columns | bounds | {"episode": episode} | recorded, part / rows_file(self.rank))
+        write_saved(columns | bounds | {"episode": episode} | recorded, part / rows_file(self.rank))
         return extents
 
     def read(self, save: Save) -> None:
@@ -117,9 +117,25 @@ def read_rows(save: Save, rank: int) -> dict[str, Any]:
     """The rows that one process saved, but their frames.
 
     Raises:
-        UserError: The file is damaged.
+        DamageError: The file is damaged, or its parts do not fit each other.
     """
-    saved: dict[str, Any] = read_saved(save.folder / rows_file(rank), keys=(*COLUMNS, "episode", "first", "written"))
+    path = save.folder / rows_file(rank)
+    kinds = dict.fromkeys((*COLUMNS, "episode", "first", "written"), torch.Tensor)
+    saved: dict[str, Any] = read_saved(path, keys=kinds)
+    whole = ("episode", "first", "written")
+    dims = dict.fromkeys(kinds, 1) | dict.fromkeys(("deter", "actions", "labels"), 2)
+    for name, value in ((name, saved[name]) for name in kinds):
+        is_right = value.dtype == torch.int64 if name in whole else value.is_floating_point()
+        if not is_right or value.ndim != dims[name]:
+            raise DamageError(f"{path} is damaged: {name} has another form")
+    first, written, recorded = saved["first"], saved["written"], saved.get("num_recorded", 0)
+    if first.shape != written.shape or not bool(((first >= 0) & (first <= written)).all()):
+        raise DamageError(f"{path} is damaged: the numbers of its rows are not in order")
+    rows = (written - first).tolist()
+    if any(len(saved[name]) != sum(rows) for name in (*COLUMNS, "episode")):
+        raise DamageError(f"{path} is damaged: its columns must have {sum(rows):,} rows")
+    if type(recorded) is not int or recorded < 0 or len(rows) <= (recorded > 0) or (recorded and rows[-1] > recorded):
+        raise DamageError(f"{path} is damaged: num_recorded has another form")
     return saved
 
 
@@ -183,9 +199,13 @@ class Counts(NamedTuple):
 
 
 def count_saved(save: Save, rank: int = 0) -> Counts:
-    """What the saved replay of one process holds, without its frames."""
-    saved = read_saved(save.folder / rows_file(rank), keys=("first", "written"))
-    recorded = int(saved.get("num_recorded", 0))  # saves of earlier versions lack it
+    """What the saved replay of one process holds, without its frames.
+
+    Raises:
+        DamageError: The file is damaged, or its parts do not fit each other.
+    """
+    saved = read_rows(save, rank)
+    recorded: int = saved.get("num_recorded", 0)  # saves of earlier versions lack it
     rows = (saved["written"] - saved["first"]).tolist()
     lanes = rows[:-1] if recorded else rows
     return Counts(len(lanes), max(lanes), recorded)

@@ -300,7 +300,8 @@ class Collect(lightning.Callback):
     def _submit_round(self) -> None:
         arguments = self.requests["collect"]
         share = -(-arguments["decisions"] // self.ranks.size)
-        self.worker.submit("collect", self.requests["weights"], *(arguments | {"decisions": share}).values())
+        more = arguments["behaviour"], share, arguments["counter"], arguments["goal"]
+        self.worker.submit("collect", self.requests["weights"], *more)
 
     def _submit_evaluation(self) -> None:
         if not self.ranks.is_first:

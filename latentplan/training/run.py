@@ -323,7 +323,7 @@ class _Run:
         if save is not None and saved is not None:
             check_memory(saved.memory, config, self.folder)
             self.files.read(save) if dealt is None else dealt.fill(self.replay)
-            restore_learner(self.learner, saved.learner, self.folder)
+            restore_learner(self.learner, saved.learner, self.folder, saved.requests["weights"])
             if ranks.is_first:
                 restore_metrics(save, self.folder)
         else:

@@ -39,10 +39,10 @@ from latentplan.models.heads import Actor
 from latentplan.training.collection.collector import EnvFactory
 from latentplan.training.console import StatusLine
 from latentplan.training.distillation.labels import Demonstrations, plan_actions, read_first_actions
-from latentplan.training.distillation.student import Student
+from latentplan.training.distillation.student import Student, StudentState
 from latentplan.training.run import Result
 from latentplan.training.signals import Signals, exit_code, raise_interrupt
-from latentplan.training.state import load_values, refuse_used, save_values
+from latentplan.training.state import build, build_settings, load_values, refuse_used, save_values
 
 KIND, FORMAT = "distillation", 2
 NUM_STAGES = 3  # per round: collect, train, select
@@ -111,12 +111,28 @@ def resume_distillation(
     saved = _load_distillation(Path(folder))
     if read_info(saved["source"])["sha256"] != saved["sha256"]:
         raise UserError(f"{saved['source']} is not the agent from which the distillation in {folder} started")
-    settings = DistillConfig(**saved["settings"])
+    settings = build_settings(DistillConfig, saved["settings"], Path(folder))
     settings = replace(settings, rounds=rounds or settings.rounds, minutes=minutes or settings.minutes)
-    planner = from_dict({"planner": saved["planner"]}).planner
+    try:
+        planner = from_dict({"planner": saved["planner"]}).planner
+    except ValueError as error:
+        raise UserError(f"the last save in {folder} is damaged: {error}") from None
     run = _Distillation(Path(saved["source"]), Path(folder), settings, planner, device, make_env, env)
     run.load(saved)
     return run.run()
+
+
+SAVED = {
+    "source": str,
+    "sha256": str,
+    "settings": dict[str, Any],
+    "planner": dict[str, Any],
+    "state": dict[str, Any],
+    "demonstrations": dict[str, torch.Tensor],
+    "student": StudentState,
+    "best": dict[str, torch.Tensor],
+}
+"""The types of what a save of a distillation holds."""
 
 
 @dataclass
@@ -269,12 +285,25 @@ class _Distillation:
             self.env.close()
 
     def load(self, saved: dict[str, Any]) -> None:
-        """Load what `_save` saved."""
+        """Load what `_save` saved.
+
+        Raises:
+            UserError: The saved weights or labels do not fit the agent.
+        """
         self.saves.newest()  # which the next save keeps
-        self.state = DistillationState(**saved["state"])
+        self.state = build(DistillationState, saved["state"], self.folder)
+        if not (math.isfinite(self.state.minutes) and self.state.minutes >= 0.0 and self.state.stage >= 0):
+            raise UserError(f"the last save in {self.folder} is damaged: its clocks are outside of their ranges")
         self._earlier_minutes = self.state.minutes
-        self.demonstrations.load_state_dict(saved["demonstrations"])
-        self.student.load_state_dict(saved["student"])
+        try:
+            self.demonstrations.load_state_dict(saved["demonstrations"])
+            self.model.actor.load_state_dict(saved["best"])
+            self.student.load_state_dict(saved["student"])
+        except (RuntimeError, ValueError) as error:
+            reason = str(error).splitlines()[-1].strip()
+            raise UserError(
+                f"what is saved in {self.folder} does not fit the agent of {self.source}: {reason}"
+            ) from None
         self.best = saved["best"]
         self.model.actor.load_state_dict(self.student.weights())
 
@@ -448,9 +477,7 @@ def _load_distillation(folder: Path) -> dict[str, Any]:
         raise UserError(
             f"{folder} was saved by latentplan 0.2.0 or earlier: finish it with that version, or start anew"
         )
-    return load_values(
-        _saves(folder), ("source", "sha256", "settings", "planner", "state", "demonstrations", "student")
-    )
+    return load_values(_saves(folder), SAVED)
 
 
 def format_mean(returns: Sequence[float], *, signed: bool = False) -> str:
