@@ -300,8 +300,7 @@ class Collect(lightning.Callback):
     def _submit_round(self) -> None:
         arguments = self.requests["collect"]
         share = -(-arguments["decisions"] // self.ranks.size)
-        more = arguments["behaviour"], share, arguments["counter"], arguments["goal"]
-        self.worker.submit("collect", self.requests["weights"], *more)
+        self.worker.submit("collect", self.requests["weights"], *(arguments | {"decisions": share}).values())
 
     def _submit_evaluation(self) -> None:
         if not self.ranks.is_first:

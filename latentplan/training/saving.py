@@ -18,7 +18,7 @@ from latentplan.config import Config
 from latentplan.config.commit import PART, Saves
 from latentplan.config.files import dump_config
 from latentplan.config.manifest import Extent
-from latentplan.config.run_folder import RUN_FILE
+from latentplan.config.run_folder import CHECKPOINTS, RUN_FILE
 from latentplan.config.run_results import METRICS_FILE
 from latentplan.models import WorldModel
 from latentplan.replay.buffer import write_saved
@@ -170,7 +170,7 @@ class Save(lightning.Callback):
             memory = self.collect.memory  # the collector remembers an end that the replay has overwritten
             has_seen_end = bool(memory and memory["has_seen_end"]) or self.files.replay.has_recorded_end
             planner = replace(planner, use_continues=has_seen_end)
-        save_checkpoint(self.folder / "checkpoints" / name, model, replace(self.config, planner=planner), facts)
+        save_checkpoint(self.folder / CHECKPOINTS / name, model, replace(self.config, planner=planner), facts)
 
     def clocks(self, learner: Learner) -> dict[str, Any]:
         """The frames, updates and minutes of the present agent."""

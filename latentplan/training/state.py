@@ -14,17 +14,19 @@ from typing import TYPE_CHECKING, Any, TypedDict, TypeVar
 import torch
 from torch import Tensor
 
-from latentplan.agents.checkpoint import INFO
+from latentplan.agents.files import INFO, WEIGHTS
+from latentplan.agents.files import remove_leftovers as remove_agent_leftovers
 from latentplan.config import UserError
 from latentplan.config.commit import Save, Saves
 from latentplan.config.manifest import DamageError, Extent, write_synced
 from latentplan.config.parsing import fits, list_settings, take_values
-from latentplan.config.run_folder import RUN_FILE, SAVES_FOLDER
-from latentplan.config.run_results import METRICS_FILE
-from latentplan.config.writing import replaced_whole
+from latentplan.config.run_folder import CHECKPOINTS, RUN_FILE, SAVES_FOLDER
+from latentplan.config.run_results import FINAL_FILE, METRICS_FILE, STATUS_FILE
+from latentplan.config.writing import remove_parts, replaced_whole
 from latentplan.replay.buffer import read_saved, write_saved
 from latentplan.replay.dealing import count_ranks
-from latentplan.training.collection.memory import Evaluated, Memory, Requests
+from latentplan.training.collection.memory import Evaluated, Memory, Requests, Round
+from latentplan.training.facts import REPORT_FILE
 from latentplan.training.learner.optimization import OptimizerState
 from latentplan.training.ranks import Ranks
 
@@ -167,6 +169,8 @@ def read_state(save: Save) -> SavedRun:
     are_right &= math.isfinite(state.minutes) and state.earlier_minutes >= 0.0 and not math.isnan(state.best_return)
     if not are_right or not fits(state.evaluations, list[Evaluated]):
         raise DamageError(f"{path} is damaged: its clocks or evaluations are outside of their ranges")
+    if (asked := saved["requests"]["collect"]) is not None:  # the values are arguments, in this order
+        saved["requests"]["collect"] = {name: asked[name] for name in Round.__annotations__}
     return SavedRun(state, **{name: saved[name] for name in SAVED_RUN if name != "run"})
 
 
@@ -284,6 +288,17 @@ def restore_metrics(save: Save, folder: Path) -> None:
         return
     with replaced_whole(path) as part:
         write_synced(part, (save.folder / METRICS_FILE).read_bytes())
+
+
+def remove_leftovers(folder: Path) -> None:
+    """Removes what killed processes left in a folder of a run, or of another learning; its lock must be held."""
+    Saves(folder / SAVES_FOLDER, "any", 0).remove_leftovers()
+    for name in (RUN_FILE, METRICS_FILE, STATUS_FILE, FINAL_FILE, REPORT_FILE):
+        remove_parts(folder / name)
+    for film in (folder / "videos").glob(".*.webm"):
+        film.unlink(missing_ok=True)
+    for agent in (folder, *(folder / CHECKPOINTS / name for name in ("best", "last"))):
+        remove_agent_leftovers(agent, (WEIGHTS, INFO))
 
 
 def refuse_used(folder: Path, kind: str, flag: str) -> None:

@@ -42,7 +42,7 @@ from latentplan.training.distillation.labels import Demonstrations, plan_actions
 from latentplan.training.distillation.student import Student, StudentState
 from latentplan.training.run import Result
 from latentplan.training.signals import Signals, exit_code, raise_interrupt
-from latentplan.training.state import build, build_settings, load_values, refuse_used, save_values
+from latentplan.training.state import build, build_settings, load_values, refuse_used, remove_leftovers, save_values
 
 KIND, FORMAT = "distillation", 2
 NUM_STAGES = 3  # per round: collect, train, select
@@ -266,7 +266,7 @@ class _Distillation:
         signals = Signals(raise_interrupt)
         try:
             with lock_folder(self.folder), self.line, signals:
-                self.saves.remove_leftovers()
+                remove_leftovers(self.folder)
                 if not state.planner:
                     self._evaluate_initial()
                 while not self._is_spent():

@@ -27,7 +27,14 @@ from latentplan.training.console import StatusLine
 from latentplan.training.goal_conditioning.learner import BoxSource, GoalLearner, GoalLearnerState
 from latentplan.training.run import Result
 from latentplan.training.signals import Signals, exit_code, raise_interrupt
-from latentplan.training.state import build_settings, load_values, refuse_used, save_values, warn_of_loss
+from latentplan.training.state import (
+    build_settings,
+    load_values,
+    refuse_used,
+    remove_leftovers,
+    save_values,
+    warn_of_loss,
+)
 
 ROUND_DECISIONS = 125
 SAVE_SECONDS = 300.0
@@ -190,7 +197,7 @@ def _learn(run: Path, folder: Path, settings: GoalsConfig, device: str, saved: d
         save_values(saves, about | state, {"updates": learner.updates, "minutes": round(minutes(), 1)})
 
     with line, signals:
-        saves.remove_leftovers()
+        remove_leftovers(folder)
         budget = settings.minutes or math.inf
         while learner.updates < settings.updates and not (signals.received or minutes() >= budget):
             parts = learner.update()
