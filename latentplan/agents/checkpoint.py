@@ -13,12 +13,11 @@ from safetensors import SafetensorError
 from safetensors.torch import load, save
 
 from latentplan.agents.base import Agent
-from latentplan.agents.files import INFO, WEIGHTS, seal, write_files
+from latentplan.agents.files import INFO, WEIGHTS, finish_renaming, seal, write_files
 from latentplan.agents.info import read_contents, read_info, read_spaces, resolve_checkpoint, suggestion
 from latentplan.agents.modes import MODES, make_agent
 from latentplan.config import Config, PlannerConfig, UserError, from_dict, to_dict
 from latentplan.config.checks import shown
-from latentplan.config.commit import MANIFEST
 from latentplan.config.estimates import check_parts, estimate_search
 from latentplan.config.planner import override_planner
 from latentplan.config.spaces import Spaces
@@ -70,8 +69,8 @@ def seal_checkpoint(path: str | Path) -> None:
         UserError: The checkpoint cannot be used as it is now.
     """
     folder = resolve_checkpoint(path)
-    (folder / MANIFEST).unlink(missing_ok=True)
-    load_model(folder)
+    finish_renaming(folder)
+    _make_model(folder, *read_contents(folder, is_sealed=False), "cpu")
     seal(folder, (INFO, WEIGHTS))
 
 
@@ -87,27 +86,7 @@ def load_model(path: str | Path, device: str = "cpu") -> tuple[WorldModel, Confi
         UserError: The checkpoint is missing or damaged, another program wrote it, or the device cannot be used.
     """
     folder = resolve_checkpoint(path)
-    info, content = read_contents(folder)
-    weights = folder / WEIGHTS
-    try:
-        config = from_dict(info["config"])
-    except (AttributeError, TypeError, ValueError) as error:
-        raise UserError(f"the settings in {folder / INFO} cannot be used: {error}") from None
-    try:
-        sizes = info["action_dim"], info.get("labels"), info.get("goal_dim") or 0, read_spaces(info)
-        state = {name: value.float() for name, value in load(content).items()}
-        with torch.device("meta"):  # compares shapes before a model is allocated whose size the file names
-            WorldModel(config.model, *sizes).load_state_dict(state, assign=True)
-        model = WorldModel(config.model, *sizes)
-        model.load_state_dict(state)
-    except (RuntimeError, SafetensorError, TypeError, ValueError) as error:
-        raise UserError(f"{weights} does not fit its own settings: {str(error).splitlines()[-1].strip()}") from None
-    if broken := _first_not_finite(state):
-        raise UserError(f"{weights} cannot be used: {broken} is not finite")
-    try:
-        return accelerate(model.to(device)), config, info
-    except (AssertionError, RuntimeError) as error:
-        raise UserError(f"device {device!r} cannot be used: {str(error).splitlines()[0]}") from None
+    return _make_model(folder, *read_contents(folder), device)
 
 
 def load_agent(path: str | Path, mode: str = "planner", device: str = "cpu", **settings: Any) -> Agent:
@@ -167,6 +146,32 @@ def make_loaded_agent(
         return make_agent(mode, model, config, info["discount"], planner=planner, **options)
     except (TypeError, ValueError) as error:
         raise UserError(f"planner settings: {error}") from None
+
+
+def _make_model(
+    folder: Path, info: dict[str, Any], content: bytes, device: str
+) -> tuple[WorldModel, Config, dict[str, Any]]:
+    """What `load_model` returns, from the description and the weights that a folder holds."""
+    weights = folder / WEIGHTS
+    try:
+        config = from_dict(info["config"])
+    except (AttributeError, TypeError, ValueError) as error:
+        raise UserError(f"the settings in {folder / INFO} cannot be used: {error}") from None
+    try:
+        sizes = info["action_dim"], info.get("labels"), info.get("goal_dim") or 0, read_spaces(info)
+        state = {name: value.float() for name, value in load(content).items()}
+        with torch.device("meta"):  # compares shapes before a model is allocated whose size the file names
+            WorldModel(config.model, *sizes).load_state_dict(state, assign=True)
+        model = WorldModel(config.model, *sizes)
+        model.load_state_dict(state)
+    except (RuntimeError, SafetensorError, TypeError, ValueError) as error:
+        raise UserError(f"{weights} does not fit its own settings: {str(error).splitlines()[-1].strip()}") from None
+    if broken := _first_not_finite(state):
+        raise UserError(f"{weights} cannot be used: {broken} is not finite")
+    try:
+        return accelerate(model.to(device)), config, info
+    except (AssertionError, RuntimeError) as error:
+        raise UserError(f"device {device!r} cannot be used: {str(error).splitlines()[0]}") from None
 
 
 def _check_mode(mode: str, settings: Mapping[str, Any]) -> dict[str, Any]:

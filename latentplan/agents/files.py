@@ -8,14 +8,25 @@ that a checkpoint is whole at every moment, also after a crash between two renam
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
 from latentplan.config import UserError
-from latentplan.config.commit import MANIFEST, PART, DamageError, Manifest, read_manifest, sync, write_manifest
+from latentplan.config.commit import PART
+from latentplan.config.manifest import (
+    MANIFEST,
+    DamageError,
+    Manifest,
+    read_manifest,
+    sync,
+    write_manifest,
+    write_synced,
+)
 from latentplan.config.reading import read_bytes
+from latentplan.config.writing import remove_parts
 
 WEIGHTS = "weights.safetensors"
 INFO = "info.json"
@@ -35,11 +46,14 @@ def write_files(folder: Path, contents: Mapping[str, bytes]) -> None:
         contents: Content of each file, by name.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    if (folder / MANIFEST).exists():
-        _finish_renaming(folder)
-    for name, content in contents.items():
-        (folder / f"{name}{PART}").write_bytes(content)
-    write_manifest(folder, KIND, FORMAT, {}, {}, names=list(contents), suffix=PART)
+    finish_renaming(folder)
+    try:
+        for name, content in contents.items():
+            write_synced(folder / f"{name}{PART}", content)
+        write_manifest(folder, KIND, FORMAT, {}, {}, names=list(contents), suffix=PART)
+    except BaseException:  # a full disk needs the room
+        _remove_parts(folder, contents)
+        raise
     (folder / f"{MANIFEST}{PART}").replace(folder / MANIFEST)
     sync(folder)
     for name in contents:
@@ -50,16 +64,54 @@ def write_files(folder: Path, contents: Mapping[str, bytes]) -> None:
 def seal(folder: Path, names: Sequence[str]) -> None:
     """Writes the manifest of a checkpoint whose files were changed on purpose, or that has none."""
     write_manifest(folder, KIND, FORMAT, {}, {}, names=names)
+    sync(folder)
 
 
-def read_files(folder: Path, names: Sequence[str]) -> dict[str, bytes]:
+def finish_renaming(folder: Path) -> bool:
+    """Does what is left of a commit that was cut off after the renaming of its manifest.
+
+    Returns:
+        Whether no file with the suffix is part of the checkpoint any more; false where the manifest cannot be read.
+    """
+    if not (folder / MANIFEST).exists():
+        return True
+    try:
+        manifest = read_manifest(folder, KIND, FORMAT)
+    except UserError:
+        return False
+    for name in manifest.files:
+        with contextlib.suppress(UserError):  # a damaged file stays where it is
+            path, _ = _find(folder, name, manifest)
+            if path.name != name:
+                path.replace(folder / name)
+    return True
+
+
+def remove_leftovers(folder: Path, names: Iterable[str]) -> None:
+    """Removes what commits left that were cut off before the renaming of their manifest, and finishes later ones.
+
+    Args:
+        folder: Folder of the checkpoint; it need not exist.
+        names: The files of a checkpoint.
+    """
+    remove_parts(folder / f"{MANIFEST}{PART}")
+    if finish_renaming(folder):
+        _remove_parts(folder, names)
+
+
+def read_files(folder: Path, names: Sequence[str], *, is_sealed: bool = True) -> dict[str, bytes]:
     """The content of files of a checkpoint, by name; compared with the manifest if there is one.
+
+    Args:
+        folder: Folder of the checkpoint.
+        names: The files.
+        is_sealed: Whether the manifest counts; without it the files are read as they are.
 
     Raises:
         UserError: A file cannot be read, or differs from what the manifest says of it.
     """
     for attempt in range(TRIES):
-        has_manifest = (folder / MANIFEST).exists()
+        has_manifest = is_sealed and (folder / MANIFEST).exists()
         try:
             if not has_manifest:
                 return {name: _read(folder / name) for name in names}
@@ -73,8 +125,9 @@ def read_files(folder: Path, names: Sequence[str]) -> dict[str, bytes]:
 
 
 def is_checkpoint(folder: Path, names: Sequence[str]) -> bool:
-    """Whether a folder holds all files of a checkpoint."""
-    return all((folder / name).is_file() or (folder / f"{name}{PART}").is_file() for name in names)
+    """Whether a folder holds all files of a checkpoint; without a manifest, files with the suffix are none."""
+    suffixes = ("", PART) if (folder / MANIFEST).is_file() else ("",)
+    return all(any((folder / f"{name}{suffix}").is_file() for suffix in suffixes) for name in names)
 
 
 def _find(folder: Path, name: str, manifest: Manifest) -> tuple[Path, bytes]:
@@ -92,16 +145,9 @@ def _find(folder: Path, name: str, manifest: Manifest) -> tuple[Path, bytes]:
     )
 
 
-def _finish_renaming(folder: Path) -> None:
-    """Do what is left of an earlier commit, before its files are overwritten."""
-    try:
-        manifest = read_manifest(folder, KIND, FORMAT)
-        for name in manifest.files:
-            path, _ = _find(folder, name, manifest)
-            if path.name != name:
-                path.replace(folder / name)
-    except UserError:
-        return  # a damaged checkpoint is replaced
+def _remove_parts(folder: Path, names: Iterable[str]) -> None:
+    for name in (*names, MANIFEST):
+        (folder / f"{name}{PART}").unlink(missing_ok=True)
 
 
 def _read(path: Path) -> bytes:

@@ -19,8 +19,8 @@ from latentplan.agents.files import CARD, FILM, INFO, LARGEST, WEIGHTS, read_fil
 from latentplan.agents.info import resolve_checkpoint
 from latentplan.config import UserError
 from latentplan.config.checks import make_folder, shown
-from latentplan.config.commit import MANIFEST
 from latentplan.config.extras import import_extra
+from latentplan.config.manifest import MANIFEST
 from latentplan.config.reading import read_bytes
 
 CLIENT = "huggingface_hub"
@@ -98,8 +98,9 @@ def pull_agent(repo: str, out: str | Path, *, revision: str | None = None, endpo
         found = api.model_info(repo, revision=revision, files_metadata=True)
         commit, sizes = str(found.sha), {each.rfilename: each.size for each in found.siblings or ()}
     names = _choose_files(repo, sizes)
+    is_there = out.is_dir()  # it may be the working folder or a mount point, which keep their place
     make_folder(out.parent)
-    with tempfile.TemporaryDirectory(prefix=f".{out.name}.", dir=out.parent) as made:
+    with tempfile.TemporaryDirectory(prefix=f".{out.name}.", dir=out if is_there else out.parent) as made:
         fetched, agent = Path(made) / "fetched", Path(made) / "agent"
         agent.mkdir()
         for name in names:
@@ -118,7 +119,10 @@ def pull_agent(repo: str, out: str | Path, *, revision: str | None = None, endpo
         except UserError as error:
             reason = str(error).replace(f"{agent}/", "").replace(str(agent), "the repository")
             raise UserError(f"the agent of {repo} cannot be used: {reason}") from None
-        agent.replace(out)
+        if not is_there:
+            agent.replace(out)
+        for name in sorted(names, key=lambda name: name == MANIFEST) if is_there else ():  # the manifest last
+            (agent / name).replace(out / name)
     return commit
 
 

@@ -18,6 +18,7 @@ from latentplan.config.spaces import Spaces
 MOST_NAMES = 5  # known names in an error message
 LARGEST_COUNT = 10**15  # of frames, updates and minutes; larger numbers are damage
 LARGEST_SIZE = 4096  # of actions, labels and goals
+DTYPES = ("F16", "BF16", "F32", "F64")  # of weights, as safetensors names them
 
 
 def _is_number(low: float, high: float, kinds: Any = (int, float)) -> tuple[Callable[[Any], bool], str]:
@@ -76,20 +77,30 @@ def read_info(path: str | Path) -> dict[str, Any]:
     return read_contents(resolve_checkpoint(path))[0]
 
 
-def read_contents(folder: Path) -> tuple[dict[str, Any], bytes]:
+def read_contents(folder: Path, *, is_sealed: bool = True) -> tuple[dict[str, Any], bytes]:
     """The description and the weights of a checkpoint, both checked.
+
+    Args:
+        folder: Folder of the checkpoint.
+        is_sealed: Whether they must agree with the manifest, if there is one.
 
     Raises:
         UserError: The checkpoint is damaged, or another program wrote it.
     """
-    contents = read_files(folder, (INFO, WEIGHTS))
+    contents = read_files(folder, (INFO, WEIGHTS), is_sealed=is_sealed)
     info = _parse(folder, contents[INFO])
     if hashlib.sha256(contents[WEIGHTS]).hexdigest() != info["sha256"]:
         raise UserError(f"{folder / WEIGHTS} is damaged: its checksum differs from the checksum in {INFO}")
     try:
-        deserialize(contents[WEIGHTS])
+        tensors = deserialize(contents[WEIGHTS])
     except SafetensorError as error:
         raise UserError(f"{folder / WEIGHTS} holds no weights: {error}") from None
+    for name, tensor in tensors:
+        if tensor["dtype"] not in DTYPES:
+            raise UserError(
+                f"{folder / WEIGHTS} cannot be used: {cut(name)} has dtype {tensor['dtype']}, and weights have one of "
+                f"{', '.join(DTYPES)}"
+            )
     return info, contents[WEIGHTS]
 
 

@@ -13,42 +13,32 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
-import json
 import os
 import re
 import shutil
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 from latentplan.config.checks import UserError, make_folder
+from latentplan.config.manifest import (
+    LARGEST_MANIFEST,
+    LOGS,
+    MANIFEST,
+    DamageError,
+    Extent,
+    check_extent,
+    check_files,
+    read_blocks,
+    read_manifest,
+    sync,
+    write_manifest,
+)
+from latentplan.config.reading import parse_json, read_text
 
-MANIFEST = "manifest.json"
-LOGS = "logs"  # folder of the logs, beside the saves
 PART = ".part"
-LARGEST_MANIFEST = 64 * 2**20
 _NAME = re.compile(r"save-(\d{6,})")
-_FILE = re.compile(r"(?:logs/)?\w[\w.-]*")
-_KEYS = {"kind", "format", "note", "files", "logs", "sha256"}
-_BLOCK = 2**20
-
-
-class DamageError(UserError):
-    """Saved files differ from what their manifest says; the message is one line."""
-
-
-@dataclass(frozen=True)
-class Extent:
-    """The first bytes of a file that belong to a save.
-
-    Attributes:
-        bytes: Number of bytes.
-        sha256: Checksum of these bytes, in hexadecimal digits.
-    """
-
-    bytes: int
-    sha256: str
 
 
 @dataclass(frozen=True)
@@ -87,8 +77,9 @@ class Saves:
         """What the saves in the folder say that they are, whatever their state."""
         kinds = set()
         for number in self._numbers():
-            with contextlib.suppress(OSError, ValueError, TypeError, KeyError):
-                kinds.add(str(json.loads((self.folder / f"save-{number:06d}" / MANIFEST).read_text())["kind"]))
+            path = self.folder / f"save-{number:06d}" / MANIFEST
+            with contextlib.suppress(UserError, TypeError, KeyError):
+                kinds.add(str(parse_json(read_text(path, LARGEST_MANIFEST), path)["kind"]))
         return kinds
 
     def commit(self, write: Callable[[Path], Mapping[str, Extent]], note: Mapping[str, Any]) -> Save:
@@ -107,14 +98,14 @@ class Saves:
         final = self.folder / f"save-{max(self._numbers(), default=0) + 1:06d}"
         part = final.with_name(final.name + PART)
         try:
-            shutil.rmtree(part, ignore_errors=True)
+            remove(part)
             part.mkdir()
             logs = write(part)
             write_manifest(part, self.kind, self.version, note, logs)
             sync(part)
             part.rename(final)
         except BaseException:
-            shutil.rmtree(part, ignore_errors=True)
+            remove(part)
             raise
         sync(self.folder)
         saved = self.verify(final, check_logs=False)
@@ -153,7 +144,7 @@ class Saves:
     def remove_leftovers(self) -> None:
         """Remove what interrupted commits left beside the saves."""
         for path in self.folder.glob(f"*{PART}"):
-            shutil.rmtree(path, ignore_errors=True)
+            remove(path)
 
     def verify(self, folder: Path, *, check_logs: bool = True) -> Save:
         """Compares the files of a save with its manifest.
@@ -183,7 +174,7 @@ class Saves:
         folders, logs = {save.folder.name for save in kept}, {name for save in kept for name in save.logs}
         for number in self._numbers():
             if (name := f"save-{number:06d}") not in folders:
-                shutil.rmtree(self.folder / name, ignore_errors=True)
+                remove(self.folder / name)
         for path in (self.folder / LOGS).glob("*"):
             if f"{LOGS}/{path.name}" not in logs:
                 path.unlink(missing_ok=True)
@@ -193,7 +184,8 @@ class Log:
     """Rows of equal size, numbered from 0 and appended to files of at most `rows_per_file` rows.
 
     The files are named by their first row. Rows that were appended stay as they are; whole files of rows that are no
-    longer needed leave the log.
+    longer needed leave the log. A file that another program has changed is noticed by its size and time; see
+    `forget_changed`.
 
     Args:
         folder: Folder of all saves.
@@ -205,6 +197,7 @@ class Log:
     def __init__(self, folder: Path, name: str, row_bytes: int, rows_per_file: int = 1024) -> None:
         self.folder, self.name, self.row_bytes, self.rows_per_file = folder, name, row_bytes, rows_per_file
         self._extents: dict[int, Extent] = {}  # by the first row of the file
+        self._looks: dict[int, tuple[int, ...]] = {}  # of each file when this log last read or wrote it
         self._hasher: Any = None  # of the last file, as far as it is committed
 
     @property
@@ -228,6 +221,7 @@ class Log:
 
         Raises:
             OSError: The rows cannot be written; the log stays as it was.
+            DamageError: The last file has lost rows.
         """
         make_folder(self.folder / LOGS)
         before = dict(self._extents)
@@ -245,12 +239,29 @@ class Log:
                     rest, row = rest[count * self.row_bytes :], row + count
             sync(self.folder / LOGS)
         except BaseException:
-            touched = list(self._extents)
+            touched = [start for start, extent in self._extents.items() if extent != before.get(start)]
+            touched += sorted(self._extents)[-1:]
             self._extents, self._hasher = before, None
             for first in touched:  # a full disk needs the room; other files may belong to the save before
-                with contextlib.suppress(OSError):
-                    os.truncate(self.path(first), before[first].bytes if first in before else 0)
+                with contextlib.suppress(OSError), self._open(first, os.O_RDWR) as file:
+                    file.truncate(before[first].bytes if first in before else 0)
             raise
+
+    def forget_changed(self) -> Path | None:
+        """Forgets the first file that another program has changed, and all files of later rows.
+
+        The rows from there on have to be appended again. A file of the same size and time is taken as unchanged; of
+        another file, the checksum of the committed part counts.
+
+        Returns:
+            The changed file; None without one.
+        """
+        for first in sorted(self._extents):
+            if self._has_changed(first):
+                self._extents = {other: extent for other, extent in self._extents.items() if other < first}
+                self._hasher = None
+                return self.path(first)
+        return None
 
     def drop_before(self, row: int) -> None:
         """Forget files whose rows all come before a row."""
@@ -263,12 +274,22 @@ class Log:
         return {str(self.path(first).relative_to(self.folder)): part for first, part in self._extents.items()}
 
     def restore(self, logs: Mapping[str, Extent]) -> None:
-        """Continue after the rows that a save committed; later rows are overwritten."""
+        """Continue after the rows that a save committed; later rows are overwritten.
+
+        Args:
+            logs: The committed parts, which `Saves.newest` has compared with the files.
+
+        Raises:
+            DamageError: A committed part does not hold whole rows.
+        """
         prefix = f"{LOGS}/{self.name}-"
         self._extents = {
             int(name.removeprefix(prefix)): extent for name, extent in logs.items() if name.startswith(prefix)
         }
+        if any(extent.bytes % self.row_bytes for extent in self._extents.values()):
+            raise DamageError(f"{self.folder / prefix}* are damaged: they do not hold whole rows")
         self._hasher = None
+        self._looks = {first: _look(self.path(first).lstat()) for first in self._extents}
 
     def rows(self) -> Iterator[tuple[int, int, Path]]:
         """First row, number of rows and path of each file."""
@@ -277,195 +298,49 @@ class Log:
 
     def _append_to(self, start: int, content: memoryview) -> None:
         """Append whole rows to the file that begins at a row."""
-        path, size = self.path(start), self._extents[start].bytes
-        path.touch()
-        with path.open("r+b") as file:
+        size = self._extents[start].bytes
+        if size == 0:
+            self.path(start).unlink(missing_ok=True)
+        with self._open(start, os.O_RDWR if size else os.O_RDWR | os.O_CREAT | os.O_EXCL) as file:
+            if os.fstat(file.fileno()).st_size < size:
+                raise DamageError(f"{self.path(start)} is damaged: it has lost rows while the run goes on")
             if self._hasher is None:
                 self._hasher = hashlib.sha256()
-                for block in _blocks(file, size):
+                for block in read_blocks(file, size):
                     self._hasher.update(block)
             file.truncate(size)
             file.seek(size)
             file.write(content)
             file.flush()
             os.fsync(file.fileno())
+            self._looks[start] = _look(os.fstat(file.fileno()))
         self._hasher.update(content)
         self._extents[start] = Extent(size + len(content), self._hasher.hexdigest())
 
+    def _open(self, first: int, flags: int) -> BinaryIO:
+        """Opens the file that begins with a row; a link, which would lead to a file of somebody else, is refused."""
+        return os.fdopen(os.open(self.path(first), flags | os.O_NOFOLLOW | os.O_CLOEXEC, 0o666), "r+b")
 
-@dataclass(frozen=True)
-class Manifest:
-    """What a save consists of.
-
-    Attributes:
-        kind: What is saved.
-        format: Number of the format.
-        note: Says in a few plain values what is saved.
-        files: Size and checksum of every file beside the manifest, by name.
-        logs: Committed part of each log, by path relative to the folder of all saves.
-    """
-
-    kind: str
-    format: int
-    note: Mapping[str, Any]
-    files: Mapping[str, Extent]
-    logs: Mapping[str, Extent]
+    def _has_changed(self, first: int) -> bool:
+        path = self.path(first)
+        with contextlib.suppress(FileNotFoundError):
+            look = _look(path.lstat())
+            if look == self._looks.get(first):
+                return False
+            with contextlib.suppress(DamageError):
+                check_extent(path, self._extents[first], is_whole=False)
+                self._looks[first] = look
+                return False
+        return True
 
 
-def write_manifest(
-    folder: Path,
-    kind: str,
-    version: int,
-    note: Mapping[str, Any],
-    logs: Mapping[str, Extent],
-    names: Sequence[str] | None = None,
-    suffix: str = "",
-) -> None:
-    """Flushes files of a folder to the disk, and writes their manifest last.
-
-    Args:
-        folder: Folder of the files.
-        kind: What is saved.
-        version: Number of the format.
-        note: Says in a few plain values what is saved.
-        logs: Committed part of each log.
-        names: The files; None takes all files of the folder.
-        suffix: End of the names of the files and of the manifest as they are now; the manifest leaves it out.
-    """
-    names = [path.name for path in folder.iterdir() if path.name != MANIFEST] if names is None else names
-    for name in names:
-        sync(folder / f"{name}{suffix}")
-    files = {name: measure_file(folder / f"{name}{suffix}") for name in sorted(names)}
-    text = _manifest_text(Manifest(kind, version, note, files, logs))
-    write_synced(folder / (MANIFEST + suffix), text.encode())
+def remove(path: Path) -> None:
+    """Removes a folder with all that is in it, or a file, or a link; a folder that cannot be removed stays."""
+    if path.is_symlink() or not path.is_dir():
+        path.unlink(missing_ok=True)
+    else:
+        shutil.rmtree(path, ignore_errors=True)
 
 
-def read_manifest(folder: Path, kind: str, version: int) -> Manifest:
-    """The manifest of a folder.
-
-    Raises:
-        DamageError: It is missing or damaged, or describes something of another kind.
-        UserError: The save has another format.
-    """
-    path = folder / MANIFEST
-    try:
-        if path.stat().st_size > LARGEST_MANIFEST:
-            raise ValueError("it is too large")
-        if not path.is_file():
-            raise ValueError("it is not a regular file")
-        text = path.read_text()
-        values = json.loads(text)
-        if not isinstance(values, dict) or set(values) != _KEYS:
-            raise ValueError(f"it must hold {', '.join(sorted(_KEYS))}")
-        files, logs = (_read_extents(values[name]) for name in ("files", "logs"))
-        manifest = Manifest(values["kind"], values["format"], values["note"], files, logs)
-        if text != _manifest_text(manifest):
-            raise ValueError("its own checksum differs")
-    except FileNotFoundError:
-        raise DamageError(f"{path} is missing") from None
-    except (OSError, ValueError, RecursionError) as error:
-        reason = getattr(error, "strerror", None) or str(error).splitlines()[0][:120]
-        raise DamageError(f"{path} is damaged: {reason}") from None
-    if manifest.kind != kind:
-        raise DamageError(f"{path} describes a {str(manifest.kind)[:40]}, not a {kind}")
-    if manifest.format != version:
-        raise UserError(
-            f"{folder} has format {manifest.format}, this version of latentplan reads format {version}: "
-            "continue with the version that saved it"
-        )
-    return manifest
-
-
-def check_files(folder: Path, manifest: Manifest) -> None:
-    """Compare the files of a folder with its manifest.
-
-    Raises:
-        DamageError: A file is missing, differs, or is not named by the manifest.
-    """
-    unknown = {path.name for path in folder.iterdir()} - set(manifest.files) - {MANIFEST}
-    if unknown:
-        raise DamageError(f"{folder / min(unknown)} is not named by {MANIFEST}")
-    for name, extent in manifest.files.items():
-        check_extent(folder / name, extent, is_whole=True)
-
-
-def check_extent(path: Path, extent: Extent, *, is_whole: bool) -> None:
-    """Compare the first bytes of a file with a checksum.
-
-    Args:
-        path: The file.
-        extent: Number and checksum of the bytes.
-        is_whole: Whether the file must end with these bytes.
-
-    Raises:
-        DamageError: The file is missing, too short, too long or damaged.
-    """
-    try:
-        size = path.stat().st_size
-        if size < extent.bytes or (is_whole and size > extent.bytes):
-            raise DamageError(f"{path} is damaged: it has {size:,} bytes and must have {extent.bytes:,}")
-        if measure_file(path, extent.bytes).sha256 != extent.sha256:
-            raise DamageError(f"{path} is damaged: its checksum differs")
-    except OSError as error:
-        raise DamageError(f"{path} cannot be read: {error.strerror}") from None
-
-
-def measure_file(path: Path, size: int | None = None) -> Extent:
-    """Size and checksum of a file, or of its first bytes."""
-    hasher, count = hashlib.sha256(), 0
-    with path.open("rb") as file:
-        for block in _blocks(file, size):
-            hasher.update(block)
-            count += len(block)
-    return Extent(count, hasher.hexdigest())
-
-
-def write_synced(path: Path, content: bytes) -> None:
-    """Write a file and flush it to the disk."""
-    with path.open("wb") as file:
-        file.write(content)
-        file.flush()
-        os.fsync(file.fileno())
-
-
-def sync(path: Path) -> None:
-    """Flush a file, or the names in a folder, to the disk."""
-    descriptor = os.open(path, os.O_RDONLY)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)
-
-
-def _blocks(file: Any, size: int | None) -> Iterator[bytes]:
-    left = size
-    while left is None or left > 0:
-        block = file.read(_BLOCK if left is None else min(_BLOCK, left))
-        if not block:
-            return
-        left = None if left is None else left - len(block)
-        yield block
-
-
-def _manifest_text(manifest: Manifest) -> str:
-    """The text of a manifest; it ends with the checksum of what it says."""
-    parts = {
-        name: {path: {"bytes": part.bytes, "sha256": part.sha256} for path, part in sorted(extents.items())}
-        for name, extents in (("files", manifest.files), ("logs", manifest.logs))
-    }
-    body = {"kind": manifest.kind, "format": manifest.format, "note": dict(manifest.note), **parts}
-    digest = hashlib.sha256(json.dumps(body).encode()).hexdigest()
-    return json.dumps(body | {"sha256": digest}, indent=1) + "\n"
-
-
-def _read_extents(values: Any) -> dict[str, Extent]:
-    if not isinstance(values, dict):
-        raise ValueError("a list of files is no list of files")
-    extents = {}
-    for name, value in values.items():
-        if not _FILE.fullmatch(name):
-            raise ValueError(f"it names the file {name[:80]!r}")
-        if not (isinstance(value, dict) and isinstance(value.get("bytes"), int) and value["bytes"] >= 0):
-            raise ValueError(f"it has no size of {name}")
-        extents[name] = Extent(value["bytes"], str(value.get("sha256")))
-    return extents
+def _look(found: os.stat_result) -> tuple[int, ...]:
+    return found.st_ino, found.st_size, found.st_mtime_ns

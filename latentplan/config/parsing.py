@@ -119,6 +119,59 @@ def read_values(
     return {**texts, **_parse_values(given, values, names)} if given else texts
 
 
+def take_values(settings: Sequence[Setting], values: Mapping[str, Any]) -> dict[str, Any]:
+    """The values that a program saved, checked and not parsed: lists become tuples, and 2.0 is a whole number.
+
+    Args:
+        settings: Every setting that may have a value.
+        values: Plain values, by key.
+
+    Raises:
+        UserError: A key is unknown or a value has the wrong type; the message names the setting, the value and what is
+            allowed.
+    """
+    known, taken = {setting.key: setting for setting in settings}, {}
+    for key in values:
+        if key not in known:
+            raise_unknown("setting", key, known)
+        setting = known[key]
+        value, kinds = _spell_numbers(setting, values[key]), alternatives(setting.hint)
+        if isinstance(value, list):
+            value = tuple(value)
+        elif isinstance(value, float) and value.is_integer() and int in kinds and float not in kinds:
+            value = int(value)
+        if not fits(value, setting.hint):
+            raise _wrong_type(setting, values, {})
+        taken[key] = value
+    return taken
+
+
+def fits(value: Any, hint: Any) -> bool:
+    """Whether a value has a type.
+
+    Args:
+        value: The value.
+        hint: A class, a `Literal`, a `TypedDict`, a `tuple`, `list` or `dict` of such types, or several of them. Whole
+            numbers have absolute values below 10**18, and are numbers too.
+    """
+    origin, inner = typing.get_origin(hint), typing.get_args(hint)
+    if origin in (typing.Union, types.UnionType):
+        return any(fits(value, kind) for kind in inner)
+    if origin is typing.Literal:
+        return isinstance(value, str) and value in inner
+    if typing.is_typeddict(hint):
+        hints = typing.get_type_hints(hint)
+        is_whole = isinstance(value, dict) and hint.__required_keys__ <= set(value)
+        return is_whole and all(name not in value or fits(value[name], kind) for name, kind in hints.items())
+    if origin is dict:
+        return isinstance(value, dict) and all(fits(key, inner[0]) and fits(value[key], inner[1]) for key in value)
+    if origin in (tuple, list):
+        return isinstance(value, origin) and all(fits(item, inner[0]) for item in value)
+    if type(value) is int:
+        return hint in (int, float, Any) and abs(value) < _LARGEST
+    return hint is Any or (isinstance(value, hint) and not (isinstance(value, bool) and hint is int))
+
+
 def alternatives(hint: Any) -> tuple[Any, ...]:
     """The types that a hint allows: `int | None` as (int, NoneType), any other hint alone."""
     return typing.get_args(hint) if typing.get_origin(hint) in (typing.Union, types.UnionType) else (hint,)
@@ -269,7 +322,7 @@ def _wrong_type(setting: Setting, values: Mapping[str, Any], names: Mapping[str,
     separator = setting.options.get("separator")
     if separator:
         text = separator.join(map(str, value)) if isinstance(value, list | tuple) else value
-        item = _TYPE_WORDS[typing.get_args(setting.hint)[0]].partition(" ")[2]
+        item = _TYPE_WORDS[typing.get_args(setting.hint)[0]].removeprefix("a ")
         return UserError(f"{name} must be {item}s, separated by {separator!r}, got {shown(text)}")
     example = '["speed -> 1.0"]' if str in typing.get_args(setting.hint) else "[16, 32]"
     wanted = " or ".join(_TYPE_WORDS.get(kind, f"a list such as {example}") for kind in alternatives(setting.hint))

@@ -12,11 +12,18 @@ from pathlib import Path
 from latentplan.config.checks import UserError, make_folder
 from latentplan.config.commit import Saves
 from latentplan.config.files import SECTIONS, build_config, field_names, read_config, read_layer
+from latentplan.config.manifest import LOGS
+from latentplan.config.reading import LARGEST_SETTINGS, read_bytes
 from latentplan.config.settings import Config
 
 RUN_FILE = "config.yaml"
 LOCK_FILE = ".lock"
 SAVES_FOLDER = "resume"
+CHECKPOINTS = "checkpoints"
+_FOLDERS = (  # in which a run writes and removes files
+    *(SAVES_FOLDER, f"{SAVES_FOLDER}/{LOGS}", CHECKPOINTS, f"{CHECKPOINTS}/best", f"{CHECKPOINTS}/last"),
+    *("videos", "skipped", "replay", f"replay/{LOGS}"),
+)
 RUN_FORMAT = 3  # 1 was `resume/state.pt`, from which a run could not continue exactly; 2 kept other counts
 RUN, DISTILLATION, GOALS = "run", "distillation", "goals"  # kinds of saves
 RESUMED_BY = {  # by kind: what the saves hold, and the command that continues it
@@ -80,7 +87,7 @@ def read_run_config(folder: Path) -> tuple[Config, str | None]:
         raise UserError(f"nothing to resume in {folder}: it holds no save of a run that is whole")
     saved = read_config(copy)
     try:
-        if path.read_bytes() == copy.read_bytes():
+        if read_bytes(path, LARGEST_SETTINGS) == read_bytes(copy, LARGEST_SETTINGS):
             return saved, None
         layer = read_layer(path)
         missing = [f"{section}.{name}" for section in SECTIONS for name in field_names(section)]
@@ -119,11 +126,16 @@ def lock_folder(folder: Path, holder: str = "another process learns") -> Iterato
         holder: What a process does that holds the lock, for the error.
 
     Raises:
-        UserError: Another process holds the lock, or the folder cannot be made.
+        UserError: Another process holds the lock, the folder cannot be made, or one of its own folders is a link.
     """
     make_folder(folder)
+    for path in (folder / name for name in _FOLDERS):
+        if path.is_symlink():
+            raise UserError(
+                f"{path} is a link, and a run writes below its own folder only: put the folder in its place"
+            )
     try:
-        lock = os.open(folder / LOCK_FILE, os.O_RDWR | os.O_CREAT, 0o666)
+        lock = os.open(folder / LOCK_FILE, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW, 0o666)
     except OSError as error:
         raise UserError(f"cannot write to {folder}: {error.strerror}; choose another") from None
     try:

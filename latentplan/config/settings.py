@@ -6,13 +6,14 @@ Defaults are the recommended values. A value that is not allowed raises a `Value
 from __future__ import annotations
 
 import dataclasses
+import functools
 from dataclasses import dataclass, field
 from typing import Any, Literal, get_args
 
 from latentplan.config.checks import MAX_EPISODES, MAX_THREADS, UserError, above_zero, at_least, one_of, shown, within
 from latentplan.config.earlier import as_saved, drop_removed
 from latentplan.config.learning import CollectionConfig, LearningConfig
-from latentplan.config.parsing import option
+from latentplan.config.parsing import Setting, list_settings, option, take_values
 from latentplan.config.planner import PlannerConfig
 from latentplan.config.reading import read_kwargs
 from latentplan.config.spaces import FRAME_SIZES, MOST_CAMERAS, check_frame_size
@@ -32,6 +33,7 @@ LOGGERS = ("tensorboard", "csv", "wandb", "trackio", "mlflow")
 MAX_REPEAT = 10_000  # ten of the longest episodes of dm_control
 MAX_ENVS = 1024
 MAX_CAMERA = 1000
+MAX_DECODER_LAYERS = 64
 MAX_RANKS = 1024  # learning processes of a node, and nodes
 USER_DOMAIN = "user"  # `EnvConfig.domain` of runs in an environment that the user wrote
 
@@ -103,7 +105,8 @@ class ModelConfig:
         encoder_channels: Channels of the encoder's layers; the first layer reads patches of 4 x 4 pixels, each later
             layer halves the grid.
         decoder_channels: Channels of the decoder's 8 x 8 grid of tokens.
-        decoder_layers: Hidden layers that the tokens read beside the features; agents of earlier versions have none.
+        decoder_layers: Hidden layers that the tokens read beside the features, at most 64; agents of earlier versions
+            have none.
         decoder_width: Width of these layers. With 88 an agent for a body of 6 actions takes 2.5 MB.
         num_bins: Bins of the distributional reward and value heads.
         turns: Quarter turns of each frame for which an agent keeps a belief, and over which its action is averaged: 1,
@@ -124,7 +127,8 @@ class ModelConfig:
         if self.turns not in (1, 4):
             raise ValueError(f"turns must be 1 or 4, got {self.turns}")
         at_least(self, latent_dim=1, deter_dim=1, hidden_dim=1, num_bins=3)
-        at_least(self, decoder_channels=1, decoder_layers=0, decoder_width=1)
+        at_least(self, decoder_channels=1, decoder_width=1)
+        within(self, decoder_layers=(0, MAX_DECODER_LAYERS))
         if not 1 <= len(self.encoder_channels) <= 5 or min(self.encoder_channels) < 1:
             raise ValueError(f"encoder_channels must hold 1 to 5 positive sizes, got {self.encoder_channels}")
 
@@ -329,8 +333,8 @@ def from_dict(values: dict[str, Any]) -> Config:
     Absent fields take their defaults, or what earlier versions did; settings that no longer exist are dropped.
 
     Raises:
-        ValueError: A section or field is unknown, a value is not allowed, or a setting that no longer exists has a
-            value other than the one that had no effect.
+        ValueError: A section or field is unknown, a value has the wrong type or is not allowed, or a setting that no
+            longer exists has a value other than the one that had no effect.
     """
     sections = {f.name: f.default_factory for f in dataclasses.fields(Config)}
     built = {}
@@ -343,5 +347,13 @@ def from_dict(values: dict[str, Any]) -> Config:
         for name in settings:
             if name not in names:
                 raise ValueError(f"unknown setting {section}.{name}; available: {', '.join(sorted(names))}")
-        built[section] = kind(**{k: tuple(v) if isinstance(v, list) else v for k, v in settings.items()})
+        values = take_values(
+            _settings_of(kind, section), {f"{section}.{name}": value for name, value in settings.items()}
+        )
+        built[section] = kind(**{key.removeprefix(f"{section}."): value for key, value in values.items()})
     return Config(**built)
+
+
+@functools.cache
+def _settings_of(kind: type, section: str) -> list[Setting]:
+    return list_settings(kind, f"{section}.")

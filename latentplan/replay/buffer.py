@@ -7,8 +7,9 @@ row of an episode has no action. A sequence in a batch has one frame more than a
 
 from __future__ import annotations
 
+import io
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from pickle import UnpicklingError
@@ -19,6 +20,8 @@ import torch
 from torch import Tensor
 
 from latentplan.config import UserError
+from latentplan.config.manifest import DamageError, write_synced
+from latentplan.config.parsing import fits
 from latentplan.replay.memory import check_memory, count_replay_bytes
 
 FRAME_SHAPE = (64, 64, 3)
@@ -248,23 +251,40 @@ class Replay:
         raise UserError(f"{too_short}: lower --learning.sequence_length")
 
 
-def read_saved(path: Path, keys: Sequence[str] = ()) -> Any:
-    """The object that `torch.save` wrote to a file, with its tensors on the CPU.
+def write_saved(value: Any, path: Path) -> None:
+    """Writes tensors and plain values, in lists and dictionaries, to a file that `read_saved` reads.
+
+    Raises:
+        OSError: The file cannot be written.
+    """
+    buffer = io.BytesIO()  # where torch writes to a full disk itself, its error does not say so
+    torch.save(value, buffer)
+    write_synced(path, buffer.getbuffer())
+
+
+def read_saved(path: Path, keys: Sequence[str] | Mapping[str, Any] = ()) -> Any:
+    """The object that `write_saved` wrote to a file, with its tensors on the CPU.
 
     Args:
         path: The file.
-        keys: If any are given, the object must be a dictionary with these keys.
+        keys: If any are given, the object must be a dictionary with these keys, and the values have the types that a
+            mapping gives; see `fits`.
 
     Raises:
-        UserError: The file is damaged, or lacks one of the keys.
+        DamageError: The file is damaged, lacks one of the keys, or has a value of another type.
     """
     try:
         saved = torch.load(path, map_location="cpu", weights_only=True)
-        if keys and not (isinstance(saved, dict) and set(keys) <= set(saved)):
-            raise ValueError(f"it does not hold {', '.join(keys)}")
-        return saved
     except UnpicklingError:  # torch's message would advise to run what the file says
-        raise UserError(f"{path} is damaged: it holds more than tensors and plain values") from None
-    except (OSError, RuntimeError, EOFError, KeyError, IndexError, ValueError) as error:
+        raise DamageError(f"{path} is damaged: it holds more than tensors and plain values") from None
+    except MemoryError:
+        raise
+    except Exception as error:  # damaged bytes make the unpickler raise errors of many types
         reason = (str(error).splitlines() or ["it ends too early"])[0][:120]
-        raise UserError(f"{path} is damaged: {reason}") from None
+        raise DamageError(f"{path} is damaged: {reason}") from None
+    if keys and not (isinstance(saved, dict) and set(keys) <= set(saved)):
+        raise DamageError(f"{path} is damaged: it does not hold {', '.join(keys)}")
+    for name, kind in keys.items() if isinstance(keys, Mapping) else ():
+        if not fits(saved[name], kind):
+            raise DamageError(f"{path} is damaged: {name} has another form")
+    return saved

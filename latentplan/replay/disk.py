@@ -6,6 +6,7 @@ rows of all of them to another number of processes.
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -14,8 +15,9 @@ import numpy as np
 import torch
 
 from latentplan.config import UserError
-from latentplan.config.commit import Extent, Log, Save, Saves
-from latentplan.replay.buffer import COLUMNS, Replay, read_saved
+from latentplan.config.commit import Log, Save, Saves
+from latentplan.config.manifest import DamageError, Extent
+from latentplan.replay.buffer import COLUMNS, Replay, read_saved, write_saved
 
 ROWS_FILE = "rows.pt"
 FORMAT = 1
@@ -52,6 +54,8 @@ class ReplayFiles:
     def write(self, part: Path) -> dict[str, Extent]:
         """Appends new frames, and writes the other columns into the folder of a save.
 
+        Frames whose log another program has changed are written again, and a warning names the log.
+
         Returns:
             The committed part of each log.
         """
@@ -59,6 +63,12 @@ class ReplayFiles:
         extents: dict[str, Extent] = {}
         for lane, log in enumerate(self._logs):
             first, end = int(replay.first[lane]), int(replay.written[lane])
+            if (changed := log.forget_changed()) is not None:
+                warnings.warn(
+                    f"{changed} was changed by another program: its frames are written again",
+                    RuntimeWarning,
+                    stacklevel=2,
+                )
             if (start := max(first, log.end)) < end:
                 log.append(start, self._blocks(lane, start, end))
             log.drop_before(first)
@@ -68,7 +78,7 @@ class ReplayFiles:
         episode = torch.from_numpy(replay.episode)[index.cpu()]
         bounds = {name: torch.from_numpy(getattr(replay, name).copy()) for name in ("first", "written")}
         recorded = {"num_recorded": replay.num_recorded} if replay.num_recorded else {}
-        torch.save(columns | bounds | {"episode": episode} | recorded, part / rows_file(self.rank))
+        write_saved(columns | bounds | {"episode": episode} | recorded, part / rows_file(self.rank))
         return extents
 
     def read(self, save: Save) -> None:
@@ -107,9 +117,25 @@ def read_rows(save: Save, rank: int) -> dict[str, Any]:
     """The rows that one process saved, but their frames.
 
     Raises:
-        UserError: The file is damaged.
+        DamageError: The file is damaged, or its parts do not fit each other.
     """
-    saved: dict[str, Any] = read_saved(save.folder / rows_file(rank), keys=(*COLUMNS, "episode", "first", "written"))
+    path = save.folder / rows_file(rank)
+    kinds = dict.fromkeys((*COLUMNS, "episode", "first", "written"), torch.Tensor)
+    saved: dict[str, Any] = read_saved(path, keys=kinds)
+    whole = ("episode", "first", "written")
+    dims = dict.fromkeys(kinds, 1) | dict.fromkeys(("deter", "actions", "labels"), 2)
+    for name, value in ((name, saved[name]) for name in kinds):
+        is_right = value.dtype == torch.int64 if name in whole else value.is_floating_point()
+        if not is_right or value.ndim != dims[name]:
+            raise DamageError(f"{path} is damaged: {name} has another form")
+    first, written, recorded = saved["first"], saved["written"], saved.get("num_recorded", 0)
+    if first.shape != written.shape or not bool(((first >= 0) & (first <= written)).all()):
+        raise DamageError(f"{path} is damaged: the numbers of its rows are not in order")
+    rows = (written - first).tolist()
+    if any(len(saved[name]) != sum(rows) for name in (*COLUMNS, "episode")):
+        raise DamageError(f"{path} is damaged: its columns must have {sum(rows):,} rows")
+    if type(recorded) is not int or recorded < 0 or len(rows) <= (recorded > 0) or (recorded and rows[-1] > recorded):
+        raise DamageError(f"{path} is damaged: num_recorded has another form")
     return saved
 
 
@@ -173,9 +199,13 @@ class Counts(NamedTuple):
 
 
 def count_saved(save: Save, rank: int = 0) -> Counts:
-    """What the saved replay of one process holds, without its frames."""
-    saved = read_saved(save.folder / rows_file(rank), keys=("first", "written"))
-    recorded = int(saved.get("num_recorded", 0))  # saves of earlier versions lack it
+    """What the saved replay of one process holds, without its frames.
+
+    Raises:
+        DamageError: The file is damaged, or its parts do not fit each other.
+    """
+    saved = read_rows(save, rank)
+    recorded: int = saved.get("num_recorded", 0)  # saves of earlier versions lack it
     rows = (saved["written"] - saved["first"]).tolist()
     lanes = rows[:-1] if recorded else rows
     return Counts(len(lanes), max(lanes), recorded)

@@ -152,15 +152,19 @@ def check_folder(run_dir: str, flag: str = "--run-dir") -> None:
         flag: The flag that names it, for the error.
 
     Raises:
-        UserError: The name is empty, or a file is in the way.
+        UserError: The name is empty, a file is in the way, or the folders above may not be read.
         OSError: The name is too long.
     """
     if run_dir == "":
         raise UserError(f"{flag} must name a folder, got an empty text")
     folder = Path(run_dir).absolute()
-    existing = next(path for path in (folder, *folder.parents) if path.exists())
-    if not existing.is_dir():
-        raise UserError(f"cannot make the folder {run_dir}: {existing} is a file; choose another {flag}")
+    try:
+        existing = next(path for path in (folder, *folder.parents) if path.exists())
+        reason = None if existing.is_dir() else f"{existing} is a file"
+    except PermissionError as error:
+        reason = f"{error.strerror}: {error.filename}"
+    if reason is not None:
+        raise UserError(f"cannot make the folder {run_dir}: {reason}; choose another {flag}")
 
 
 def parse_curriculum_task(text: str, labels: Mapping[str, float]) -> tuple[tuple[float, Node], ...]:

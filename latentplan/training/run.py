@@ -26,7 +26,7 @@ from latentplan.config.commit import Save
 from latentplan.config.env_id import as_file_name, repeat_flag
 from latentplan.config.files import dump_config, read_config
 from latentplan.config.origin import present_facts
-from latentplan.config.run_folder import RUN_FILE, SAVES_FOLDER, lock_folder, read_run_config, run_saves
+from latentplan.config.run_folder import CHECKPOINTS, RUN_FILE, SAVES_FOLDER, lock_folder, read_run_config, run_saves
 from latentplan.config.run_results import FINAL_FILE, METRICS_FILE, note_state, read_facts
 from latentplan.config.writing import write_whole
 from latentplan.envs import default_task
@@ -60,6 +60,7 @@ from latentplan.training.state import (
     SavedRun,
     read_saved_run,
     refuse_used,
+    remove_leftovers,
     restore_learner,
     restore_metrics,
     warn_of_loss,
@@ -182,7 +183,7 @@ def resume(
 def _start(config: Config, folder: Path, make_env: EnvFactory | None, *, resume: bool) -> Result:
     """Runs with all ranks until the end, an interruption or an error."""
     config = place_ranks(config)
-    check_settings(config)
+    check_settings(replace(config, run=replace(config.run, run_dir=str(folder))))
     with contextlib.closing(join_ranks(config)) as ranks:
         config, folder = ranks.lead(lambda: (config, folder))
         take_part = _lead if ranks.is_first else _follow
@@ -192,6 +193,7 @@ def _start(config: Config, folder: Path, make_env: EnvFactory | None, *, resume:
 def _lead(config: Config, folder: Path, make_env: EnvFactory | None, ranks: Ranks, *, resume: bool) -> Result:
     """Runs as rank 0, which keeps the folder."""
     with lock_folder(folder), Signals() as signals:
+        remove_leftovers(folder)
         facts = present_facts(config.run.device != "cpu" and torch.cuda.is_available())
         run_id = read_facts(folder).get("run_id") or uuid.uuid4().hex[:8]
         note_state(folder, "running", run_id=run_id, command=shlex.join(sys.argv), **facts)
@@ -283,7 +285,6 @@ class _Run:
 
     def _find_save(self) -> Save:
         """The newest save that is whole; warns of newer ones that are not."""
-        self.saves.remove_leftovers()
         save, problems = self.saves.newest()
         warn_of_loss(save, problems)
         return save
@@ -323,7 +324,7 @@ class _Run:
         if save is not None and saved is not None:
             check_memory(saved.memory, config, self.folder)
             self.files.read(save) if dealt is None else dealt.fill(self.replay)
-            restore_learner(self.learner, saved.learner, self.folder)
+            restore_learner(self.learner, saved.learner, self.folder, saved.requests["weights"])
             if ranks.is_first:
                 restore_metrics(save, self.folder)
         else:
@@ -386,6 +387,10 @@ class _Run:
                 if not state.interrupted:
                     return Result(self.folder, 0, self._finish(trainer, save, videos / "final.webm"))
             agree_on_signals(state, ranks)
+        except WorkerEnded:
+            if ranks.size == 1:  # other ranks may not know of it, and all of them save together
+                save.save(trainer, self.learner)
+            raise
         except EnvironmentFault as fault:
             save.save(trainer, self.learner)
             raise EnvironmentFault(f"{fault}; the run is saved in {self.folder}", fault.origin) from None
@@ -472,7 +477,7 @@ class _Run:
 
         The highest mean of many short evaluations is partly chance, so the final starts decide between best and last.
         """
-        folder = self.folder / "checkpoints" / "best"
+        folder = self.folder / CHECKPOINTS / "best"
         if not is_checkpoint(folder, (INFO,)):
             return float("-inf")
         try:

@@ -15,11 +15,13 @@ import torch
 
 from latentplan.agents.checkpoint import save_checkpoint
 from latentplan.config import Config
-from latentplan.config.commit import PART, Extent, Saves
+from latentplan.config.commit import PART, Saves
 from latentplan.config.files import dump_config
-from latentplan.config.run_folder import RUN_FILE
+from latentplan.config.manifest import Extent
+from latentplan.config.run_folder import CHECKPOINTS, RUN_FILE
 from latentplan.config.run_results import METRICS_FILE
 from latentplan.models import WorldModel
+from latentplan.replay.buffer import write_saved
 from latentplan.replay.disk import ReplayFiles
 from latentplan.training.callbacks import Collect, agree_on_signals
 from latentplan.training.collection.episodes import to_tensors
@@ -151,7 +153,7 @@ class Save(lightning.Callback):
         folder = self._share_folder(self.ranks.rank)
         shutil.rmtree(folder, ignore_errors=True)
         folder.mkdir(parents=True)
-        torch.save({"memory": to_tensors(self.collect.memory)}, folder / memory_file(self.ranks.rank))
+        write_saved({"memory": to_tensors(self.collect.memory)}, folder / memory_file(self.ranks.rank))
         return self.files.write(folder)
 
     def _share_folder(self, rank: int) -> Path:
@@ -168,7 +170,7 @@ class Save(lightning.Callback):
             memory = self.collect.memory  # the collector remembers an end that the replay has overwritten
             has_seen_end = bool(memory and memory["has_seen_end"]) or self.files.replay.has_recorded_end
             planner = replace(planner, use_continues=has_seen_end)
-        save_checkpoint(self.folder / "checkpoints" / name, model, replace(self.config, planner=planner), facts)
+        save_checkpoint(self.folder / CHECKPOINTS / name, model, replace(self.config, planner=planner), facts)
 
     def clocks(self, learner: Learner) -> dict[str, Any]:
         """The frames, updates and minutes of the present agent."""
@@ -247,13 +249,8 @@ class Guard(lightning.Callback):
         if path.exists() or len(list(self.folder.glob("*.pt"))) >= KEPT_BATCHES:
             return
         self.folder.mkdir(parents=True, exist_ok=True)
-        torch.save(
-            {
-                part: value.cpu()
-                for part, value in learner.replay.gather(rows.to(learner.replay.device))._asdict().items()
-            },
-            path,
-        )
+        batch = learner.replay.gather(rows.to(learner.replay.device))
+        write_saved({part: value.cpu() for part, value in batch._asdict().items()}, path)
         warnings.warn(
             f"the loss or gradient of the {name} was not finite by update {learner.updates}: a step was skipped, and "
             f"its batch is kept in {path}",

@@ -2,23 +2,32 @@
 
 from __future__ import annotations
 
+import math
 import time
+import typing
 import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypedDict, TypeVar
 
 import torch
+from torch import Tensor
 
-from latentplan.agents.checkpoint import INFO
+from latentplan.agents.files import INFO, WEIGHTS
+from latentplan.agents.files import remove_leftovers as remove_agent_leftovers
 from latentplan.config import UserError
-from latentplan.config.commit import DamageError, Extent, Save, Saves, write_synced
-from latentplan.config.run_folder import RUN_FILE, SAVES_FOLDER
-from latentplan.config.run_results import METRICS_FILE
-from latentplan.config.writing import replaced_whole
-from latentplan.replay.buffer import read_saved
+from latentplan.config.commit import Save, Saves
+from latentplan.config.manifest import DamageError, Extent, write_synced
+from latentplan.config.parsing import fits, list_settings, take_values
+from latentplan.config.run_folder import CHECKPOINTS, RUN_FILE, SAVES_FOLDER
+from latentplan.config.run_results import FINAL_FILE, METRICS_FILE, STATUS_FILE
+from latentplan.config.writing import remove_parts, replaced_whole
+from latentplan.replay.buffer import read_saved, write_saved
 from latentplan.replay.dealing import count_ranks
+from latentplan.training.collection.memory import Evaluated, Memory, Requests, Round
+from latentplan.training.facts import REPORT_FILE
+from latentplan.training.learner.optimization import OptimizerState
 from latentplan.training.ranks import Ranks
 
 if TYPE_CHECKING:
@@ -27,6 +36,25 @@ if TYPE_CHECKING:
 
 CONTENTS = {RUN_FILE: "a run", INFO: "an agent", f"{SAVES_FOLDER}/save-*[0-9]": "an agent"}
 STATE_FILE = "state.pt"
+Kind = TypeVar("Kind")
+
+
+class LearnerState(TypedDict):
+    """A learner: its weights and counts of skipped steps, number of updates, and latest metrics."""
+
+    weights: dict[str, Tensor]
+    updates: int
+    metrics: dict[str, float]
+
+
+SAVED_RUN = {
+    "run": dict[str, Any],
+    "learner": LearnerState,
+    "optimizers": list[OptimizerState],
+    "requests": Requests,
+    "memory": Memory,
+}
+"""The types of what `STATE_FILE` holds."""
 
 
 @dataclass
@@ -109,7 +137,7 @@ class SavedRun:
 def write_state(saved: SavedRun, part: Path) -> None:
     """Writes a run's state into the folder of a save."""
     values = {name: getattr(saved, name) for name in ("learner", "optimizers", "requests", "memory")}
-    torch.save({"run": saved.state.to_dict(), **values}, part / STATE_FILE)
+    write_saved({"run": saved.state.to_dict(), **values}, part / STATE_FILE)
 
 
 def memory_file(rank: int) -> str:
@@ -118,8 +146,12 @@ def memory_file(rank: int) -> str:
 
 
 def read_memory(save: Save, rank: int) -> dict[str, Any] | None:
-    """The collector's state that a rank above 0 saved; None before its first round."""
-    memory: dict[str, Any] | None = read_saved(save.folder / memory_file(rank), keys=("memory",))["memory"]
+    """The collector's state that a rank above 0 saved; None before its first round.
+
+    Raises:
+        DamageError: The file is damaged, or holds something else.
+    """
+    memory: dict[str, Any] | None = read_saved(save.folder / memory_file(rank), keys={"memory": Memory})["memory"]
     return memory
 
 
@@ -130,17 +162,16 @@ def read_state(save: Save) -> SavedRun:
         DamageError: The state has other entries, or values outside of their ranges.
     """
     path = save.folder / STATE_FILE
-    saved = read_saved(path, keys=("run", "learner", "optimizers", "requests", "memory"))
-    try:
-        state = RunState(**saved.pop("run"))
-        counts = ("env_frames", "decisions", "rounds", "epoch_updates", "next_evaluation", "worker_restarts")
-        for name in counts:
-            value = getattr(state, name)
-            if not isinstance(value, int) or value < 0:
-                raise ValueError(f"{name} is {value!r}")
-        return SavedRun(state, **saved)
-    except (TypeError, ValueError) as error:
-        raise DamageError(f"{path} is damaged: {str(error)[:160]}") from None
+    saved = read_saved(path, keys=SAVED_RUN)
+    state = build(RunState, saved["run"], path)
+    counts = ("env_frames", "decisions", "rounds", "epoch_updates", "next_evaluation", "worker_restarts")
+    are_right = all(getattr(state, name) >= 0 for name in counts) and saved["learner"]["updates"] >= 0
+    are_right &= math.isfinite(state.minutes) and state.earlier_minutes >= 0.0 and not math.isnan(state.best_return)
+    if not are_right or not fits(state.evaluations, list[Evaluated]):
+        raise DamageError(f"{path} is damaged: its clocks or evaluations are outside of their ranges")
+    if (asked := saved["requests"]["collect"]) is not None:  # the values are arguments, in this order
+        saved["requests"]["collect"] = {name: asked[name] for name in Round.__annotations__}
+    return SavedRun(state, **{name: saved[name] for name in SAVED_RUN if name != "run"})
 
 
 def read_saved_run(save: Save, ranks: Ranks) -> SavedRun:
@@ -156,25 +187,56 @@ def read_saved_run(save: Save, ranks: Ranks) -> SavedRun:
     return replace(saved, memory=memory, has_seen_end=has_seen_end)
 
 
+def build(kind: type[Kind], values: Any, path: Path) -> Kind:
+    """A dataclass of saved values.
+
+    Args:
+        kind: The dataclass.
+        values: A dictionary of values by field.
+        path: The file that holds them, for the error.
+
+    Raises:
+        DamageError: A field is unknown, or a value has another type or is not allowed.
+    """
+    hints = typing.get_type_hints(kind)
+    try:
+        for name, value in values.items():
+            if not fits(value, hints[name]):
+                raise ValueError(f"{name} has another form")
+        return kind(**values)
+    except (AttributeError, KeyError, TypeError, ValueError) as error:
+        raise DamageError(f"{path} is damaged: {str(error)[:160]}") from None
+
+
+def build_settings(kind: type[Kind], values: Mapping[str, Any], path: Path) -> Kind:
+    """A dataclass of settings that were saved; the arguments and errors are those of `build`."""
+    try:
+        return build(kind, take_values(list_settings(kind), values), path)
+    except DamageError:
+        raise
+    except UserError as error:
+        raise DamageError(f"{path} is damaged: {error}") from None
+
+
 def save_values(saves: Saves, values: dict[str, Any], note: Mapping[str, Any]) -> None:
     """Saves tensors and plain values as one commit; `load_values` restores them."""
 
     def write(part: Path) -> dict[str, Extent]:
-        torch.save(values, part / STATE_FILE)
+        write_saved(values, part / STATE_FILE)
         return {}
 
     saves.commit(write, note)
 
 
-def load_values(saves: Saves, keys: Sequence[str]) -> dict[str, Any]:
+def load_values(saves: Saves, keys: Sequence[str] | Mapping[str, Any]) -> dict[str, Any]:
     """The values of the newest save that is whole; a warning names newer ones that are not.
 
     Args:
         saves: The saves.
-        keys: Names that the values must have.
+        keys: Names that the values must have, and their types in a mapping; see `read_saved`.
 
     Raises:
-        UserError: There is no save, or none is whole.
+        UserError: There is no save, or none is whole, or the values are others.
     """
     save, problems = saves.newest()
     warn_of_loss(save, problems)
@@ -193,19 +255,24 @@ def warn_of_loss(save: Save, problems: Sequence[str]) -> None:
         )
 
 
-def restore_learner(learner: Learner, saved: dict[str, Any], folder: Path) -> None:
+def restore_learner(
+    learner: Learner, saved: dict[str, Any], folder: Path, acting: Mapping[str, Tensor] | None = None
+) -> None:
     """Loads a saved state into a learner.
 
     Args:
         learner: The learner to load into.
         saved: `SavedRun.learner`.
         folder: Folder of the run, for the error message.
+        acting: Weights that the worker acts with, if it was asked for something; they are compared only.
 
     Raises:
         UserError: The saved weights have other names or shapes than this model.
     """
     try:
         learner.load_state_dict(saved["weights"])
+        if acting is not None and _shapes(acting) != _shapes(learner.averaged.state_dict()):
+            raise RuntimeError("the worker acts with weights of other shapes")
     except RuntimeError as error:
         reason = str(error).splitlines()[-1].strip()
         raise UserError(f"the saved weights in {folder} do not fit the settings in its config.yaml: {reason}") from None
@@ -221,6 +288,17 @@ def restore_metrics(save: Save, folder: Path) -> None:
         return
     with replaced_whole(path) as part:
         write_synced(part, (save.folder / METRICS_FILE).read_bytes())
+
+
+def remove_leftovers(folder: Path) -> None:
+    """Removes what killed processes left in a folder of a run, or of another learning; its lock must be held."""
+    Saves(folder / SAVES_FOLDER, "any", 0).remove_leftovers()
+    for name in (RUN_FILE, METRICS_FILE, STATUS_FILE, FINAL_FILE, REPORT_FILE):
+        remove_parts(folder / name)
+    for film in (folder / "videos").glob(".*.webm"):
+        film.unlink(missing_ok=True)
+    for agent in (folder, *(folder / CHECKPOINTS / name for name in ("best", "last"))):
+        remove_agent_leftovers(agent, (WEIGHTS, INFO))
 
 
 def refuse_used(folder: Path, kind: str, flag: str) -> None:
@@ -239,3 +317,7 @@ def refuse_used(folder: Path, kind: str, flag: str) -> None:
             can_resume = Saves(folder / SAVES_FOLDER, kind, 0).kinds() == {kind}
             advice = f"resume it with --resume {folder} (or from Python), or " if can_resume else ""
             raise UserError(f"{folder} already holds {content}: {advice}choose another {flag}")
+
+
+def _shapes(weights: Mapping[str, Tensor]) -> dict[str, torch.Size]:
+    return {name: value.shape for name, value in weights.items()}

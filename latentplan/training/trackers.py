@@ -15,6 +15,8 @@ from lightning.pytorch.loggers import CSVLogger, Logger, MLFlowLogger, TensorBoa
 
 from latentplan.config import Config, to_dict
 from latentplan.config.extras import import_extra
+from latentplan.config.reading import read_text
+from latentplan.config.writing import write_whole
 from latentplan.reporting.frame import Frame
 from latentplan.reporting.report import tile
 from latentplan.reporting.video import encode_gif, read_frames
@@ -135,13 +137,13 @@ class Trackers:
 def _make_mlflow(run: str, folder: Path, settings: Mapping[str, Any]) -> MLFlowLogger:
     """The logger of MLflow: of the server in MLFLOW_TRACKING_URI, or of a database in the folder of the run."""
     noted = folder / "mlflow-run.txt"
-    known = noted.read_text().strip() if noted.exists() else None
+    known = read_text(noted).strip() if noted.exists() else None
     address = os.environ.get("MLFLOW_TRACKING_URI") or f"sqlite:///{(folder / 'mlflow.db').resolve()}"
     place = None if "MLFLOW_TRACKING_URI" in os.environ else str((folder / "mlflow").resolve())
     logger = MLFlowLogger(PROJECT, run_name=run, tracking_uri=address, run_id=known, artifact_location=place)
     if known is None:
         logger.log_hyperparams(dict(settings))
-        noted.write_text(str(logger.run_id))
+        write_whole(noted, str(logger.run_id))
     return logger
 
 

@@ -1,6 +1,8 @@
 """The files of a checkpoint: whole wherever writing is killed, and every changed bit is noticed."""
 
+import hashlib
 import json
+import math
 import os
 import random
 import shutil
@@ -10,8 +12,8 @@ from pathlib import Path
 import pytest
 
 from latentplan.agents import files
-from latentplan.agents.checkpoint import load_model, read_info, save_checkpoint, seal_checkpoint
-from latentplan.agents.files import read_files, write_files
+from latentplan.agents.checkpoint import load_model, read_info, resolve_checkpoint, save_checkpoint, seal_checkpoint
+from latentplan.agents.files import read_files, remove_leftovers, write_files
 from latentplan.config import UserError
 from tests.agents.small_agents import make_plain_model
 from tests.agents.test_checkpoint import CONFIG, INFO, assert_refused, unseal
@@ -208,3 +210,115 @@ def test_load_model_compares_sizes_before_it_allocates_a_model(agent, tmp_path):
     info["config"]["model"]["deter_dim"] = 10**7  # some petabytes
     path.write_text(json.dumps(info))
     assert_refused(lambda: load_model(folder), "does not fit its own settings")
+
+
+def test_write_files_replaces_links_beside_the_files(tmp_path):
+    folder, other = tmp_path / "agent", tmp_path / "other"
+    folder.mkdir()
+    other.write_text("kept")
+    for name in (*NAMES, "manifest.json"):
+        (folder / f"{name}.part").symlink_to(other)
+    write_files(folder, {name: name.encode() for name in NAMES})
+    assert other.read_text() == "kept" and read_files(folder, NAMES) == {name: name.encode() for name in NAMES}
+    assert not any(path.is_symlink() for path in folder.iterdir())
+
+
+@pytest.mark.parametrize("call", range(4))
+@pytest.mark.parametrize("has_old", [True, False])
+def test_write_files_that_fails_leaves_nothing(tmp_path, monkeypatch, call, has_old):
+    old, calls = {name: b"old" for name in NAMES}, iter(range(100))
+    if has_old:
+        write_files(tmp_path, old)
+    before = sorted(tmp_path.iterdir())
+
+    def fill_up(descriptor):
+        if next(calls) == call:
+            raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(os, "fsync", fill_up)
+    with pytest.raises(OSError, match="No space left"):
+        write_files(tmp_path, {name: b"new" for name in NAMES})
+    assert sorted(tmp_path.iterdir()) == before
+    assert not has_old or read_files(tmp_path, NAMES) == old
+
+
+@pytest.mark.parametrize("has_old", [True, False])
+def test_remove_leftovers_keeps_one_whole_checkpoint_wherever_writing_is_killed(tmp_path, has_old):
+    old, new = ({name: f"{name} {age}".encode() for name in NAMES} for age in ("old", "new"))
+
+    def write():
+        die_at(call)
+        write_files(folder, new)
+
+    for call in range(100):
+        folder = tmp_path / str(call)
+        if has_old:
+            write_files(folder, old)
+        is_finished = in_child(write)
+        before = read_files(folder, NAMES) if (folder / "manifest.json").exists() else None
+        remove_leftovers(folder, NAMES)
+        assert {path.name for path in folder.glob("*")} == ({*NAMES, "manifest.json"} if before else set())
+        assert before is None or read_files(folder, NAMES) == before
+        if is_finished:
+            break
+    assert is_finished and call > 5
+
+
+def test_remove_leftovers_leaves_a_checkpoint_whose_manifest_is_damaged(agent, tmp_path):
+    folder = shutil.copytree(agent, tmp_path / "agent")
+    (folder / "info.json").rename(folder / "info.json.part")
+    (folder / "manifest.json").write_text("{")
+    before = sorted(folder.iterdir())
+    remove_leftovers(folder, ("info.json", "weights.safetensors"))
+    assert sorted(folder.iterdir()) == before
+
+
+def test_load_model_takes_the_last_agent_where_the_best_one_was_never_committed(agent, tmp_path):
+    shutil.copytree(agent, tmp_path / "checkpoints" / "last")
+    best = shutil.copytree(agent, tmp_path / "checkpoints" / "best")
+    (best / "manifest.json").unlink()
+    for path in list(best.iterdir()):
+        path.rename(f"{path}.part")
+    assert resolve_checkpoint(tmp_path) == tmp_path / "checkpoints" / "last"
+    load_model(tmp_path)
+
+
+def test_seal_checkpoint_that_refuses_an_agent_leaves_its_manifest(agent, tmp_path):
+    folder = shutil.copytree(agent, tmp_path / "agent")
+    before = (folder / "manifest.json").read_bytes()
+    info = json.loads((folder / "info.json").read_text())
+    (folder / "info.json").write_text(json.dumps(info | {"discount": 5}))
+    assert_refused(lambda: seal_checkpoint(folder), "discount")
+    assert (folder / "manifest.json").read_bytes() == before
+
+
+def test_seal_checkpoint_finishes_a_commit_that_was_cut_off(agent, tmp_path):
+    folder = shutil.copytree(agent, tmp_path / "agent")
+    for name in ("info.json", "weights.safetensors"):
+        (folder / name).rename(folder / f"{name}.part")
+        (folder / name).write_bytes(b"old")
+    seal_checkpoint(folder)
+    load_model(folder)
+    assert sorted(path.name for path in folder.iterdir()) == ["info.json", "manifest.json", "weights.safetensors"]
+
+
+@pytest.mark.parametrize("dtype", ["F16", "BF16", "F32", "F64", "BOOL", "U8", "I64", "C64", "F8_E8M0", "F8_E5M2"])
+def test_load_model_accepts_floating_point_weights_only(agent, tmp_path, dtype):
+    folder = shutil.copytree(agent, tmp_path / "agent")
+    unseal(folder)
+    sizes = {"F64": 8, "C64": 8, "I64": 8, "F32": 4, "F16": 2, "BF16": 2}
+    content = (folder / "weights.safetensors").read_bytes()
+    length = int.from_bytes(content[:8], "little")
+    header, place = {}, 0
+    for name, entry in json.loads(content[8 : 8 + length]).items():
+        end = place + math.prod(entry["shape"]) * sizes.get(dtype, 1)
+        header[name], place = {"dtype": dtype, "shape": entry["shape"], "data_offsets": [place, end]}, end
+    text = json.dumps(header).encode()
+    content = len(text).to_bytes(8, "little") + text + bytes(place)
+    (folder / "weights.safetensors").write_bytes(content)
+    info = json.loads((folder / "info.json").read_text())
+    (folder / "info.json").write_text(json.dumps(info | {"sha256": hashlib.sha256(content).hexdigest()}))
+    if dtype in ("F16", "BF16", "F32", "F64"):
+        load_model(folder)
+    else:
+        assert_refused(lambda: load_model(folder), f"has dtype {dtype}", "F16, BF16, F32, F64")

@@ -93,6 +93,23 @@ def test_pull_takes_the_revision_that_is_asked_for(copy, hub, tmp_path):
     assert contents(tmp_path / "new") == contents(copy) != before
 
 
+@pytest.mark.parametrize("out", [".", "empty"])
+def test_pull_fills_an_empty_folder_that_keeps_its_place(out, agent, hub, tmp_path, monkeypatch):
+    hub.add("ann/pole", contents(agent))
+    folder = tmp_path / "here" / "empty"
+    folder.mkdir(parents=True)
+    before = folder.stat().st_ino
+    monkeypatch.chdir(folder if out == "." else folder.parent)
+    pull_agent("ann/pole", out, endpoint=hub.url)
+    assert folder.stat().st_ino == before and contents(folder) == contents(agent)
+    assert list(folder.parent.iterdir()) == [folder]
+    hub.add("eve/pole", contents(agent) | {"weights.safetensors": b"pickle"})
+    (tmp_path / "other").mkdir()
+    with pytest.raises(UserError, match="cannot be used"):
+        pull_agent("eve/pole", tmp_path / "other", endpoint=hub.url)
+    assert not list((tmp_path / "other").iterdir())
+
+
 def test_pull_fetches_the_files_of_an_agent_only(agent, hub, tmp_path):
     others = {"setup.py": b"raise SystemExit", "deep/info.json": b"{}", "replay.mp4": b"film", "model.pkl": b"p"}
     hub.add("eve/pole", contents(agent) | others)

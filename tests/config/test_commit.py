@@ -1,5 +1,6 @@
 """Commits: at every moment one save is whole, and every changed bit is noticed."""
 
+import hashlib
 import json
 import os
 import random
@@ -10,7 +11,7 @@ import pytest
 
 from latentplan.config import UserError
 from latentplan.config import commit as module
-from latentplan.config.commit import MANIFEST, DamageError, Log, Saves, read_manifest, write_manifest
+from latentplan.config.commit import MANIFEST, DamageError, Extent, Log, Saves, read_manifest, write_manifest
 
 ROW = 32
 
@@ -160,6 +161,14 @@ def test_verify_ignores_log_bytes_after_the_committed_ones(folder):
         (lambda values: values | {"note": {"count": 99}}, "its own checksum differs"),
         (lambda values: values | {"files": {"../count": {"bytes": 1, "sha256": ""}}}, "names the file"),
         (lambda values: values | {"files": {"count": {"bytes": -1, "sha256": ""}}}, "no size"),
+        (lambda values: values | {"kind": 1}, "kind must be a text"),
+        (lambda values: values | {"format": True}, "format a whole number"),
+        (lambda values: values | {"note": 5}, "note must hold plain values"),
+        (lambda values: values | {"note": {"count": [5]}}, "note must hold plain values"),
+        (lambda values: values | {"files": {"logs/count": {"bytes": 1, "sha256": ""}}}, "names the file"),
+        (lambda values: values | {"files": {"count": {"bytes": True, "sha256": "0" * 64}}}, "no size"),
+        (lambda values: values | {"files": {"count": {"bytes": 1, "sha256": 5}}}, "no checksum"),
+        (lambda values: values | {"logs": {"logs/rows-abc": {"bytes": 1, "sha256": "0" * 64}}}, "names the file"),
         (lambda values: [values], "must hold"),
         (lambda values: "text", "must hold"),
     ],
@@ -187,6 +196,71 @@ def test_read_manifest_does_not_wait_for_a_pipe(folder):
     os.mkfifo(path)
     with pytest.raises(DamageError, match="not a regular file"):
         read_manifest(path.parent, "diary", 1)
+
+
+@pytest.mark.parametrize("content", ["[" * 100_000, "{}", "[]", '{"kind": 1}'])
+def test_kinds_ignores_manifests_that_cannot_be_read(folder, content):
+    (folder / "save-000004" / MANIFEST).write_text(content)
+    assert Saves(folder, "run", 1).kinds() - {"1"} == {"diary"}
+
+
+@pytest.mark.parametrize("replace", [os.mkfifo, lambda path: path.symlink_to(path.with_name("rows-000000000000"))])
+def test_newest_refuses_a_log_that_is_not_a_file(folder, replace):
+    write_empty_log(folder, "logs/rows-000000000009")
+    replace(folder / "logs" / "rows-000000000009")
+    with pytest.raises(DamageError, match="rows-000000000009 is damaged: it is not a regular file"):
+        Saves(folder, "diary", 1).newest()
+
+
+def write_empty_log(folder, name):
+    """Seals all saves again, with a log of no bytes."""
+    for save in folder.glob("save*"):
+        old = read_manifest(save, "diary", 1)
+        write_manifest(save, "diary", 1, old.note, {**old.logs, name: Extent(0, hashlib.sha256(b"").hexdigest())})
+
+
+def test_append_does_not_follow_a_link(folder, tmp_path):
+    (tmp_path / "other").write_text("kept")
+    diary = Diary(folder)
+    for name in ("rows-000000000003", "rows-000000000006"):
+        (folder / "logs" / name).unlink(missing_ok=True)
+        (folder / "logs" / name).symlink_to(tmp_path / "other")
+    with pytest.raises((OSError, DamageError)):
+        diary.add()
+    diary.log.restore({})
+    diary.log.append(6, iter([bytes(ROW)]))
+    assert (tmp_path / "other").read_text() == "kept" and not (folder / "logs" / "rows-000000000006").is_symlink()
+
+
+@pytest.mark.parametrize("damage", [os.unlink, lambda path: os.truncate(path, ROW), lambda path: path.write_bytes(b"")])
+def test_append_refuses_a_log_that_has_lost_rows(folder, damage):
+    diary = Diary(folder)
+    damage(folder / "logs" / "rows-000000000003")
+    with pytest.raises((OSError, DamageError), match="rows-000000000003"):
+        diary.add()
+
+
+def change_content(path):
+    path.write_bytes(b"x" * path.stat().st_size)
+
+
+@pytest.mark.parametrize("damage", [os.unlink, lambda path: os.truncate(path, ROW), change_content])
+@pytest.mark.parametrize("first", [0, 3])
+def test_forget_changed_forgets_the_first_changed_file_and_later_rows(folder, damage, first):
+    log = Diary(folder).log
+    damage(folder / "logs" / f"rows-{first:012d}")
+    assert log.forget_changed() == log.path(first) and log.end == first
+    log.append(first, iter([bytes([row]) * ROW for row in range(first, 5)]))
+    assert log.forget_changed() is None
+    assert Diary(folder).rows() == list(range(5))  # both saves are whole again
+
+
+def test_forget_changed_reads_a_file_with_another_time_once(folder, monkeypatch):
+    log, path = Diary(folder).log, folder / "logs" / "rows-000000000003"
+    os.utime(path, ns=(0, 0))
+    assert log.forget_changed() is None
+    monkeypatch.setattr(module, "check_extent", pytest.fail)
+    assert log.forget_changed() is None
 
 
 def test_newest_refuses_another_format_and_skips_another_kind(folder, tmp_path):

@@ -13,6 +13,7 @@ from latentplan.config import (
     ModelConfig,
     PlannerConfig,
     RunConfig,
+    UserError,
     derive_seed,
     from_dict,
     to_dict,
@@ -54,6 +55,34 @@ def test_from_dict_names_unknown_settings():
 
 
 @pytest.mark.parametrize(
+    ("section", "name", "value"),
+    [
+        ("model", "decoder_layers", float("inf")),
+        ("model", "decoder_layers", 2.5),
+        ("model", "decoder_layers", True),
+        ("model", "decoder_layers", "2"),
+        ("model", "latent_dim", 10**30),
+        ("model", "encoder_channels", [8, "x"]),
+        ("model", "encoder_channels", 8),
+        ("learning", "batch_size", None),
+        ("env", "domain", 5),
+        ("env", "vectors", [[]]),
+        ("run", "device", ["cpu"]),
+    ],
+)
+def test_from_dict_names_the_setting_of_a_value_of_another_type(section, name, value):
+    with pytest.raises(UserError, match=rf"{section}\.{name} must be .+, got") as caught:
+        from_dict({section: {name: value}})
+    assert "\n" not in str(caught.value) and "be s," not in str(caught.value)
+
+
+def test_from_dict_takes_numbers_of_the_other_type_that_are_equal():
+    saved = from_dict({"run": {"frames": 1e5, "minutes": 2}, "env": {"cameras": [0, 1]}})
+    assert (saved.run.frames, saved.run.minutes, saved.env.cameras) == (100_000, 2, ("0", "1"))
+    assert type(saved.run.frames) is int
+
+
+@pytest.mark.parametrize(
     ("kind", "name", "value"),
     [
         (PlannerConfig, "horizon", 0),
@@ -65,6 +94,7 @@ def test_from_dict_names_unknown_settings():
         (RunConfig, "frames", -1),
         (RunConfig, "threads", 999_999),
         (ModelConfig, "encoder_channels", ()),
+        (ModelConfig, "decoder_layers", 65),
     ],
 )
 def test_config_names_the_field_of_a_bad_value(kind, name, value):

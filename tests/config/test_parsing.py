@@ -1,12 +1,12 @@
 """The settings that a dataclass declares, and how values are read for them."""
 
 from dataclasses import MISSING, dataclass, field
-from typing import Literal
+from typing import Any, Literal
 
 import pytest
 
 from latentplan.config import UserError
-from latentplan.config.parsing import list_settings, option, raise_unknown, read_values
+from latentplan.config.parsing import fits, list_settings, option, raise_unknown, read_values
 
 
 @dataclass(frozen=True)
@@ -121,3 +121,20 @@ def test_raise_unknown_names_the_nearest_or_all():
         raise_unknown("mode", "q", ["planner", "actor"])
     with pytest.raises(UserError, match="--help-all lists all"):
         raise_unknown("flag", "q", [f"--{'x' * count}" for count in range(1, 30)])
+
+
+@pytest.mark.parametrize(
+    ("hint", "good", "bad"),
+    [
+        (int, [0, -3], [True, 1.0, "1", None, 10**18]),
+        (float, [0.5, 2, float("inf")], [False, "1", None, 10**18]),
+        (bool, [True], [1, None]),
+        (str | None, ["", None], [0]),
+        (Literal["red", "green"], ["red"], ["blue", ["red"], None]),
+        (tuple[int, ...], [(), (1, 2)], [[1], (1.0,), 1]),
+        (list[float], [[], [1, 2.0]], [(1.0,), ["x"]]),
+        (dict[str, Any], [{}, {"a": [1]}], [{1: 2}, [], {"a": 10**18}]),
+    ],
+)
+def test_fits_compares_values_with_types(hint, good, bad):
+    assert all(fits(value, hint) for value in good) and not any(fits(value, hint) for value in bad)

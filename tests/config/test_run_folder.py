@@ -1,12 +1,13 @@
-"""The settings with which a run resumes: the file that a user may edit, or those of the last save."""
+"""The folder of a run: the settings with which the run resumes, and the lock of the folder."""
 
+import os
 from dataclasses import replace
 
 import pytest
 
 from latentplan.config import Config, EnvConfig, UserError
 from latentplan.config.files import dump_config
-from latentplan.config.run_folder import RUN_FILE, read_run_config, run_saves
+from latentplan.config.run_folder import RUN_FILE, lock_folder, read_run_config, run_saves
 
 CONFIG = Config(env=EnvConfig(domain="cartpole", task="swingup"))
 
@@ -72,3 +73,21 @@ def test_run_saves_refuses_a_run_of_the_format_before(tmp_path):
     with pytest.raises(UserError, match="finish it with that version, or start a new run") as caught:
         run_saves(tmp_path)
     assert "\n" not in str(caught.value)
+
+
+def test_read_run_config_does_not_wait_for_a_pipe(folder):
+    (folder / RUN_FILE).unlink()
+    os.mkfifo(folder / RUN_FILE)
+    config, warning = read_run_config(folder)
+    assert config == CONFIG and "the settings of the last save take its place" in warning
+
+
+@pytest.mark.parametrize("name", ["resume", "resume/logs", "checkpoints", "checkpoints/last", "videos", ".lock"])
+def test_lock_folder_refuses_a_run_whose_files_would_be_written_elsewhere(tmp_path, name):
+    target, path = tmp_path / "elsewhere", tmp_path / "run" / name
+    target.mkdir()
+    path.parent.mkdir(parents=True)
+    path.symlink_to(target / "new" if name == ".lock" else target)
+    with pytest.raises(UserError, match=str(path.parent)) as caught, lock_folder(tmp_path / "run"):
+        pass
+    assert "\n" not in str(caught.value) and list(target.iterdir()) == []

@@ -1,6 +1,7 @@
 """The replay on disk: what was saved is restored, and a save writes new frames only."""
 
 import os
+import resource
 
 import numpy as np
 import pytest
@@ -8,7 +9,7 @@ import torch
 
 from latentplan.config import UserError
 from latentplan.config.commit import DamageError, Saves
-from latentplan.replay.buffer import Replay
+from latentplan.replay.buffer import Replay, write_saved
 from latentplan.replay.disk import FORMAT, ReplayFiles
 from tests.replay.numbered_rows import CPU, NumberedRows, make_filled_replay, make_replay, sample
 from tests.replay.test_buffer import RINGS, assert_aligned
@@ -118,6 +119,25 @@ def test_save_that_fails_leaves_the_save_before(tmp_path, monkeypatch):
     assert_same(disk.replay, Disk(tmp_path, make_replay()).load().replay)
 
 
+@pytest.mark.parametrize("damage", [os.unlink, lambda path: os.truncate(path, 10)])
+@pytest.mark.parametrize("capacity", [60, 12])
+def test_save_writes_frames_again_whose_log_was_changed(tmp_path, damage, capacity):
+    disk, numbered = Disk(tmp_path, make_replay(capacity)), NumberedRows(0, (99,))
+    disk.files._logs[0].rows_per_file = 10
+    for start in range(0, 24, 8):
+        disk.replay.add(0, numbered.rows(start, start + 8))
+        disk.save()
+    path = sorted((tmp_path / "logs").iterdir())[-2]
+    damage(path)
+    disk.replay.add(0, numbered.rows(24, 32))
+    with pytest.warns(RuntimeWarning, match=f"{path.name} was changed by another program"):
+        disk.save()
+    assert_same(disk.replay, Disk(tmp_path, make_replay(capacity)).load().replay)
+    disk.replay.add(0, numbered.rows(32, 40))
+    disk.save()
+    assert_same(disk.replay, Disk(tmp_path, make_replay(capacity)).load().replay)
+
+
 @pytest.mark.parametrize(("before", "after"), [(60, 100), (12, 60), (60, 14), (12, 8)])
 def test_read_keeps_the_newest_rows_in_another_capacity(before, after, tmp_path):
     replay = make_filled_replay(capacity=before)
@@ -154,3 +174,14 @@ def test_newest_refuses_a_log_with_missing_frames(tmp_path):
     os.truncate(path, 10 * 64 * 64 * 3)
     with pytest.raises(DamageError, match="it has 122,880 bytes and must have 282,624"):
         Disk(tmp_path, make_replay()).load()
+
+
+def test_write_saved_raises_the_error_of_the_disk(tmp_path):
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    for size in (10, 10**5, 10**6):  # torch itself would raise errors of other types, which depend on the size
+        resource.setrlimit(resource.RLIMIT_FSIZE, (4 * size, limits[1]))
+        try:
+            with pytest.raises(OSError, match="File too large"):
+                write_saved({"values": torch.zeros(size), "more": torch.zeros(50)}, tmp_path / "file")
+        finally:
+            resource.setrlimit(resource.RLIMIT_FSIZE, limits)

@@ -1,11 +1,13 @@
-"""A folder is locked by one process at a time."""
+"""The folder of a run is locked by one process at a time, and refused where it cannot be made."""
 
 import multiprocessing
+from pathlib import Path
 
 import pytest
 
 from latentplan.config import UserError
 from latentplan.config.run_folder import lock_folder
+from latentplan.training.checks import check_folder
 
 
 def test_lock_folder_refuses_a_second_lock_until_the_first_is_released(tmp_path):
@@ -34,3 +36,12 @@ def _hold(folder, held):
     with lock_folder(folder):
         held.set()
         multiprocessing.Event().wait()
+
+
+def test_check_folder_refuses_a_folder_below_one_that_may_not_be_read(monkeypatch):
+    def refuse(path):
+        raise PermissionError(13, "Permission denied", str(path))
+
+    monkeypatch.setattr(Path, "exists", refuse)
+    with pytest.raises(UserError, match=r"cannot make the folder .*Permission denied: .*choose another --run-dir"):
+        check_folder("private/run")

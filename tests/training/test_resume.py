@@ -5,12 +5,16 @@ import os
 import shutil
 import signal
 import time
+from dataclasses import replace
 from types import SimpleNamespace
 
 import pytest
 
+from latentplan.config import UserError
+from latentplan.config.files import dump_config, read_config
 from latentplan.training import resume, saving, train
-from latentplan.training.collection.process import LocalWorker
+from latentplan.training.collection.collector import Collected
+from latentplan.training.collection.process import LocalWorker, WorkerEnded
 from latentplan.training.learner.registry import WORLD_MODEL_LOSSES, register
 from latentplan.training.run import _Run
 from tests.training.run_folder import list_saves, read_epochs, read_rows, read_state, seal, write_state
@@ -190,3 +194,54 @@ def test_resume_continues_from_the_last_timed_save_after_a_crash(tiny, dot, tmp_
     assert (before := read_state(tmp_path / "run"))["run"]["env_frames"] == 75
     resume(tmp_path / "run", make_env=dot)
     assert_continues(before, read_state(tmp_path / "run"))
+
+
+def test_run_whose_collection_process_ends_too_often_saves_itself(finished, tiny, dot, tmp_path, monkeypatch):
+    rounds = itertools.count()
+
+    class EndingWorker(LocalWorker):
+        """A worker that ends with its third round, and is not replaced."""
+
+        def result(self):
+            value = super().result()
+            if isinstance(value, Collected) and next(rounds) == 2:
+                raise WorkerEnded("the collection process ended unexpectedly (exit code -9)")
+            return value
+
+    config = tiny(tmp_path / "run", evaluation={"every_frames": 10**6})
+    with monkeypatch.context() as patch:
+        patch.setattr("latentplan.training.collection.crew.LocalWorker", EndingWorker)
+        with pytest.raises(UserError, match="ended unexpectedly.*--resume .* continues it"):
+            train(config, dot)
+    before = read_state(tmp_path / "run")
+    assert before["run"]["env_frames"] == 60 and before["learner"]["updates"] > 0
+    resume(tmp_path / "run", make_env=dot)
+    assert_continues(before, read_state(tmp_path / "run"))
+
+
+def test_resume_of_a_run_that_was_moved_does_not_look_at_its_old_folder(short, dot, tmp_path):
+    folder = shutil.copytree(short.run_dir, tmp_path / "run")
+    (tmp_path / "file").touch()
+    save = list_saves(folder)[-1]
+    config = read_config(folder / "config.yaml")
+    moved = replace(config, run=replace(config.run, run_dir=str(tmp_path / "file" / "run")))
+    for path in (folder, save):
+        dump_config(moved, path / "config.yaml")
+    seal(save)
+    assert resume(folder, make_env=dot).exit_code == 0
+
+
+def test_resume_removes_what_a_killed_process_left(short, dot, tmp_path):
+    folder = shutil.copytree(short.run_dir, tmp_path / "run")
+    child = os.fork()
+    if child == 0:
+        os._exit(0)
+    os.waitpid(child, 0)
+    names = [f".config.yaml.{child}", f".metrics.csv.{child}", f"videos/.000000060.{child}.webm"]
+    names += ["checkpoints/best/weights.safetensors.part", "checkpoints/last/manifest.json.part"]
+    for name in names:
+        (folder / name).write_text("half")
+    (folder / "resume" / "save-000099.part").mkdir()
+    (folder / "resume" / "save-000098.part").symlink_to(tmp_path)
+    resume(folder, make_env=dot)
+    assert not [path for path in folder.rglob("*") if path.suffix == ".part" or str(child) in path.name]

@@ -15,6 +15,7 @@ import numpy as np
 import torch
 
 from latentplan.config import CollectionConfig, Config, EnvironmentFault, UserError
+from latentplan.config.manifest import DamageError
 from latentplan.config.run_folder import RUN_FILE
 from latentplan.replay.buffer import Rows
 from latentplan.training.cluster import join_cluster
@@ -359,11 +360,15 @@ def check_memory(memory: dict[str, Any] | None, config: Config, folder: Path) ->
 
     Raises:
         UserError: The episodes cannot go on with these settings.
+        DamageError: The parts of the state do not fit each other.
     """
     if memory is None:
         return
     is_crew, settings = "members" in memory, config.collection
     members = memory["members"] if is_crew else [memory]
+    are_counts = not is_crew or len(members) == len(memory["ended"]) == len(memory["shares"])
+    if not are_counts or not all(member is None or _is_whole(member) for member in members):
+        raise DamageError(f"the last save in {folder} is damaged: its running episodes have another form")
     sizes = {len(member["episodes"]) for member in members if member is not None}
     is_same_kind = is_crew == (settings.overlap and not _is_alone(settings))
     if not is_same_kind or len(members) != settings.workers or not sizes <= {config.env.num_envs}:
@@ -377,6 +382,14 @@ def end_episodes(memory: dict[str, Any]) -> dict[str, Any]:
     """The state of a collector as `Collected.memory` holds it, without its running episodes."""
     records = [record | {"actions": record["actions"][:0]} for record in memory["episodes"]]
     return memory | {"episodes": records, "has_ended": np.ones_like(memory["has_ended"])}
+
+
+def _is_whole(memory: dict[str, Any]) -> bool:
+    """Whether the state of a collector holds a return and an end for each of its episodes."""
+    num, has_ended = len(memory["episodes"]), memory["has_ended"]
+    are_actions = all(record["actions"].ndim == 2 for record in memory["episodes"])
+    is_right = memory["returns"].shape == has_ended.shape == (num,) and has_ended.dtype in (torch.bool, np.bool_)
+    return bool(are_actions and is_right)
 
 
 def _is_alone(settings: CollectionConfig) -> bool:

@@ -12,8 +12,8 @@ import numpy as np
 
 from latentplan import __version__
 from latentplan.config import EnvConfig, UserError
-from latentplan.config.commit import write_synced
 from latentplan.config.extras import import_extra
+from latentplan.config.manifest import write_synced
 from latentplan.config.writing import replaced_whole
 from latentplan.envs.spaces import Actions, Interface
 from latentplan.training.demonstrations.recording import RecordedEpisode, name_space

@@ -12,6 +12,8 @@ from latentplan.models import Gaussian, State, WorldModel
 from latentplan.models.symmetry import TurnedModel
 from latentplan.planning import Plan, Planner
 
+COLUMNS = {"deter", "stoch", "mean", "std", "round"}
+
 
 def plan_actions(
     planner: Planner,
@@ -105,5 +107,11 @@ class Demonstrations:
         return dict(self.columns)
 
     def load_state_dict(self, columns: dict[str, Any]) -> None:
-        """Load columns that `state_dict` returned."""
+        """Load columns that `state_dict` returned.
+
+        Raises:
+            ValueError: The columns have other names or different numbers of rows.
+        """
+        if columns and (set(columns) != COLUMNS or len({value.shape[:1] for value in columns.values()}) > 1):
+            raise ValueError(f"labels must have the columns {', '.join(sorted(COLUMNS))}, of one length")
         self.columns = dict(columns)

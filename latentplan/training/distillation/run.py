@@ -40,10 +40,10 @@ from latentplan.models.heads import Actor
 from latentplan.training.collection.collector import EnvFactory
 from latentplan.training.console import StatusLine
 from latentplan.training.distillation.labels import Demonstrations, plan_actions, read_first_actions
-from latentplan.training.distillation.student import Student
+from latentplan.training.distillation.student import Student, StudentState
 from latentplan.training.run import Result
 from latentplan.training.signals import Signals, exit_code, raise_interrupt
-from latentplan.training.state import load_values, refuse_used, save_values
+from latentplan.training.state import build, build_settings, load_values, refuse_used, remove_leftovers, save_values
 
 KIND, FORMAT = DISTILLATION, 2
 NUM_STAGES = 3  # per round: collect, train, select
@@ -131,9 +131,26 @@ def read_resumed(
     saved = _load_distillation(Path(folder))
     if read_info(saved["source"])["sha256"] != saved["sha256"]:
         raise UserError(f"{saved['source']} is not the agent from which the distillation in {folder} started")
-    settings = DistillConfig(**saved["settings"])
+    settings = build_settings(DistillConfig, saved["settings"], Path(folder))
     settings = replace(settings, rounds=rounds or settings.rounds, minutes=minutes or settings.minutes)
-    return saved, settings, from_dict({"planner": saved["planner"]}).planner
+    try:
+        planner = from_dict({"planner": saved["planner"]}).planner
+    except ValueError as error:
+        raise UserError(f"the last save in {folder} is damaged: {error}") from None
+    return saved, settings, planner
+
+
+SAVED = {
+    "source": str,
+    "sha256": str,
+    "settings": dict[str, Any],
+    "planner": dict[str, Any],
+    "state": dict[str, Any],
+    "demonstrations": dict[str, torch.Tensor],
+    "student": StudentState,
+    "best": dict[str, torch.Tensor],
+}
+"""The types of what a save of a distillation holds."""
 
 
 @dataclass
@@ -269,7 +286,7 @@ class _Distillation:
         signals = Signals(raise_interrupt)
         try:
             with lock_folder(self.folder), self.line, signals:
-                self.saves.remove_leftovers()
+                remove_leftovers(self.folder)
                 if not state.planner:
                     self._evaluate_initial()
                 while not self._is_spent():
@@ -288,12 +305,25 @@ class _Distillation:
             self.env.close()
 
     def load(self, saved: dict[str, Any]) -> None:
-        """Load what `_save` saved."""
+        """Load what `_save` saved.
+
+        Raises:
+            UserError: The saved weights or labels do not fit the agent.
+        """
         self.saves.newest()  # which the next save keeps
-        self.state = DistillationState(**saved["state"])
+        self.state = build(DistillationState, saved["state"], self.folder)
+        if not (math.isfinite(self.state.minutes) and self.state.minutes >= 0.0 and self.state.stage >= 0):
+            raise UserError(f"the last save in {self.folder} is damaged: its clocks are outside of their ranges")
         self._earlier_minutes = self.state.minutes
-        self.demonstrations.load_state_dict(saved["demonstrations"])
-        self.student.load_state_dict(saved["student"])
+        try:
+            self.demonstrations.load_state_dict(saved["demonstrations"])
+            self.model.actor.load_state_dict(saved["best"])
+            self.student.load_state_dict(saved["student"])
+        except (RuntimeError, ValueError) as error:
+            reason = str(error).splitlines()[-1].strip()
+            raise UserError(
+                f"what is saved in {self.folder} does not fit the agent of {self.source}: {reason}"
+            ) from None
         self.best = saved["best"]
         self.model.actor.load_state_dict(self.student.weights())
 
@@ -467,9 +497,7 @@ def _load_distillation(folder: Path) -> dict[str, Any]:
         raise UserError(
             f"{folder} was saved by latentplan 0.2.0 or earlier: finish it with that version, or start anew"
         )
-    return load_values(
-        _saves(folder), ("source", "sha256", "settings", "planner", "state", "demonstrations", "student")
-    )
+    return load_values(_saves(folder), SAVED)
 
 
 def format_mean(returns: Sequence[float], *, signed: bool = False) -> str:

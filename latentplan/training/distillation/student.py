@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Callable
-from typing import Any
+from typing import Any, TypedDict
 
 import torch
 from torch import Tensor
@@ -13,6 +13,14 @@ from latentplan.config import DistillConfig, derive_seed
 from latentplan.models.heads import Actor
 from latentplan.training.distillation.labels import Demonstrations
 from latentplan.training.learner.losses import imitation_loss
+from latentplan.training.learner.optimization import OptimizerState, load_optimizer_state
+
+
+class StudentState(TypedDict):
+    """What the `state_dict` of a student returns."""
+
+    actor: dict[str, Tensor]
+    optimizer: OptimizerState
 
 
 class Student:
@@ -69,6 +77,11 @@ class Student:
         return {"actor": self.actor.state_dict(), "optimizer": self.optimizer.state_dict()}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Load what `state_dict` returned."""
+        """Load what `state_dict` returned.
+
+        Raises:
+            RuntimeError: The weights belong to another actor.
+            UserError: The state of the optimizer belongs to other parameters.
+        """
         self.actor.load_state_dict(state["actor"])
-        self.optimizer.load_state_dict(state["optimizer"])
+        load_optimizer_state(self.optimizer, state["optimizer"])

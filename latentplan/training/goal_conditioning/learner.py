@@ -10,7 +10,7 @@ from __future__ import annotations
 import copy
 import math
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypedDict
 
 import torch
 from torch import Tensor
@@ -21,11 +21,21 @@ from latentplan.objectives.box import box_degree
 from latentplan.replay.buffer import Replay
 from latentplan.training.learner.losses import draw_noise, entropy
 from latentplan.training.learner.module import Snapshot
-from latentplan.training.learner.optimization import descend, return_scale
+from latentplan.training.learner.optimization import OptimizerState, descend, load_optimizer_state, return_scale
 
 RANGE = (0.005, 0.995)  # quantiles of the observed quantities, between which box centres are moved
 RANGE_ROWS = 20_000  # rows from which the quantiles are estimated
 FRAMES_PER_CALL = 1024
+
+
+class GoalLearnerState(TypedDict):
+    """What the `state_dict` of a goal learner returns."""
+
+    heads: dict[str, Tensor]
+    target: dict[str, Tensor]
+    optimizer: OptimizerState
+    return_range: Tensor
+    updates: int
 
 
 class Boxes(NamedTuple):
@@ -193,10 +203,15 @@ class GoalLearner:
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Load what `state_dict` returned."""
+        """Load what `state_dict` returned.
+
+        Raises:
+            RuntimeError: The weights belong to goal heads of other sizes.
+            UserError: The state of the optimizer belongs to other parameters.
+        """
         self.model.goal_heads.load_state_dict(state["heads"])
         self.target.load_state_dict(state["target"])
-        self.optimizer.load_state_dict(state["optimizer"])
+        load_optimizer_state(self.optimizer, state["optimizer"])
         self.return_range, self.updates = state["return_range"].to(self.model.device), state["updates"]
 
     def _generator(self, name: str, counter: int = 0) -> torch.Generator:

@@ -24,15 +24,31 @@ from latentplan.replay.disk import FORMAT as REPLAY_FORMAT
 from latentplan.replay.disk import ReplayFiles, count_saved, save_replay
 from latentplan.training.collection.collector import Collector
 from latentplan.training.console import StatusLine
-from latentplan.training.goal_conditioning.learner import BoxSource, GoalLearner
+from latentplan.training.goal_conditioning.learner import BoxSource, GoalLearner, GoalLearnerState
 from latentplan.training.run import Result
 from latentplan.training.signals import Signals, exit_code, raise_interrupt
-from latentplan.training.state import load_values, refuse_used, save_values, warn_of_loss
+from latentplan.training.state import (
+    build_settings,
+    load_values,
+    refuse_used,
+    remove_leftovers,
+    save_values,
+    warn_of_loss,
+)
 
 ROUND_DECISIONS = 125
 SAVE_SECONDS = 300.0
 KIND, FORMAT = GOALS, 2
 PLAYED_FOLDER = "replay"
+SAVED = {
+    "run": str,
+    "source": str,
+    "sha256": str,
+    "settings": dict[str, Any],
+    "minutes": float,
+    "learner": GoalLearnerState,
+}
+"""The types of what a save holds."""
 
 
 def learn_goals(
@@ -93,10 +109,10 @@ def read_resumed(
         UserError: The folder holds nothing to resume, or the agent that the learning started from has changed.
     """
     require_saves(Path(folder), KIND)
-    saved = load_values(_saves(Path(folder)), ("run", "source", "sha256", "settings", "minutes", "learner"))
+    saved = load_values(_saves(Path(folder)), SAVED)
     if read_info(saved["source"])["sha256"] != saved["sha256"]:
         raise UserError(f"{saved['source']} is not the agent from which {folder} started")
-    settings = GoalsConfig(**saved["settings"])
+    settings = build_settings(GoalsConfig, saved["settings"], Path(folder))
     return saved, replace(settings, updates=updates or settings.updates, minutes=minutes or settings.minutes)
 
 
@@ -182,8 +198,7 @@ def _learn(run: Path, folder: Path, settings: GoalsConfig, device: str, saved: d
     saves, earlier = _saves(folder), 0.0
     if saved is not None:
         saves.newest()  # which the next save keeps
-        learner.load_state_dict(saved["learner"])
-        earlier = saved["minutes"]
+        earlier = _load(learner, saved, folder)
     started = last_save = time.monotonic()
     worth, signals = math.nan, Signals()
 
@@ -198,7 +213,7 @@ def _learn(run: Path, folder: Path, settings: GoalsConfig, device: str, saved: d
         save_values(saves, about | state, {"updates": learner.updates, "minutes": round(minutes(), 1)})
 
     with line, signals:
-        saves.remove_leftovers()
+        remove_leftovers(folder)
         budget = settings.minutes or math.inf
         while learner.updates < settings.updates and not (signals.received or minutes() >= budget):
             parts = learner.update()
@@ -216,6 +231,22 @@ def _learn(run: Path, folder: Path, settings: GoalsConfig, device: str, saved: d
             return Result(folder, exit_code(signals.received), {})
         line.print(f"agent: {folder}")
     return Result(folder, 0, {"worth": worth})
+
+
+def _load(learner: GoalLearner, saved: dict[str, Any], folder: Path) -> float:
+    """Loads what was saved into a learner, and returns the minutes that were spent.
+
+    Raises:
+        UserError: The saved weights do not fit the agent, or the minutes are no number of minutes.
+    """
+    if not (math.isfinite(saved["minutes"]) and saved["minutes"] >= 0.0):
+        raise UserError(f"the last save in {folder} is damaged: minutes is {saved['minutes']}")
+    try:
+        learner.load_state_dict(saved["learner"])
+    except RuntimeError as error:
+        reason = str(error).splitlines()[-1].strip()
+        raise UserError(f"what is saved in {folder} does not fit its agent: {reason}") from None
+    return float(saved["minutes"])
 
 
 def _refuse_agent(run: Path, model: WorldModel) -> None:

@@ -5,17 +5,25 @@ from __future__ import annotations
 import ctypes
 import os
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, TypedDict
 
 import torch
 from torch import Tensor
 
+from latentplan.config import UserError
 from latentplan.models.backend import Backend
 
 RETURN_RANGE_RATE = 0.01
 AVERAGED_SHARE = 0.1  # the average covers at most this share of all updates
 _M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD = -1, -3  # names of <malloc.h>
 _KEPT_BYTES = {_M_TRIM_THRESHOLD: 2**31 - 1, _M_MMAP_THRESHOLD: 32 * 2**20}
+
+
+class OptimizerState(TypedDict):
+    """What the `state_dict` of an optimizer returns."""
+
+    state: dict[int, dict[str, Tensor]]
+    param_groups: list[dict[str, Any]]
 
 
 def descend(optimizer: torch.optim.Optimizer, loss: Tensor, max_norm: float, update: int) -> Tensor:
@@ -84,14 +92,31 @@ def clipped_gradient(
 
 
 def load_optimizer_state(optimizer: torch.optim.Optimizer, saved: dict[str, Any]) -> None:
-    """Loads a saved state into an optimizer, but keeps the optimizer's own `capturable` flag.
+    """Loads a saved state into an optimizer of the kind Adam, but keeps the optimizer's own options.
 
-    The flag depends on the device, and a run may resume on another device.
+    The flag `capturable` depends on the device, and a run may resume on another device; the learning rate may have been
+    edited in its settings.
+
+    Raises:
+        UserError: The state belongs to other parameters.
     """
-    capturable = [group["capturable"] for group in optimizer.param_groups]
-    optimizer.load_state_dict(saved)
-    for group, own in zip(optimizer.param_groups, capturable, strict=True):
-        group["capturable"] = own
+    options = [{name: value for name, value in group.items() if name != "params"} for group in optimizer.param_groups]
+    try:
+        optimizer.load_state_dict(saved)
+        for group, own in zip(optimizer.param_groups, options, strict=True):
+            group |= own
+            _check_moments(optimizer, group["params"])
+    except (AttributeError, KeyError, TypeError, ValueError) as error:
+        raise UserError(f"the saved state of an optimizer does not fit its parameters: {str(error)[:160]}") from None
+
+
+def _check_moments(optimizer: torch.optim.Optimizer, parameters: Sequence[Tensor]) -> None:
+    """Raises ValueError if the moments of parameters have other names or shapes; none stand for no step so far."""
+    for parameter in parameters:
+        state = optimizer.state.get(parameter)
+        moments = {"exp_avg": parameter.shape, "exp_avg_sq": parameter.shape, "step": torch.Size()}
+        if state and {name: value.shape for name, value in state.items()} != moments:
+            raise ValueError(f"a parameter of shape {tuple(parameter.shape)} has moments of other shapes")
 
 
 @torch.no_grad()
