@@ -49,7 +49,7 @@ def resolve(request: Request) -> dict[str, Any]:
     """
     if request.resume is not None:
         require_saves(request.resume, DISTILLATION)  # before torch is imported
-        from latentplan.training.distillation.run import read_resumed
+        from latentplan.training.distillation.saves import read_resumed
 
         _, settings, planner = read_resumed(request.resume, **request.settings)
     else:

@@ -25,12 +25,11 @@ import torch
 
 from latentplan.agents.actor import ActorAgent
 from latentplan.agents.base import ModelAgent
-from latentplan.agents.checkpoint import load_model, read_info, resolve_checkpoint, save_checkpoint
+from latentplan.agents.checkpoint import load_model, resolve_checkpoint, save_checkpoint
 from latentplan.agents.planning import PlanningAgent
-from latentplan.config import USER_DOMAIN, DistillConfig, PlannerConfig, UserError, derive_seed, from_dict, to_dict
-from latentplan.config.commit import Saves
+from latentplan.config import USER_DOMAIN, DistillConfig, PlannerConfig, UserError, derive_seed, to_dict
 from latentplan.config.env_id import choose_env, repeat_flag
-from latentplan.config.run_folder import DISTILLATION, SAVES_FOLDER, lock_folder, require_saves
+from latentplan.config.run_folder import lock_folder
 from latentplan.envs import make_env, make_from
 from latentplan.evaluation.compatibility import refuse_other_spaces
 from latentplan.evaluation.episodes import OnStep, Step, episode_seed, iterate_episodes
@@ -40,12 +39,12 @@ from latentplan.models.heads import Actor
 from latentplan.training.collection.collector import EnvFactory
 from latentplan.training.console import StatusLine
 from latentplan.training.distillation.labels import Demonstrations, plan_actions, read_first_actions
-from latentplan.training.distillation.student import Student, StudentState
+from latentplan.training.distillation.saves import KIND, open_saves, read_resumed
+from latentplan.training.distillation.student import Student
 from latentplan.training.run import Result
 from latentplan.training.signals import Signals, exit_code, raise_interrupt
-from latentplan.training.state import build, build_settings, load_values, refuse_used, remove_leftovers, save_values
+from latentplan.training.state import build, refuse_used, remove_leftovers, save_values
 
-KIND, FORMAT = DISTILLATION, 2
 NUM_STAGES = 3  # per round: collect, train, select
 NO_ROUND = -1  # value of `best_round` while the actor before distillation is the best
 # Names of random streams, from which the starts of episodes derive; other names would change the results.
@@ -112,45 +111,6 @@ def resume_distillation(
     run = _Distillation(Path(saved["source"]), Path(folder), settings, planner, device, make_env, env)
     run.load(saved)
     return run.run()
-
-
-def read_resumed(
-    folder: Path | str, *, rounds: int | None = None, minutes: float | None = None
-) -> tuple[dict[str, Any], DistillConfig, PlannerConfig]:
-    """What a distillation continues with: its last save, its settings and those of its search.
-
-    Args:
-        folder: As for `resume_distillation`, and so are the others.
-        rounds: New total number of rounds.
-        minutes: New total budget of minutes.
-
-    Raises:
-        UserError: The folder holds no distillation, or the agent that it started from has changed.
-    """
-    require_saves(Path(folder), KIND)
-    saved = _load_distillation(Path(folder))
-    if read_info(saved["source"])["sha256"] != saved["sha256"]:
-        raise UserError(f"{saved['source']} is not the agent from which the distillation in {folder} started")
-    settings = build_settings(DistillConfig, saved["settings"], Path(folder))
-    settings = replace(settings, rounds=rounds or settings.rounds, minutes=minutes or settings.minutes)
-    try:
-        planner = from_dict({"planner": saved["planner"]}).planner
-    except ValueError as error:
-        raise UserError(f"the last save in {folder} is damaged: {error}") from None
-    return saved, settings, planner
-
-
-SAVED = {
-    "source": str,
-    "sha256": str,
-    "settings": dict[str, Any],
-    "planner": dict[str, Any],
-    "state": dict[str, Any],
-    "demonstrations": dict[str, torch.Tensor],
-    "student": StudentState,
-    "best": dict[str, torch.Tensor],
-}
-"""The types of what a save of a distillation holds."""
 
 
 @dataclass
@@ -276,7 +236,7 @@ class _Distillation:
         self.student = Student(cast(Actor, self.model.actor), settings)
         self.initial = self.best = copy.deepcopy(self.model.actor.state_dict())
         self.line = StatusLine()
-        self.saves = _saves(folder)
+        self.saves = open_saves(folder)
         self._started = time.monotonic()
         self._earlier_minutes = 0.0
 
@@ -481,23 +441,6 @@ class _Distillation:
     def _show(self, activity: str) -> None:
         round_index = min(self.state.stage // NUM_STAGES + 1, self.settings.rounds)
         self.line.update(f"round {round_index} of {self.settings.rounds} | {activity} | {self._minutes():.1f} min")
-
-
-def _saves(folder: Path) -> Saves:
-    return Saves(folder / SAVES_FOLDER, KIND, FORMAT)
-
-
-def _load_distillation(folder: Path) -> dict[str, Any]:
-    """The distillation saved in a folder.
-
-    Raises:
-        UserError: The folder holds no distillation, or a damaged one, or one of an earlier version.
-    """
-    if (folder / SAVES_FOLDER / "distill.pt").exists():
-        raise UserError(
-            f"{folder} was saved by latentplan 0.2.0 or earlier: finish it with that version, or start anew"
-        )
-    return load_values(_saves(folder), SAVED)
 
 
 def format_mean(returns: Sequence[float], *, signed: bool = False) -> str:

@@ -16,7 +16,8 @@ from latentplan.config.run_folder import lock_folder
 from latentplan.models import Gaussian, State, WorldModel
 from latentplan.training import distill, resume_distillation
 from latentplan.training.distillation.labels import Demonstrations, plan_actions
-from latentplan.training.distillation.run import FORMAT, KIND, Comparison
+from latentplan.training.distillation.run import Comparison
+from latentplan.training.distillation.saves import FORMAT, KIND
 from latentplan.training.distillation.student import Student
 from latentplan.training.state import save_values
 from tests.training.run_folder import list_saves, read_state
