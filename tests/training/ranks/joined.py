@@ -22,7 +22,13 @@ from tests.training.conftest import TINY
 
 BATCH, LENGTH, LANE_ROWS, LANES = TINY.learning.batch_size, TINY.learning.sequence_length, 60, 2
 LABELS = {"height": 0.5}
-CALM = {"representation_scale": 0.02, "entropy_scale": 1e-3, "gradient_decay": 1.0}  # rounding errors grow slowly
+CALM = {  # rounding errors grow slowly, on every processor
+    "representation_scale": 0.02,
+    "entropy_scale": 1e-3,
+    "gradient_decay": 1.0,
+    "model_learning_rate": 1e-4,
+    "behaviour_learning_rate": 3e-5,
+}
 SPOILT = 25  # the update in which a reward is not a number
 
 
