@@ -19,7 +19,7 @@ FLOORS = {
     "cartpole-swingup": (75, 250),  #  462      103
     "cheetah-run": (75, 50),  #        111        1
     "finger-spin": (75, 60),  #        122        0
-    "pendulum-swingup": (75, 100),  #  205        0
+    "pendulum-swingup": (150, 100),  # 228        0
     "reacher-easy": (50, 100),  #      188        0
     "walker-run": (125, 50),  #         78        9
     "walker-stand": (75, 95),  #       150       39
