@@ -21,6 +21,7 @@ from latentplan.config.suites import check_task
 from latentplan.config.writing import write_whole
 
 METRICS_FILE, FINAL_FILE, STATUS_FILE = "metrics.csv", "final.json", "status.json"
+CLOCKS = ("env_frames", "minutes", "updates")  # columns of metrics
 StateName = Literal["running", "finished", "stopped", "failed"]
 _DAMAGES = (OSError, ValueError, TypeError, KeyError, OverflowError, RecursionError, csv.Error)  # of files of results
 
@@ -44,11 +45,11 @@ def read_evaluations(folder: Path) -> list[Evaluation]:
         UserError: The files of the run are damaged.
     """
     try:
-        found = {_moment(each): each for each in _read_metrics(folder / METRICS_FILE)}
+        found = {moment_of(each): each for each in _read_metrics(folder / METRICS_FILE)}
         if (folder / FINAL_FILE).exists():
             final = json.loads(read_text(folder / FINAL_FILE, LARGEST_DATA))
             last = _to_evaluation(*(final[name] for name in Evaluation._fields))
-            found[_moment(last)] = last
+            found[moment_of(last)] = last
     except KeyError as error:
         raise UserError(f"the results in {folder} cannot be read: they lack {error}") from None
     except _DAMAGES as error:
@@ -63,17 +64,16 @@ def read_log(info: Mapping[str, Any]) -> list[Evaluation]:
     return [Evaluation(*(entry[name] for name in Evaluation._fields)) for entry in entries if _is_whole(entry)]
 
 
-def read_progress(folder: Path) -> tuple[float, float]:
-    """Largest frames and minutes among the rows of metrics of a run; zeros before the first row.
+def read_progress(folder: Path) -> dict[str, float]:
+    """How far a run is: its largest `env_frames`, `minutes` and `updates`; zeros before the first row of metrics.
 
     The row of an evaluation has the clocks of its beginning, and may come after a later row of learning.
     """
     try:
-        clocks = [(float(row["env_frames"]), float(row["minutes"])) for row in read_rows(folder / METRICS_FILE)]
+        rows = list(read_rows(folder / METRICS_FILE))
+        return {clock: max((float(row[clock]) for row in rows), default=0.0) for clock in CLOCKS}
     except _DAMAGES:  # a damaged file, which the run itself reports
-        return 0.0, 0.0
-    frames, minutes = zip(*clocks, strict=True) if clocks else ((0.0,), (0.0,))
-    return max(frames), max(minutes)
+        return dict.fromkeys(CLOCKS, 0.0)
 
 
 def read_rows(path: Path) -> Iterator[dict[str, str]]:
@@ -120,10 +120,15 @@ def note_state(folder: Path, state: StateName, **facts: Any) -> None:
     write_whole(path, json.dumps(read_facts(folder) | {"state": state, "reason": None} | facts, indent=1) + "\n")
 
 
-def read_facts(folder: Path) -> dict[str, Any]:
-    """What a run has noted about itself: `state`, `reason`, `command`, `commit` and others; empty without a note."""
+def read_facts(folder: Path, name: str = STATUS_FILE) -> dict[str, Any]:
+    """What a run has noted in a file of JSON; empty without the file, or where it is damaged.
+
+    Args:
+        folder: Folder of the run.
+        name: The file; `status.json` has `state`, `reason`, `command`, `commit` and others.
+    """
     try:
-        facts = json.loads(read_text(folder / STATUS_FILE, LARGEST_DATA))
+        facts = json.loads(read_text(folder / name, LARGEST_DATA))
     except _DAMAGES:
         return {}
     return facts if isinstance(facts, dict) else {}
@@ -148,7 +153,7 @@ def find_state(folder: Path) -> tuple[StateName, str | None]:
     return ("finished" if _has_final_evaluation(folder) else "stopped"), None
 
 
-def _moment(evaluation: Evaluation) -> tuple[int, int]:
+def moment_of(evaluation: Evaluation) -> tuple[int, int]:
     """When a run was evaluated: its frames, or its updates where it has collected none."""
     return evaluation.env_frames, 0 if evaluation.env_frames else evaluation.updates
 
@@ -160,8 +165,8 @@ def _is_whole(entry: Mapping[str, Any]) -> bool:
 def _has_final_evaluation(folder: Path) -> bool:
     """Whether the run was evaluated finally after the last frames that it has collected."""
     try:
-        return bool(json.loads(read_text(folder / FINAL_FILE, LARGEST_DATA))["env_frames"] >= read_progress(folder)[0])
-    except _DAMAGES:
+        return bool(read_facts(folder, FINAL_FILE)["env_frames"] >= read_progress(folder)["env_frames"])
+    except (KeyError, TypeError):
         return False
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import inspect
 import time
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
@@ -14,7 +13,7 @@ from torch import Tensor
 from torch.utils._pytree import tree_map
 
 from latentplan.planning.adapters import CEMTrajectoryOptimizer, RolloutController
-from latentplan.planning.model import Model, State, check_shape, count_rows, state_device
+from latentplan.planning.model import Model, State, check_shape, count_rows, state_device, takes
 from latentplan.planning.objectives import Constraint, Term
 from latentplan.planning.plan import Iteration, Plan
 from latentplan.planning.search.registry import Planner
@@ -234,7 +233,7 @@ class ModelPredictiveController:
     def _search(self, state: State, previous: Plan | None, generator: Generators, last_action: Tensor | None) -> Plan:
         """Returns a new plan, of which no action has been executed."""
         asked: dict[str, Any] = {"keep": self.keep, "last_action": last_action}
-        given = {name: value for name, value in asked.items() if value is not None and _takes(self.planner.plan, name)}
+        given = {name: value for name, value in asked.items() if value is not None and takes(self.planner.plan, name)}
         if self.callback is not None:
             given["callback"] = self.callback
         plan = self.planner.plan(
@@ -247,12 +246,6 @@ class ModelPredictiveController:
             **given,
         )
         return plan.executed(torch.zeros_like(plan.elapsed))
-
-
-def _takes(function: Callable[..., Any], name: str) -> bool:
-    """Whether a function takes an argument of a name."""
-    parameters = inspect.signature(function).parameters
-    return name in parameters or any(each.kind is each.VAR_KEYWORD for each in parameters.values())
 
 
 @contextlib.contextmanager

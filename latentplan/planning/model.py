@@ -27,7 +27,7 @@ from __future__ import annotations
 
 import dataclasses
 import inspect
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from types import FunctionType
 from typing import Any, Protocol
@@ -42,7 +42,7 @@ State = Any  # a tensor, or a pytree (tuple, NamedTuple, dict, list, dataclass) 
 Bound = float | Sequence[Any] | Tensor  # one number, (action,), (horizon, action) or (batch, horizon, action)
 
 
-_generators: WeakKeyDictionary[FunctionType, inspect.Parameter | None] = WeakKeyDictionary()
+_parameters: WeakKeyDictionary[FunctionType, Mapping[str, inspect.Parameter]] = WeakKeyDictionary()
 
 
 class Model(Protocol):
@@ -123,21 +123,27 @@ def has_policy(model: object) -> bool:
 
 def takes_generator(function: Callable[..., Any]) -> bool:
     """Returns whether a function, or the `forward` of a module, has an argument `generator`."""
-    return _find_generator(function) is not None
+    return "generator" in find_parameters(function)
 
 
-def _find_generator(function: Callable[..., Any]) -> inspect.Parameter | None:
-    """Returns the argument `generator` of a function, or of the `forward` of a module; None without one."""
+def takes(function: Callable[..., Any], name: str) -> bool:
+    """Returns whether a function can be given an argument by name."""
+    parameters = find_parameters(function)
+    return name in parameters or any(each.kind is each.VAR_KEYWORD for each in parameters.values())
+
+
+def find_parameters(function: Callable[..., Any]) -> Mapping[str, inspect.Parameter]:
+    """Returns the parameters of a function, or of the `forward` of a module, by name; empty without a signature."""
     function = function.forward if isinstance(function, torch.nn.Module) else function
     plain = getattr(function, "__func__", function)  # of a method; methods are made anew at each access
     if isinstance(plain, FunctionType):
-        if plain not in _generators:  # a signature takes longer to read than a small step
-            _generators[plain] = inspect.signature(plain).parameters.get("generator")
-        return _generators[plain]
+        if plain not in _parameters:  # a signature takes longer to read than a small step
+            _parameters[plain] = inspect.signature(plain).parameters
+        return _parameters[plain]
     try:
-        return inspect.signature(function).parameters.get("generator")
+        return inspect.signature(function).parameters
     except (TypeError, ValueError):  # a compiled function may have no signature
-        return None
+        return {}
 
 
 def is_sampling(model: Any) -> bool:
@@ -151,7 +157,7 @@ def call_with(function: Callable[..., Any], generator: torch.Generator | None, *
 
     Without a generator the method takes its own default, or None where it has no default.
     """
-    wanted = _find_generator(function)
+    wanted = find_parameters(function).get("generator")
     if wanted is None or (generator is None and wanted.default is not inspect.Parameter.empty):
         return function(*arguments)
     return function(*arguments, generator=generator)

@@ -82,7 +82,8 @@ def read_run(folder: Path) -> RunSummary:
         UserError: The folder holds no run, or its files are damaged.
     """
     config, evaluations = read_settings(folder), read_evaluations(folder)
-    frames, minutes = read_progress(folder)
+    progress = read_progress(folder)
+    frames, minutes = progress["env_frames"], progress["minutes"]
     if evaluations and evaluations[-1].env_frames >= frames:
         frames, minutes = evaluations[-1].env_frames, max(minutes, evaluations[-1].minutes)
     return RunSummary(folder, config, int(frames), minutes, evaluations, *find_state(folder))

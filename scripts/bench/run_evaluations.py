@@ -6,13 +6,11 @@ the run keeps the final evaluations of its shorter budgets.
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
-from typing import Any
 
 from bench.report import write_json
 from latentplan.config import UserError
-from latentplan.config.run_results import FINAL_FILE, Evaluation, read_evaluations, read_log
+from latentplan.config.run_results import FINAL_FILE, Evaluation, moment_of, read_evaluations, read_facts, read_log
 
 FINALS = "finals.json"
 
@@ -23,9 +21,9 @@ def keep_final(folder: Path) -> None:
     Raises:
         UserError: The copy cannot be written, or the file of copies is damaged.
     """
-    final = read_log({"metrics": [_read_facts(folder / FINAL_FILE)]})
+    final = read_log({"metrics": [read_facts(folder, FINAL_FILE)]})
     if final:
-        kept = {_clock(each): each for each in (*_read_finals(folder), *final)}
+        kept = {moment_of(each): each for each in (*_read_finals(folder), *final)}
         write_json(folder / FINALS, {"metrics": [each._asdict() for each in kept.values()]})
 
 
@@ -40,27 +38,13 @@ def read_all_evaluations(folder: Path) -> list[Evaluation]:
     evaluations = read_evaluations(folder)
     if not evaluations:
         return []
-    found = {_clock(each): each for each in evaluations}
-    found |= {_clock(each): each for each in _read_finals(folder) if _clock(each) < _clock(evaluations[-1])}
-    return [found[clock] for clock in sorted(found)]
+    found = {moment_of(each): each for each in evaluations}
+    found |= {moment_of(each): each for each in _read_finals(folder) if moment_of(each) < moment_of(evaluations[-1])}
+    return [found[moment] for moment in sorted(found)]
 
 
 def _read_finals(folder: Path) -> list[Evaluation]:
-    facts = _read_facts(folder / FINALS)
+    facts = read_facts(folder, FINALS)
     if not facts and (folder / FINALS).exists():
         raise UserError(f"{folder / FINALS} is damaged; remove it, and with it the results of shorter budgets")
     return read_log(facts)
-
-
-def _read_facts(path: Path) -> dict[str, Any]:
-    """The facts in a file; empty where there is none or it is damaged."""
-    try:
-        facts = json.loads(path.read_text())
-    except (OSError, ValueError):
-        return {}
-    return facts if isinstance(facts, dict) else {}
-
-
-def _clock(evaluation: Evaluation) -> int:
-    """When a run was evaluated: its frames, or its updates where it collects none."""
-    return evaluation.env_frames or evaluation.updates

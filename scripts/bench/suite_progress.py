@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import heapq
 import statistics
 import sys
@@ -15,14 +14,13 @@ from bench.run_evaluations import keep_final
 from bench.runs import TrainingRun
 from bench.suite_rows import Origin, Row, merge_rows, note_origin, read_origin, read_rows, rows_of, write_rows
 from latentplan.config import UserError, make_folder
-from latentplan.config.run_results import FINAL_FILE, METRICS_FILE
-from latentplan.config.run_results import read_rows as read_metrics
+from latentplan.config.run_results import FINAL_FILE, METRICS_FILE, read_progress
 from latentplan.training.child_run import LOG
 
 LOOK_S = 5.0
 STATUS_S = 300.0  # between two lines about the whole sweep where there is no terminal
 LEAST_SHARE = 0.05  # of a run, from which its speed is known; collection before the first update is faster
-CLOCKS = {"--frames": "env_frames", "--minutes": "minutes", "--updates": "updates"}  # columns of metrics, by limit
+CLOCK_OF_LIMIT = {"--frames": "env_frames", "--minutes": "minutes", "--updates": "updates"}  # columns of metrics
 
 
 class Progress(NamedTuple):
@@ -164,17 +162,10 @@ class Board:
 
 
 def measure_progress(run: TrainingRun) -> Progress:
-    """How far a run is, from the largest clocks in its metrics.
-
-    An evaluation runs beside the updates, and its row has the clocks of its start.
-    """
-    try:
-        rows = list(read_metrics(run.folder / METRICS_FILE))
-        spent = {name: max((float(row[clock]) for row in rows), default=0.0) for name, clock in CLOCKS.items()}
-    except (OSError, ValueError, TypeError, KeyError, csv.Error):  # a damaged file, which the run itself reports
-        spent = dict.fromkeys(CLOCKS, 0.0)
-    share = max(spent[name] / limit for name, limit in run.limits.items())
-    return Progress(1.0 if run.is_finished() else min(1.0, share), spent["--minutes"])
+    """How far a run is, from the largest clocks in its metrics."""
+    spent = read_progress(run.folder)
+    share = max(spent[CLOCK_OF_LIMIT[name]] / limit for name, limit in run.limits.items())
+    return Progress(1.0 if run.is_finished() else min(1.0, share), spent["minutes"])
 
 
 def estimate_minutes_left(progress: Mapping[TrainingRun, Progress], jobs: int) -> float | None:

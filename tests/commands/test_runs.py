@@ -111,8 +111,8 @@ def test_a_pipe_in_the_folder_of_a_run_makes_no_command_wait(make_run, tmp_path,
 def test_progress_is_the_largest_clock_of_any_row(tmp_path):
     rows = [(",".join(COLUMNS)), "2000,0,0.7,,", "2000,0,0.2,5,5"]  # an evaluation has the clock of its beginning
     (tmp_path / "metrics.csv").write_text("\n".join(rows) + "\n")
-    assert read_progress(tmp_path) == (2000.0, 0.7)
-    assert read_progress(tmp_path / "none") == (0.0, 0.0)
+    assert read_progress(tmp_path) == {"env_frames": 2000.0, "minutes": 0.7, "updates": 0.0}
+    assert set(read_progress(tmp_path / "none").values()) == {0.0}
 
 
 @pytest.mark.parametrize("method", ["iterdir", "exists"])

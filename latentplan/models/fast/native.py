@@ -107,9 +107,17 @@ def require_kernels(tensor: Tensor) -> Kernels:
 
 def check_shape(name: str, tensor: Tensor | None, *shape: int) -> None:
     """Raises ValueError for a tensor of another shape or device, because compiled functions read at its address."""
-    if tensor is not None and (tensor.shape != shape or not tensor.is_cpu):
-        found = f"the shape {tuple(tensor.shape)} on device {tensor.device}"
-        raise ValueError(f"{name} has {found}; the model needs {shape} on the CPU")
+    if tensor is None:
+        return
+    check_place(name, tensor)
+    if tensor.shape != shape:
+        raise ValueError(f"{name} has the shape {tuple(tensor.shape)}; the model needs {shape}")
+
+
+def check_place(name: str, tensor: Tensor) -> None:
+    """Raises ValueError for a tensor outside of the CPU's memory, where compiled functions cannot read."""
+    if not tensor.is_cpu:
+        raise ValueError(f"{name} is on device {tensor.device}; the model needs it on the CPU")
 
 
 def describe_layer(linear: Tensor, scale: Tensor | None, shift: Tensor) -> Layer:

@@ -16,6 +16,7 @@ from latentplan.models.fast.native import (
     allocate,
     borrow,
     check_called,
+    check_place,
     check_shape,
     describe_layer,
     give_back,
@@ -64,14 +65,14 @@ def mean(head: ScalarHead, logits: Tensor) -> Tensor:
 def cross_entropy(head: ScalarHead, logits: Tensor, targets: Tensor) -> Tensor:
     """See `ScalarHead.loss`."""
     check_shape("logits", logits, *targets.shape, len(head.values))
-    check_shape("targets", targets, *targets.shape)
+    check_place("targets", targets)
     losses: Tensor = _CrossEntropy.apply(logits, head.values, targets.detach().to(logits.dtype))
     return losses
 
 
 def lambda_return(rewards: Tensor, discounts: Tensor, values: Tensor, lambda_: float) -> Tensor:
     """See `Backend.lambda_return`."""
-    check_shape("rewards", rewards, *rewards.shape)
+    check_place("rewards", rewards)
     check_shape("discounts", discounts, *rewards.shape)
     check_shape("values", values, *rewards.shape)
     returns: Tensor = _LambdaReturn.apply(rewards, discounts.to(rewards.dtype), values.to(rewards.dtype), lambda_)
