@@ -222,7 +222,8 @@ def rate_limit(
         step_seconds: Duration of a model step in seconds, for `per_second`.
 
     Raises:
-        ValueError: No limit is given, a limit is not above 0, or one of `per_second` and `step_seconds` is missing.
+        ValueError: No limit is given, a limit is not above 0, the limits are for different numbers of dimensions, or one
+            of `per_second` and `step_seconds` is missing.
     """
     if (per_second is None) != (step_seconds is None):
         raise ValueError("a rate limit per second needs both per_second and step_seconds")
@@ -233,6 +234,9 @@ def rate_limit(
         limits.append(torch.as_tensor(per_second, dtype=torch.float64) * step_seconds)
     if not limits or any(limit.ndim > 1 or not bool((limit > 0).all()) for limit in limits):
         raise ValueError(f"a rate limit must be above 0, got per_step {per_step} and per_second {per_second}")
+    sizes = {len(limit) for limit in limits if limit.ndim == 1} - {1}
+    if len(sizes) > 1:
+        raise ValueError(f"per_step and per_second are for different numbers of dimensions: {sorted(sizes)}")
     numbers = tuple(torch.atleast_1d(torch.minimum(limits[0], limits[-1])).tolist())
     return Objective(partial(_excess_change, numbers), max_change=numbers)
 

@@ -129,7 +129,7 @@ class Plan:
                 an array or a sequence. The first action is the one that is due now.
 
         Raises:
-            ValueError: The actions have another shape, or there is no action.
+            ValueError: The actions have another shape, there is no action, or an action is not finite.
         """
         sequence = torch.as_tensor(actions)
         sequence = sequence if sequence.is_floating_point() else sequence.float()
@@ -139,6 +139,8 @@ class Plan:
                 "a trajectory has shape (horizon, action) or (batch, horizon, action), with one action or more, got "
                 f"{tuple(sequence.shape)}"
             )
+        if not bool(torch.isfinite(sequence).all()):
+            raise ValueError("the actions of a trajectory must be finite")
         batch = len(sequence)
         unknown = sequence.new_full((batch,), torch.nan)
         none, zeros = torch.zeros(batch, dtype=torch.bool), torch.zeros(batch, dtype=torch.long)

@@ -184,9 +184,6 @@ class BackgroundPlanner:
     def set_objective(self, objective: Term | None = None, constraints: Sequence[Constraint] = ()) -> None:
         """Changes objective and constraints, from the next request on.
 
-        A `PlanScheduler` that uses this planner does not notice the call: change both by
-        `PlanScheduler.set_objective`.
-
         Args:
             objective: See `CEMPlanner.plan`.
             constraints: See `CEMPlanner.plan`.

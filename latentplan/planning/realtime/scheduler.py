@@ -106,8 +106,8 @@ class PlanScheduler:
     Args:
         planner: Planner of the executor; only its horizon and action bounds are read.
         model: Predicts states; its `policy`, if any, acts where there is no plan, and corrects planned actions.
-        executor: Computes plans. Where it has the attributes `objective` and `constraints`, the scheduler starts with
-            them, as if `set_objective` had been called with them.
+        executor: Computes plans. Where it has the attributes `objective` and `constraints`, the scheduler follows
+            them: a change of the executor's goals counts as a call of `set_objective`.
         max_age: See `PlanBuffer`.
         fresh_ticks: See `PlanBuffer`; None follows the predicted latency.
         generator: Draws the seed of each request; None leaves the seed to the executor.
@@ -136,7 +136,8 @@ class PlanScheduler:
         self._last: tuple[int, Plan] | None = None
         self._batch: int | None = None
         self._action: Tensor | None = None  # of the last tick, (batch, action)
-        self._follow(getattr(executor, "objective", None), getattr(executor, "constraints", ()))
+        self._follow(None, ())
+        self._follow_executor()
 
     @property
     def latency_ticks(self) -> int:
@@ -161,6 +162,7 @@ class PlanScheduler:
         if count_rows(state) != self._batch:  # the plans are for other environments
             self.reset()
             self._batch = count_rows(state)
+        self._follow_executor()
         self._collect()
         action, source, age = self.buffer.choose(self.tick)
         if age is None or source is None:
@@ -188,10 +190,18 @@ class PlanScheduler:
         self._nominals, self._failures = {}, {}
         self._requested = self._last = self._action = None
 
+    def _follow_executor(self) -> None:
+        """Takes over goals that the executor was given directly; an executor may not tell its goals."""
+        objective, constraints = self._goals
+        goals = getattr(self.executor, "objective", objective), getattr(self.executor, "constraints", constraints)
+        if goals[0] is not objective or goals[1] is not constraints:
+            self._follow(*goals)
+
     def _follow(self, objective: Term | None, constraints: Sequence[Constraint]) -> None:
         """Finds the rate limits of the next decisions, and the model or view whose policy acts."""
         self._limits, _ = split_limits(constraints)  # each (1,) or (action,)
         self._acting: Any = apply_view(self.model, objective)[0]
+        self._goals = objective, constraints
 
     def _collect(self) -> None:
         """Puts a finished plan, if there is one, into the buffer."""

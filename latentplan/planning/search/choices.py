@@ -135,7 +135,11 @@ def read_choices(given: Any, action_dim: int) -> dict[int, tuple[float, ...]]:
     for dim, some in by_dimension.items():
         if isinstance(dim, bool) or not isinstance(dim, Integral) or not 0 <= int(dim) < action_dim:
             raise ValueError(f"action_choices names dimension {dim!r}; dimensions are 0 to {action_dim - 1}")
-        values = tuple(map(float, range(int(some)) if isinstance(some, Integral) else some))
+        try:
+            values = tuple(map(float, range(int(some)) if isinstance(some, Integral) else some))
+        except (TypeError, ValueError):
+            hint = "the number of values, a whole number, or the values themselves"
+            raise ValueError(f"action_choices takes {hint}, got {some!r} for {dim}") from None
         is_finite = bool(torch.isfinite(torch.tensor(values)).all())
         if len(set(values)) < 2 or len(set(values)) != len(values) or not is_finite:
             raise ValueError(f"action_choices needs two different finite values or more, got {some!r} for {dim}")

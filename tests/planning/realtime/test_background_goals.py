@@ -126,3 +126,18 @@ def test_scheduler_acts_by_the_goal_that_the_background_planner_was_made_with():
         assert torch.equal(PlanScheduler(CEM, model, background).decide(STATE).action, policy(STATE, None))
         background.set_objective()
         assert background.objective is None and background.constraints == ()
+
+
+def test_scheduler_follows_goals_that_the_background_planner_is_given_directly():
+    """The policy of the goal goes right and the model's own goes left, as far as the rate limit lets it."""
+    model = FunctionModel(dynamics, reward, policy=towards_zero)
+    goal = conditioned(lambda _: FunctionModel(dynamics, reward, value=lambda state: state[:, 0], policy=policy))
+    with BackgroundPlanner(CEM, model, worker="thread") as background:
+        scheduler = PlanScheduler(CEM, model, background)
+        assert not torch.equal(scheduler.decide(STATE).action, policy(STATE, None))
+        scheduler.reset()
+        background.set_objective(goal)
+        assert torch.equal(scheduler.decide(STATE).action, policy(STATE, None))
+        background.set_objective(constraints=[rate_limit(0.1)])
+        actions = torch.cat([scheduler.decide(sign * STATE).action for sign in (1.0, -1.0, 1.0)])
+    assert (actions.diff(dim=0).abs() <= 0.1 + 1e-6).all()

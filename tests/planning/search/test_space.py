@@ -156,6 +156,12 @@ def test_plan_on_another_device_is_moved_to_the_search():
     assert shifted.mean.device.type == "meta" and shifted.mean.shape == (1, 4, 2)
 
 
+def test_rate_limits_for_different_numbers_of_dimensions_are_refused():
+    with pytest.raises(ValueError, match=r"different numbers of dimensions: \[2, 3\]"):
+        rate_limit([0.1, 0.2], per_second=[1.0, 2.0, 3.0], step_seconds=0.1)
+    assert rate_limit([0.1, 0.2], per_second=[1.5], step_seconds=0.1).max_change == pytest.approx((0.1, 0.15))
+
+
 def test_rate_limit_of_another_number_of_dimensions_is_refused(recorder, make_planner):
     with pytest.raises(ValueError, match="rate_limit is for 3 dimensions, an action has 2"):
         make_planner().plan(recorder, torch.zeros(3, 1), constraints=[rate_limit([0.1, 0.2, 0.3])])
@@ -439,6 +445,8 @@ def test_plan_around_a_trajectory_starts_the_search_there(recorder, make_planner
         Plan.around(trajectory.flatten())
     with pytest.raises(ValueError, match=r"with one action or more, got \(2, 0, 2\)"):
         Plan.around(torch.zeros(2, 0, 2))
+    with pytest.raises(ValueError, match="must be finite"):
+        Plan.around([[0.0, float("nan")]])
 
 
 def test_scheduler_without_plan_and_policy_acts_in_the_middle_of_the_bounds(point, make_planner):
