@@ -173,7 +173,7 @@ def _has_final_evaluation(folder: Path) -> bool:
 def is_locked(folder: Path) -> bool:
     """Whether a process holds the lock of a folder; false on a file system without locks."""
     try:
-        lock = os.open(folder / LOCK_FILE, os.O_RDONLY)
+        lock = os.open(folder / LOCK_FILE, os.O_RDONLY | os.O_NONBLOCK)
     except OSError:
         return False
     try:

@@ -97,7 +97,7 @@ def test_damaged_results_of_one_run_are_one_line_beside_the_other_runs(make_run,
     assert capsys.readouterr().err.count("\n") == 1
 
 
-@pytest.mark.parametrize("name", ["metrics.csv", "final.json", "status.json"])
+@pytest.mark.parametrize("name", ["metrics.csv", "final.json", "status.json", ".lock"])
 def test_a_pipe_in_the_folder_of_a_run_makes_no_command_wait(make_run, tmp_path, capsys, name):
     make_run("good")
     odd = make_run("odd")
@@ -105,7 +105,7 @@ def test_a_pipe_in_the_folder_of_a_run_makes_no_command_wait(make_run, tmp_path,
     os.mkfifo(odd / name)
     assert main(["runs", str(tmp_path)]) == 0
     output = capsys.readouterr()
-    assert "good" in output.out and output.err.count("\n") == (0 if name == "status.json" else 1)
+    assert "good" in output.out and output.err.count("\n") == (0 if name in ("status.json", ".lock") else 1)
 
 
 def test_progress_is_the_largest_clock_of_any_row(tmp_path):
