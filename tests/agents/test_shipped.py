@@ -15,14 +15,14 @@ CHECKPOINTS = Path(__file__).parents[2] / "checkpoints"
 FLOORS = {
     # agent: (decisions, floor)      actor   random agent
     "ball_in_cup-catch": (50, 120),  # 200       11
-    "cartpole-balance": (50, 250),  #  396      122
+    "cartpole-balance": (200, 250),  # 400      156
     "cartpole-swingup": (75, 250),  #  462      103
     "cheetah-run": (75, 50),  #        111        1
     "finger-spin": (75, 60),  #        122        0
     "pendulum-swingup": (150, 100),  # 228        0
     "reacher-easy": (50, 100),  #      188        0
     "walker-run": (125, 50),  #         78        9
-    "walker-stand": (75, 95),  #       150       39
+    "walker-stand": (75, 95),  #       149       39
     "walker-walk": (75, 55),  #        112        7
 }
 PLANNER_FLOORS = {
