@@ -222,8 +222,8 @@ def rate_limit(
         step_seconds: Duration of a model step in seconds, for `per_second`.
 
     Raises:
-        ValueError: No limit is given, a limit is not above 0, the limits are for different numbers of dimensions, or one
-            of `per_second` and `step_seconds` is missing.
+        ValueError: No limit is given, a limit is not above 0, the limits are for different numbers of dimensions, or
+            one of `per_second` and `step_seconds` is missing.
     """
     if (per_second is None) != (step_seconds is None):
         raise ValueError("a rate limit per second needs both per_second and step_seconds")

@@ -134,7 +134,9 @@ def test_rate_limit_leaves_discrete_dimensions_alone(make_planner, seeded):
     assert plan.action[0, 0].item() == pytest.approx(0.1, abs=0.01) and plan.action[0, 1] == 4
 
 
-@pytest.mark.parametrize("choices", [1, (0.5,), (1.0, 1.0), {2: 3}, {0: (0.0, float("nan"))}, {"a": 3}, 5.0, "ab", [[0.0]]])
+@pytest.mark.parametrize(
+    "choices", [1, (0.5,), (1.0, 1.0), {2: 3}, {0: (0.0, float("nan"))}, {"a": 3}, 5.0, "ab", [[0.0]]]
+)
 def test_choices_are_refused_when_they_are_none(make_planner, choices):
     with pytest.raises(ValueError, match="action_choices"):
         make_planner(action_choices=choices)
