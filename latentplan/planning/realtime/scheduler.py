@@ -136,8 +136,7 @@ class PlanScheduler:
         self._last: tuple[int, Plan] | None = None
         self._batch: int | None = None
         self._action: Tensor | None = None  # of the last tick, (batch, action)
-        self._follow(None, ())
-        self._follow_executor()
+        self._follow(*self._find_goals(None, ()))
 
     @property
     def latency_ticks(self) -> int:
@@ -162,7 +161,9 @@ class PlanScheduler:
         if count_rows(state) != self._batch:  # the plans are for other environments
             self.reset()
             self._batch = count_rows(state)
-        self._follow_executor()
+        objective, constraints = self._find_goals(*self._goals)
+        if objective is not self._goals[0] or constraints is not self._goals[1]:
+            self._follow(objective, constraints)
         self._collect()
         action, source, age = self.buffer.choose(self.tick)
         if age is None or source is None:
@@ -182,7 +183,7 @@ class PlanScheduler:
         decision on.
         """
         self.executor.set_objective(objective, constraints)
-        self._follow(objective, constraints)
+        self._follow(*self._find_goals(objective, constraints))
 
     def reset(self) -> None:
         """Drops all plans, and the plan of the running request when it arrives."""
@@ -190,12 +191,11 @@ class PlanScheduler:
         self._nominals, self._failures = {}, {}
         self._requested = self._last = self._action = None
 
-    def _follow_executor(self) -> None:
-        """Takes over goals that the executor was given directly; an executor may not tell its goals."""
-        objective, constraints = self._goals
-        goals = getattr(self.executor, "objective", objective), getattr(self.executor, "constraints", constraints)
-        if goals[0] is not objective or goals[1] is not constraints:
-            self._follow(*goals)
+    def _find_goals(
+        self, objective: Term | None, constraints: Sequence[Constraint]
+    ) -> tuple[Term | None, Sequence[Constraint]]:
+        """Returns the executor's objective and constraints; the given ones where the executor does not tell its own."""
+        return getattr(self.executor, "objective", objective), getattr(self.executor, "constraints", constraints)
 
     def _follow(self, objective: Term | None, constraints: Sequence[Constraint]) -> None:
         """Finds the rate limits of the next decisions, and the model or view whose policy acts."""
