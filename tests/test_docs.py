@@ -63,6 +63,17 @@ def test_pages_of_the_site_stay_within_docs(page):
             assert (page.parent / link.partition("#")[0]).resolve().is_relative_to(ROOT / "docs"), link
 
 
+@pytest.mark.parametrize("page", PAGES, ids=page_name)
+def test_no_line_is_a_comment_that_is_not_shown(page):
+    """MyST leaves out a line that begins with a percent sign, such as the second line of a paragraph with "95 %"."""
+    assert re.findall(r"^\s*%.*", prose(page), flags=re.MULTILINE) == []
+
+
+def test_glossary_defines_every_term():
+    entries = prose(ROOT / "docs/reference/glossary.md").strip().split("\n\n")[1:]
+    assert [entry for entry in entries if not re.match(r"[^\n]+\n: ", entry)] == []
+
+
 def test_every_picture_is_shown_on_a_page():
     shown = {
         (page.parent / link).resolve() for page in PAGES for link in re.findall(r"!\[[^\]]*\]\(([^)\s]+)", prose(page))
