@@ -162,7 +162,8 @@ def _make_model(
         state = {name: value.float() for name, value in load(content).items()}
         with torch.device("meta"):  # compares shapes before a model is allocated whose size the file names
             WorldModel(config.model, *sizes).load_state_dict(state, assign=True)
-        model = WorldModel(config.model, *sizes)
+        with torch.device("cpu"):  # the arrays of the file lie there, whatever torch's default device
+            model = WorldModel(config.model, *sizes)
         model.load_state_dict(state)
     except (RuntimeError, SafetensorError, TypeError, ValueError) as error:
         raise UserError(f"{weights} does not fit its own settings: {str(error).splitlines()[-1].strip()}") from None

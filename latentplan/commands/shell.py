@@ -185,6 +185,9 @@ class LearningRequest(ComputeRequest):
         super().__post_init__()
         if self.checkpoint is None and self.resume is None:
             raise UserError("flag --checkpoint is missing; give the folder of a trained agent or of a run")
+        from latentplan.training.checks import check_launcher
+
+        check_launcher()  # before Lightning is imported
 
 
 @dataclass(frozen=True, kw_only=True)

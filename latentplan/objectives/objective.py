@@ -186,15 +186,16 @@ def _build_expression(
 
 
 def _violation(clauses: Sequence[Clause], rollout: Rollout) -> Tensor:
-    values = predicted_quantities(rollout)
-    excesses = [torch.as_tensor(shortfall(clause, values)) + CONSTRAINT_DISTANCE for clause in clauses]
+    values, device = predicted_quantities(rollout), rollout.rewards.device
+    excesses = [torch.as_tensor(shortfall(clause, values), device=device) + CONSTRAINT_DISTANCE for clause in clauses]
     return reduce(torch.stack(excesses).clamp_min(0.0), "clause step rows -> rows", "sum")
 
 
 def _score(terms: Sequence[tuple[float, Node]], rollout: Rollout) -> Tensor:
     values = predicted_quantities(rollout)
     score: Any = sum(weight * evaluate(node, values, planning_degree) for weight, node in terms)
-    return _discounted(torch.as_tensor(score).expand(len(rollout.states), len(rollout.actions)), rollout)
+    score = torch.as_tensor(score, device=rollout.rewards.device)
+    return _discounted(score.expand(len(rollout.states), len(rollout.actions)), rollout)
 
 
 def _closeness(goal: Tensor, rollout: Rollout) -> Tensor:

@@ -57,7 +57,7 @@ class CEMTrajectoryOptimizer:
         self.smoothing = smoothing
         self.action_low = action_low
         self.action_high = action_high
-        half_range = torch.as_tensor(action_high, dtype=torch.float64).sub(torch.as_tensor(action_low)) / 2
+        low, high = (torch.as_tensor(bound, dtype=torch.float64, device="cpu") for bound in (action_low, action_high))
         self._planner = CEMPlanner(
             action_dim=action_dim,
             horizon=horizon,
@@ -66,7 +66,7 @@ class CEMTrajectoryOptimizer:
             num_iterations=num_iterations,
             warm_start_iterations=num_iterations,
             smoothing=smoothing,
-            init_std=half_range,
+            init_std=(high - low) / 2,
             min_std=0.0,
             final="mean",
             noise_beta=0.0,
@@ -88,7 +88,7 @@ class CEMTrajectoryOptimizer:
         """
         model = _RolloutModel(initial_state, rollout_fn)
         previous = None if warm_start_mean is None else _make_plan(warm_start_mean)
-        no_state = torch.zeros(1, 0, dtype=torch.float64)  # the model holds the state
+        no_state = torch.zeros(1, 0, dtype=torch.float64, device="cpu")  # the model holds the state
         plan = self._planner.plan(model, no_state, previous, generator=self._generator)
         if bool(plan.info["is_fallback"].any()):
             warnings.warn(
@@ -117,7 +117,7 @@ class CEMTrajectoryOptimizer:
         smoothing: float = 0.8,
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Returns mean and variance (horizon, action) after one refit, and the first action of the mean (action,)."""
-        arrays = (torch.as_tensor(array) for array in (candidates, returns, prior_mean, prior_var))
+        arrays = (torch.as_tensor(array, device="cpu") for array in (candidates, returns, prior_mean, prior_var))
         mean, var = refit(*arrays, num_elites=num_elites, smoothing=smoothing)
         return mean.numpy(), var.numpy(), mean[0].numpy()
 
@@ -156,7 +156,7 @@ class _RolloutModel:
         raise NotImplementedError("a rollout function returns no single steps")
 
     def rollout(self, state: Tensor, actions: Tensor) -> tuple[Tensor, Tensor]:
-        rewards = torch.zeros(actions.shape[:2], dtype=torch.float64)
+        rewards = actions.new_zeros(actions.shape[:2])
         for row, sequence in enumerate(actions.numpy()):
             rewards[row, 0] = float(self._rollout_fn(self._state, sequence.copy()))
         return rewards, state
@@ -164,6 +164,6 @@ class _RolloutModel:
 
 def _make_plan(mean: np.ndarray) -> Plan:
     """Returns a plan with this mean (horizon, action), of which no action has been executed."""
-    sequence = torch.as_tensor(mean, dtype=torch.float64)[None]
-    zero = torch.zeros(1, dtype=torch.long)
-    return Plan(sequence, sequence, torch.ones_like(sequence), torch.zeros(1), {}, None, zero == 0, zero)
+    sequence = torch.as_tensor(mean, dtype=torch.float64, device="cpu")[None]
+    zero = torch.zeros(1, dtype=torch.long, device="cpu")
+    return Plan(sequence, sequence, torch.ones_like(sequence), zero.float(), {}, None, zero == 0, zero)

@@ -82,7 +82,7 @@ def check_model(
         action_choices = getattr(planner, "action_choices", None)
     if action_dim is None:
         raise TypeError("check_model() needs action_dim or planner")
-    index = torch.arange(_ROWS) % count_rows(state)
+    index = torch.arange(_ROWS, device="cpu") % count_rows(state)
     rows = tree_map(lambda leaf: leaf[index.to(leaf.device)], state)
     choices = read_choices(action_choices, action_dim)
     actions = _draw_actions(*read_bounds(action_low, action_high, action_dim, choices))
@@ -115,8 +115,8 @@ class _Seeded:
 def _draw_actions(low: Tensor, high: Tensor) -> Tensor:
     """Returns actions within the bounds of the first steps and of the first environment, (rows, horizon, action)."""
     generator = torch.Generator().manual_seed(0)
-    drawn = torch.rand(_ROWS, _HORIZON, low.shape[-1], generator=generator, dtype=torch.float64)
-    steps = torch.arange(_HORIZON)
+    drawn = torch.rand(_ROWS, _HORIZON, low.shape[-1], generator=generator, dtype=torch.float64, device="cpu")
+    steps = torch.arange(_HORIZON, device="cpu")
     lowest, highest = (bound[:1, steps.clamp_max(bound.shape[1] - 1)] for bound in (low, high))
     return lowest + (highest - lowest) * drawn
 

@@ -143,7 +143,7 @@ class ModelPredictiveController:
         batch, horizon = self.plan.actions.shape[:2]
         index = self.plan.elapsed.clamp_max(horizon - 1)
         is_left = self.plan.is_warm & (self.plan.elapsed < horizon) & ~self._find_stale()
-        return self.plan.actions[torch.arange(batch), index], is_left
+        return self.plan.actions[torch.arange(batch, device="cpu"), index], is_left
 
     def reset(self, mask: Tensor | None = None) -> None:
         """Forgets the plan, so that the next search starts cold.
@@ -201,15 +201,15 @@ class ModelPredictiveController:
         """
         if not self._latencies_ms:
             return {}
-        times = torch.tensor(list(self._latencies_ms), dtype=torch.float64)
-        p50, p95, p99 = torch.quantile(times, torch.tensor([0.5, 0.95, 0.99], dtype=torch.float64)).tolist()
+        times = torch.tensor(list(self._latencies_ms), dtype=torch.float64, device="cpu")
+        p50, p95, p99 = torch.quantile(times, times.new_tensor([0.5, 0.95, 0.99])).tolist()
         return {"mean_ms": float(times.mean()), "p50_ms": p50, "p95_ms": p95, "p99_ms": p99}
 
     def _act(self, state: State, generator: Generators, last_action: Tensor | None = None) -> Tensor:
         started = time.perf_counter()
         if self.plan is None or self.plan.mean.shape[0] != count_rows(state):
             self.plan = self._search(state, None, generator, last_action)
-            is_due = torch.ones(count_rows(state), dtype=torch.bool)
+            is_due = torch.ones(count_rows(state), dtype=torch.bool, device="cpu")
         else:
             is_due = ~self.plan.is_warm | (self.plan.elapsed >= self.replan_every) | self._find_stale()
             if bool(is_due.all()):
@@ -218,7 +218,7 @@ class ModelPredictiveController:
                 with _keep_streams(_select_streams(generator, ~is_due), _select_streams(generator, is_due)):
                     self.plan = self.plan.updated(is_due, self._search(state, self.plan, generator, last_action))
         self._is_stale = None
-        action = self.plan.actions[torch.arange(len(is_due)), self.plan.elapsed]
+        action = self.plan.actions[torch.arange(len(is_due), device="cpu"), self.plan.elapsed]
         self.plan = self.plan.executed(self.plan.elapsed + 1)
         if state_device(state).type == "cuda":
             torch.cuda.synchronize(state_device(state))

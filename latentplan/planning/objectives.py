@@ -229,9 +229,9 @@ def rate_limit(
         raise ValueError("a rate limit per second needs both per_second and step_seconds")
     limits = []
     if per_step is not None:
-        limits.append(torch.as_tensor(per_step, dtype=torch.float64))
+        limits.append(torch.as_tensor(per_step, dtype=torch.float64, device="cpu"))
     if per_second is not None and step_seconds is not None:
-        limits.append(torch.as_tensor(per_second, dtype=torch.float64) * step_seconds)
+        limits.append(torch.as_tensor(per_second, dtype=torch.float64, device="cpu") * step_seconds)
     if not limits or any(limit.ndim > 1 or not bool((limit > 0).all()) for limit in limits):
         raise ValueError(f"a rate limit must be above 0, got per_step {per_step} and per_second {per_second}")
     sizes = {len(limit) for limit in limits if limit.ndim == 1} - {1}
@@ -394,7 +394,7 @@ def _action_changes(rollout: Rollout) -> Tensor:
 
 
 def _excess_change(limit: tuple[float, ...], rollout: Rollout) -> Tensor:
-    largest = torch.tensor(limit).to(rollout.actions)
+    largest = rollout.actions.new_tensor(limit)
     later = (rollout.actions.diff(dim=1).abs() - largest).clamp_min(0.0).sum(dim=(1, 2))
     return later + (_first_change(rollout).abs() - largest).clamp_min(0.0).sum(dim=1)
 

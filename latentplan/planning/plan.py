@@ -131,7 +131,7 @@ class Plan:
         Raises:
             ValueError: The actions have another shape, there is no action, or an action is not finite.
         """
-        sequence = torch.as_tensor(actions)
+        sequence = actions if isinstance(actions, Tensor) else torch.as_tensor(actions, device="cpu")
         sequence = sequence if sequence.is_floating_point() else sequence.float()
         sequence = sequence[None] if sequence.ndim == 2 else sequence
         if sequence.ndim != 3 or sequence.numel() == 0:
@@ -143,7 +143,8 @@ class Plan:
             raise ValueError("the actions of a trajectory must be finite")
         batch = len(sequence)
         unknown = sequence.new_full((batch,), torch.nan)
-        none, zeros = torch.zeros(batch, dtype=torch.bool), torch.zeros(batch, dtype=torch.long)
+        zeros = torch.zeros(batch, dtype=torch.long, device="cpu")
+        none = zeros.bool()
         info = {"is_fallback": none, "is_policy": none, "num_nonfinite": zeros}
         var = torch.zeros_like(sequence)
         return cls(sequence, sequence, var, unknown, info, None, ~none, zeros)
@@ -304,7 +305,7 @@ def shift_plan(
     """
     length, horizon = previous.mean.shape[1], rest.shape[1]
     device = rest.device
-    position = torch.arange(horizon)[None] + previous.elapsed[:, None]
+    position = torch.arange(horizon, device="cpu")[None] + previous.elapsed[:, None]
     is_tail = (position >= length).to(device)[..., None]  # (batch, horizon, 1)
     index = position.clamp_max(length - 1).to(device)[..., None]
 

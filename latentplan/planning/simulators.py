@@ -90,7 +90,9 @@ class MuJoCoModel:
         self.action_dim = int(mjmodel.nu)
         limits = torch.from_numpy(mjmodel.actuator_ctrlrange.copy())
         is_limited = torch.from_numpy(mjmodel.actuator_ctrllimited.astype(bool))[:, None]
-        self.action_low, self.action_high = torch.where(is_limited, limits, torch.tensor([-1.0, 1.0])).unbind(dim=1)
+        self.action_low, self.action_high = torch.where(is_limited, limits, limits.new_tensor([-1.0, 1.0])).unbind(
+            dim=1
+        )
         if terminal_cost is not None:  # a planner detects an optional method by the attribute
             self.value = self._value
 
@@ -99,7 +101,7 @@ class MuJoCoModel:
         import mujoco
 
         kind = mujoco.mjtState.mjSTATE_FULLPHYSICS
-        row = torch.empty(1, mujoco.mj_stateSize(self.mjmodel, kind), dtype=torch.float64)
+        row = torch.empty(1, mujoco.mj_stateSize(self.mjmodel, kind), dtype=torch.float64, device="cpu")
         mujoco.mj_getState(self.mjmodel, data, row[0].numpy(), kind)
         return row
 
@@ -150,7 +152,7 @@ class MuJoCoModel:
         before = torch.cat([start[:, None], after[:, :-1]], dim=1)
         # The time of an unstable simulation stops.
         duration = self.mjmodel.opt.timestep * self.substeps
-        expected = start[:, :1] + duration * torch.arange(1, controls.shape[1] + 1)
+        expected = start[:, :1] + duration * torch.arange(1, controls.shape[1] + 1, device="cpu")
         is_stable = (after[:, :, 0] - expected).abs() < self.mjmodel.opt.timestep / 2
         is_stable &= before.abs().amax(dim=2) < LARGEST  # false for NaN too
         return before, torch.from_numpy(sensordata)[:, :: self.substeps], after[:, -1], is_stable

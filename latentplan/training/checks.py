@@ -63,17 +63,26 @@ def check_planner(method: str) -> None:
         raise_unknown("planner", method, known)
 
 
-def check_machines(run: RunConfig) -> None:
-    """Refuses processes or machines that cannot find each other, from the variables of the environment alone.
+def check_launcher() -> None:
+    """Refuses wrong numbers in the variables with which a launcher numbers its processes.
 
     Raises:
-        UserError: A variable is missing or wrong; Lightning reads a wrong one when it is imported, or waits for ever.
+        UserError: A variable is wrong; Lightning would fail on it when it is imported.
     """
     for rank, size in (("RANK", "WORLD_SIZE"), ("LOCAL_RANK", "LOCAL_WORLD_SIZE")):
         if rank in os.environ:
             number = read_number(rank)
             if size in os.environ:
                 _check_below(rank, number, size, read_number(size))
+
+
+def check_machines(run: RunConfig) -> None:
+    """Refuses processes or machines that cannot find each other, from the variables of the environment alone.
+
+    Raises:
+        UserError: A variable is missing or wrong, so that the processes would wait for ever.
+    """
+    check_launcher()
     nodes, needed = run.nodes, ["MASTER_ADDR", "MASTER_PORT"]
     if is_started_outside():
         nodes = read_number("WORLD_SIZE") // read_number("LOCAL_WORLD_SIZE", os.environ["WORLD_SIZE"])

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+import torch
 
 from latentplan.agents.checkpoint import load_agent, save_checkpoint
 from latentplan.agents.modes import MODES, AgentMode, planning_modes
@@ -80,3 +81,17 @@ def test_registered_mode_that_does_not_plan_takes_no_planner_settings(checkpoint
     assert load_agent(checkpoint, "resting").act(FRAME).tolist() == [0.0, 0.0]
     with pytest.raises(UserError, match="horizon has no effect in mode resting"):
         load_agent(checkpoint, "resting", horizon=2)
+
+
+@pytest.mark.parametrize("mode", sorted(MODES.keys() - {"background"}))  # whose actions depend on the clock
+def test_actions_do_not_depend_on_torchs_default_device(checkpoint, film, mode):
+    def play():
+        agent = load_agent(checkpoint, mode, device="cpu")
+        agent.seed(0)
+        actions = [agent.act(frames) for frames in film]
+        agent.reset()
+        return np.concatenate([*actions, *(agent.act(frames) for frames in film)])
+
+    expected = play()
+    with torch.device("meta"):  # a tensor on this device has no numbers, so that its use fails
+        assert np.array_equal(play(), expected)

@@ -104,3 +104,9 @@ def test_search_settings_take_every_registered_planner(monkeypatch):
     assert [search_settings(Config(), {"method": name}).method for name in PLANNERS] == list(PLANNERS)
     with pytest.raises(UserError, match="unknown planner 'mppy'; did you mean 'mppi'"):
         search_settings(Config(), {"method": "mppy"})
+
+
+@pytest.mark.parametrize("command", ["goals", "distill"])
+def test_teaching_refuses_wrong_variables_of_a_launcher(command, checkpoint, assert_refused, monkeypatch):
+    monkeypatch.setenv("RANK", "a")  # on which Lightning fails when it is imported
+    assert_refused([command, "--checkpoint", checkpoint], "RANK must be a whole number, at least 0, got 'a'")

@@ -24,7 +24,7 @@ def point_policy(state, generator):
     mode = -state[:, :2] - state[:, 2:]
     if generator is None:
         return mode
-    return mode + 0.2 * torch.randn(mode.shape, generator=generator)
+    return mode + 0.2 * torch.randn(mode.shape, generator=generator, device=mode.device)
 
 
 @pytest.fixture

@@ -12,7 +12,7 @@ import torch
 
 from latentplan.config.checks import shown
 from latentplan.config.planner import WIDEST_STD, SearchOptions, check_whole
-from latentplan.planning.model import Bound, Model, State, per_dimension, per_step
+from latentplan.planning.model import Bound, Model, State, per_dimension, per_step, state_device
 from latentplan.planning.objectives import Constraint, Term
 from latentplan.planning.plan import Iteration, Plan
 from latentplan.planning.search.choices import read_choices
@@ -159,7 +159,7 @@ class CEMPlanner(SearchOptions):
         # In inference mode the plan could not be a training target, and gradient steps would fail.
         with torch.inference_mode(False), torch.no_grad():
             low, high = self.bounds if bounds is None else self._read_bounds(*_as_pair(bounds))
-            last = None if last_action is None else torch.as_tensor(last_action)
+            last = None if last_action is None else torch.as_tensor(last_action, device=state_device(state))
             start, spread, discount = self._init_mean, self._init_std, self.discount
             goals, seen = (objective, constraints), self.first_searches
             problem = Problem(model, state, *goals, low, high, start, spread, discount, self.choices, last, seen)

@@ -5,6 +5,7 @@ The elites refit the probability of each value, as they refit mean and variance 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from numbers import Integral
 from typing import Any
@@ -140,7 +141,7 @@ def read_choices(given: Any, action_dim: int) -> dict[int, tuple[float, ...]]:
         except (TypeError, ValueError):
             hint = "the number of values, a whole number, or the values themselves"
             raise ValueError(f"action_choices takes {hint}, got {some!r} for {dim}") from None
-        is_finite = bool(torch.isfinite(torch.tensor(values)).all())
+        is_finite = all(map(math.isfinite, values))
         if len(set(values)) < 2 or len(set(values)) != len(values) or not is_finite:
             raise ValueError(f"action_choices needs two different finite values or more, got {some!r} for {dim}")
         choices[int(dim)] = values

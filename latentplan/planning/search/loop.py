@@ -148,7 +148,7 @@ class Search:
         kept = None
         if progress.elites is not None and options.num_kept:
             kept = space.carry(progress.elites.actions[:, : options.num_kept])
-        ones = torch.ones(self.batch, dtype=torch.long)
+        ones = torch.ones(self.batch, dtype=torch.long, device="cpu")
         var, is_warm = space.decode_var(progress.var), start.is_warm
         if not bool(is_warm.all()):  # only then, because reading from a graphics processor waits for it
             is_warm = is_warm | progress.has_elites.cpu()
@@ -190,7 +190,7 @@ class Search:
         pause = self._pause() if self.options.gradient_steps else None
         info = {**progress.describe([], "deadline"), "is_policy": is_policy}
         info |= _describe_rest(progress, self._add_excess(unknown, actions), pause)
-        ones = torch.ones(self.batch, dtype=torch.long)
+        ones = torch.ones(self.batch, dtype=torch.long, device="cpu")
         elites, is_warm = shifted.elites, shifted.is_warm
         mean, var = self.space.decode(progress.mean), self.space.decode_var(progress.var)
         return Plan(actions, mean, var, progress.expected_return, info, elites, is_warm, ones)
@@ -399,7 +399,7 @@ class Search:
         return (actions, expected, violation), pause, False
 
     def _cold_start(self) -> WarmStart:
-        return WarmStart(self.rest, None, torch.zeros(self.batch, dtype=torch.bool))
+        return WarmStart(self.rest, None, torch.zeros(self.batch, dtype=torch.bool, device="cpu"))
 
     def _shift(self, previous: Plan) -> WarmStart:
         return shift_plan(

@@ -91,7 +91,7 @@ def split_limits(constraints: Sequence[Constraint]) -> tuple[list[Tensor], list[
     limits, others = [], []
     for constraint in constraints:
         if isinstance(constraint, Objective) and constraint.max_change is not None:
-            limits.append(torch.tensor(constraint.max_change, dtype=torch.float64))
+            limits.append(torch.tensor(constraint.max_change, dtype=torch.float64, device="cpu"))
         else:
             others.append(constraint)
     return limits, others

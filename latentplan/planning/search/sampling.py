@@ -111,10 +111,10 @@ def _colour_factor(horizon: int, noise_beta: float) -> list[list[float]]:
     periodic, and the last step correlated with the first. Coloured noise for CEM is from Pinneri et al. 2020,
     "Sample-efficient cross-entropy method for real-time planning", section 3.1.
     """
-    frequency = torch.arange(1, horizon + 1, dtype=torch.float64) / (2 * horizon)
+    frequency = torch.arange(1, horizon + 1, dtype=torch.float64, device="cpu") / (2 * horizon)
     power = frequency**-noise_beta
-    lag = torch.arange(horizon, dtype=torch.float64)
+    lag = torch.arange(horizon, dtype=torch.float64, device="cpu")
     covariance = (power * torch.cos(2 * torch.pi * frequency * lag[:, None])).sum(dim=1) / power.sum()
     toeplitz = covariance[(lag[:, None] - lag[None, :]).abs().long()]
-    factor: list[list[float]] = torch.linalg.cholesky(toeplitz + 1e-9 * torch.eye(horizon)).tolist()
+    factor: list[list[float]] = torch.linalg.cholesky(toeplitz + 1e-9 * torch.eye(horizon, device="cpu")).tolist()
     return factor

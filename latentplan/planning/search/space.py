@@ -251,7 +251,7 @@ def _spline_maps(
     """
     matrix = _spline_matrix(spline, horizon, num_knots)
     maps = (matrix, torch.linalg.pinv(matrix), _spline_matrix("zero", horizon, num_knots))
-    steps = torch.linspace(0, horizon - 1, num_knots).round().long()
+    steps = torch.linspace(0, horizon - 1, num_knots, device="cpu").round().long()
     forward, inverse, hold = (each.to(device, dtype) for each in maps)
     return forward, inverse, hold, steps.to(device)
 
@@ -263,12 +263,12 @@ def _spline_matrix(spline: str, horizon: int, num_knots: int) -> Tensor:
     the first action to the last; the slopes of the cubic spline at its knots are those of Catmull and Rom.
     """
     if spline == "zero" or num_knots == 1:
-        knot = torch.arange(horizon) * num_knots // horizon
+        knot = torch.arange(horizon, device="cpu") * num_knots // horizon
         return torch.nn.functional.one_hot(knot, num_knots).double()
-    time = torch.linspace(0, num_knots - 1, horizon, dtype=torch.float64)
+    time = torch.linspace(0, num_knots - 1, horizon, dtype=torch.float64, device="cpu")
     left = time.floor().clamp(max=num_knots - 2).long()
     part = (time - left)[:, None]
-    eye = torch.eye(num_knots, dtype=torch.float64)
+    eye = torch.eye(num_knots, dtype=torch.float64, device="cpu")
     before, after = eye[left], eye[left + 1]
     if spline == "linear":
         return (1 - part) * before + part * after
