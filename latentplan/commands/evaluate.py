@@ -337,7 +337,7 @@ def _write_page(
         deadlines["period of control"] = 1000.0 / request.control_hz
     facts = {"command": shlex.join(sys.argv), **present_facts(request.device != "cpu")}
     trained = {name: info[name] for name in ("version", "env_frames", "updates", "minutes") if name in info}
-    own = {name: result[name] for name in ("seed", "renderer", "render_quality", "floor")}
+    own = {name: result[name] for name in ("seed", "renderer", "render_quality", "render_slices", "floor")}
     data = ReportData(
         task=f"{result['domain']}-{result['task']}",
         config=saved_config(request.checkpoint, info),
@@ -366,6 +366,7 @@ def _describe(
         "seed": request.seed,
         "env_frames_trained": int(info["env_frames"]),
         "render_quality": env.render_quality,
+        "render_slices": env.render_slices,
         "floor": env.floor,
         "renderer": describe_renderer(env)["renderer"],
     }

@@ -73,7 +73,7 @@ def run(request: Request) -> int:
     from latentplan.training.checks import check_settings
     from latentplan.training.demonstrations.kinds import find_recordings
 
-    check_settings(config)
+    check_settings(config, is_new=request.resume is None)
     if request.resume is None:  # a run that resumes has its recorded episodes in its saves
         find_recordings(config.replay.demonstrations)
     from latentplan.training import resume, train

@@ -40,6 +40,7 @@ REMOVED = {
 ADDED: dict[str, dict[str, Any]] = {
     "model": {"decoder_layers": 0, "decoder_width": 96},  # 96 of the agents that have layers and name no width
     "planner": {"policy_margin": None},
+    "env": {"render_slices": 28},
 }
 
 

@@ -11,7 +11,7 @@ from pathlib import Path
 
 from latentplan.config.checks import UserError, make_folder
 from latentplan.config.commit import Saves
-from latentplan.config.files import SECTIONS, build_config, field_names, read_config, read_layer
+from latentplan.config.files import SECTIONS, read_config, read_layer
 from latentplan.config.manifest import LOGS
 from latentplan.config.reading import LARGEST_SETTINGS, read_bytes
 from latentplan.config.settings import Config
@@ -90,11 +90,11 @@ def read_run_config(folder: Path) -> tuple[Config, str | None]:
         if read_bytes(path, LARGEST_SETTINGS) == read_bytes(copy, LARGEST_SETTINGS):
             return saved, None
         layer = read_layer(path)
-        missing = [f"{section}.{name}" for section in SECTIONS for name in field_names(section)]
-        missing = [key for key in missing if key.partition(".")[2] not in layer.get(key.partition(".")[0], {})]
+        written = [(section, name) for section, fields in read_layer(copy).items() for name in fields]
+        missing = [f"{section}.{name}" for section, name in written if name not in layer.get(section, {})]
         if missing:
             raise UserError(f"{path} lacks {', '.join(missing[:3])}")
-        own = build_config(layer)
+        own = read_config(path)  # gives settings that came after the version of the run what they meant then
     except (OSError, ValueError) as error:
         reason = error if isinstance(error, UserError) else f"{path} cannot be read"
         return saved, f"{reason}: the settings of the last save take its place"

@@ -26,7 +26,7 @@ class FrameRenderer:
     so that no larger buffer has to be cleared; the picture does not depend on the size of the buffer.
     """
 
-    def __init__(self, physics: Physics, size: int, camera: int, quality: str) -> None:
+    def __init__(self, physics: Physics, size: int, camera: int, quality: str, slices: int | None = None) -> None:
         """Makes the OpenGL context and the scene.
 
         Args:
@@ -34,6 +34,7 @@ class FrameRenderer:
             size: Height and width of the frames, in pixels.
             camera: Camera id of the MuJoCo model; -1 is the free camera.
             quality: `exact`, `fast` or `fastest`.
+            slices: Flat sides around a round shape, except at quality `exact`; None takes those of the model.
 
         Raises:
             UserError: No OpenGL context can be made.
@@ -46,7 +47,7 @@ class FrameRenderer:
 
             self._physics = physics
             self._gl = _render.Renderer(size, size)
-            self._context = _make_context(physics, self._gl, size, quality)
+            self._context = _make_context(physics, self._gl, size, quality, slices)
         self._rectangle = mujoco.MjrRect(0, 0, size, size)
         self._pixels = np.empty((size, size, 3), dtype=np.uint8)
         self._options = mujoco.MjvOption()
@@ -106,14 +107,18 @@ def draw_floor_behind(physics: Physics) -> None:
             model.geom_pos[geom][0] -= half
 
 
-def _make_context(physics: Physics, gl: object, size: int, quality: str) -> Any:
+def _make_context(physics: Physics, gl: object, size: int, quality: str, slices: int | None) -> Any:
     """MuJoCo's drawing context, which reads its settings from the model; the model is restored afterwards."""
     from dm_control.mujoco import wrapper
 
     visual = physics.model.vis
     buffer_size, before = (visual.global_.offwidth, visual.global_.offheight), {}
     visual.global_.offwidth = visual.global_.offheight = size
-    for name, value in _QUALITY_SETTINGS[quality].items():
+    settings = dict(_QUALITY_SETTINGS[quality])
+    if slices is not None and quality != "exact":
+        own = visual.quality.numslices, visual.quality.numstacks
+        settings |= {"numslices": slices, "numstacks": max(2, round(own[1] * slices / own[0]))}
+    for name, value in settings.items():
         before[name] = getattr(visual.quality, name)
         setattr(visual.quality, name, value)
     context = wrapper.MjrContext(physics.model, gl)

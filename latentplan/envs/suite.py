@@ -79,7 +79,8 @@ class SuiteEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         self.spaces = Spaces(frame_size=config.frame_size, cameras=len(self._cameras), vector_dim=vector_dim)
         if config.floor == "endless":
             draw_floor_behind(self.physics)
-        self.domain, self._quality = config.domain, config.render_quality
+        self.domain = config.domain
+        self._quality, self._slices = config.render_quality, config.render_slices
         self.labels = scales(config.domain)
         self._renderers: dict[tuple[int, int], FrameRenderer] = {}
         self._needs_reset = True
@@ -218,7 +219,8 @@ class SuiteEnv(gymnasium.Env[np.ndarray, np.ndarray]):
 
     def _draw(self, size: int, camera: int) -> np.ndarray:
         if (size, camera) not in self._renderers:
-            self._renderers[size, camera] = FrameRenderer(self.physics, size, camera, self._quality)
+            slices = self._slices if size == self._frame_size else None  # a film is to look smooth
+            self._renderers[size, camera] = FrameRenderer(self.physics, size, camera, self._quality, slices)
         return self._renderers[size, camera].render()
 
     def _observe(self) -> np.ndarray:

@@ -20,8 +20,12 @@ from latentplan.objectives.parser import parse_objective, parse_reward
 from latentplan.training.estimates import check_run
 
 
-def check_settings(config: Config) -> None:
+def check_settings(config: Config, *, is_new: bool = True) -> None:
     """Refuses a run that cannot work, before its first process starts.
+
+    Args:
+        config: Settings of the run.
+        is_new: Whether settings that have no effect are refused; a saved run may hold those of an earlier version.
 
     Raises:
         UserError: A task, a planner or an expression does not exist, or the machine cannot serve the run.
@@ -39,7 +43,7 @@ def check_settings(config: Config) -> None:
         check_folder(config.collection.keep_episodes, "--collection.keep_episodes")
         require_extra("collection.keep_episodes", "h5py")
     env, learning = config.env, config.learning
-    check_env_settings(env)
+    check_env_settings(env, is_new=is_new)
     if env.suite == DEFAULT_SUITE and env.domain != USER_DOMAIN:
         known = scales(env.domain)
         if env.objective is not None:
@@ -127,8 +131,12 @@ def read_number(name: str, default: str | None = None) -> int:
     return int(text)
 
 
-def check_env_settings(env: EnvConfig) -> None:
+def check_env_settings(env: EnvConfig, *, is_new: bool = True) -> None:
     """Refuses names of environments that do not exist, and settings that have no effect in the environment.
+
+    Args:
+        env: Settings of the environment.
+        is_new: See `check_settings`.
 
     Raises:
         UserError: There is no such environment, or a setting has no effect.
@@ -138,7 +146,7 @@ def check_env_settings(env: EnvConfig) -> None:
     if is_by_id(env) and env.domain != USER_DOMAIN:
         if env.objective is not None:
             raise UserError(f"env.objective needs a domain with named quantities; {env.task} returns its own reward")
-        for name in ("camera", "render_quality", "floor"):
+        for name in ("camera", "render_quality", "render_slices", "floor") if is_new else ():
             if getattr(env, name) != getattr(EnvConfig, name):
                 raise UserError(
                     f"--env.{name} has no effect in {env.task or env.domain}, which draws its own pictures: leave it "

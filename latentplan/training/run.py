@@ -183,7 +183,7 @@ def resume(
 def _start(config: Config, folder: Path, make_env: EnvFactory | None, *, resume: bool) -> Result:
     """Runs with all ranks until the end, an interruption or an error."""
     config = place_ranks(config)
-    check_settings(replace(config, run=replace(config.run, run_dir=str(folder))))
+    check_settings(replace(config, run=replace(config.run, run_dir=str(folder))), is_new=not resume)
     with contextlib.closing(join_ranks(config)) as ranks:
         config, folder = ranks.lead(lambda: (config, folder))
         take_part = _lead if ranks.is_first else _follow

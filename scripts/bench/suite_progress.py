@@ -51,7 +51,7 @@ class Board:
         self.runs, self.jobs, self.results, self.origin = runs, jobs, results, origin
         self.failures: dict[TrainingRun, str] = {}
         self.rows = read_rows(results)
-        self._changes: dict[TrainingRun, tuple[int, ...]] = {}
+        self._changes: dict[TrainingRun, tuple[tuple[int, int], ...]] = {}
         self._seen: dict[TrainingRun, list[Row]] = {}
         self._progress = {run: measure_progress(run) for run in runs}
         self._looked, self._stated = 0.0, time.monotonic()
@@ -122,8 +122,9 @@ class Board:
     def _read(self, run: TrainingRun) -> bool:
         """Read the rows of a run if its files have changed; returns whether its rows have changed."""
         files = (run.folder / METRICS_FILE, run.folder / FINAL_FILE)
-        changes = tuple(path.stat().st_mtime_ns if path.exists() else 0 for path in files)
-        if changes == self._changes.get(run, (0, 0)):
+        # Two writes may fall into one tick of the clock of a file system, so a time alone does not show every change.
+        changes = tuple((path.stat().st_mtime_ns, path.stat().st_size) for path in files if path.exists())
+        if changes == self._changes.get(run, ()):
             return False
         try:
             rows = rows_of(run)

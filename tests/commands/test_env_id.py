@@ -1,17 +1,21 @@
 """The command line of environments by id: train, resume, evaluate, distil, list and test them."""
 
 import json
+import shutil
 import sys
 
 import cv2
 import numpy as np
 import pytest
+import yaml
 
 from latentplan.agents.checkpoint import read_info
 from latentplan.commands.flags import read_request
 from latentplan.commands.main import main
 from latentplan.commands.train import Request, resolve
+from latentplan.config.earlier import ADDED
 from latentplan.config.env_id import by_id
+from latentplan.config.run_folder import RUN_FILE
 from latentplan.config.suites import SUITES, Suite
 from latentplan.envs import by_id as by_id_module
 from tests.envs import odd
@@ -72,6 +76,15 @@ def test_run_resumes_with_its_own_id_only(trained, assert_refused):
     )
     assert main(["train", "--resume", str(trained), "--env-id", STATE, "--frames", "200"]) == 0
     assert read_info(trained / "checkpoints" / "last")["env_frames"] >= 200
+
+
+def test_run_of_an_earlier_version_resumes_with_settings_that_have_no_effect(trained, tmp_path):
+    folder = shutil.copytree(trained, tmp_path / "run")
+    saved = yaml.safe_load((folder / RUN_FILE).read_text())
+    saved["env"] |= ADDED["env"] | {"camera": 1}
+    (folder / RUN_FILE).write_text(yaml.safe_dump(saved))
+    with pytest.warns(RuntimeWarning, match="goes on with a change of env.camera from 0 to 1, env.render_slices from"):
+        assert main(["train", "--resume", str(folder), "--env-id", STATE, "--frames", "240"]) == 0
 
 
 def test_distill_plays_in_the_environment(trained, tmp_path, assert_refused):

@@ -5,8 +5,9 @@ from dataclasses import replace
 
 import pytest
 
-from latentplan.config import Config, EnvConfig, UserError
-from latentplan.config.files import dump_config
+from latentplan.config import Config, EnvConfig, UserError, from_dict, to_dict
+from latentplan.config.earlier import ADDED
+from latentplan.config.files import dump_config, to_yaml
 from latentplan.config.run_folder import RUN_FILE, lock_folder, read_run_config, run_saves
 
 CONFIG = Config(env=EnvConfig(domain="cartpole", task="swingup"))
@@ -32,6 +33,25 @@ def test_read_run_config_goes_on_with_edited_settings_and_names_the_change(folde
     dump_config(edited, folder / RUN_FILE)
     config, warning = read_run_config(folder)
     assert config == edited and f"planner.horizon from {CONFIG.planner.horizon} to 9" in warning
+
+
+def test_read_run_config_keeps_what_was_edited_in_a_run_of_an_earlier_version(tmp_path):
+    saved = to_dict(CONFIG)
+    saved = {
+        section: {name: value for name, value in fields.items() if name not in ADDED.get(section, {})}
+        for section, fields in saved.items()
+    }
+
+    def write(part):
+        (part / RUN_FILE).write_text(to_yaml(saved))
+        return {}
+
+    run_saves(tmp_path).commit(write, {"env_frames": 10})
+    saved["planner"]["horizon"] = 9
+    (tmp_path / RUN_FILE).write_text(to_yaml(saved))
+    config, warning = read_run_config(tmp_path)
+    assert config == from_dict(saved) and config.planner.horizon == 9
+    assert warning.endswith(f"with a change of planner.horizon from {CONFIG.planner.horizon} to 9")
 
 
 @pytest.mark.parametrize("content", [b"", b"env: [", b"\xff\xfe", b"planer: {}", None])

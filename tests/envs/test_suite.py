@@ -165,6 +165,24 @@ def test_exact_frame_equals_dm_controls_rendering():
     assert np.array_equal(frame, expected)
 
 
+@pytest.mark.parametrize("domain", ["walker", "reacher"])
+def test_slices_change_outlines_of_the_agents_pictures_only(domain):
+    def draw(quality, slices, size):
+        env = make_env(config(domain=domain, render_quality=quality, render_slices=slices), seed=0)
+        env.reset()
+        frame = env.render_large(size)
+        env.close()
+        return frame.astype(int)
+
+    exact, smooth, default, coarse = (
+        draw(quality, slices, 64) for quality, slices in (("exact", 28), ("fast", 28), ("fast", 14), ("fast", 4))
+    )
+    changes = [np.abs(frame - exact).mean() for frame in (smooth, default, coarse)]
+    assert changes == sorted(changes) and changes[1] < 1.0 < np.abs(coarse - smooth).max()
+    assert np.array_equal(draw("exact", 4, 64), exact)
+    assert np.array_equal(draw("fast", 4, 128), draw("fast", 28, 128))  # a film
+
+
 @pytest.mark.parametrize("domain", ["walker", "cheetah"])
 def test_endless_floor_changes_only_frames_behind_the_start(domain):
     """The suite draws no floor behind the start: frames differ behind the start, and are equal ahead of it."""
