@@ -134,9 +134,10 @@ class GatedAgent(PlanningAgent):
     def _update_belief(self, frames: Tensor | Observation) -> State:
         if self.state is None:
             self._is_first, self._drift = torch.ones(len(frames), dtype=torch.bool, device="cpu"), None
+        elif self._is_reset is None:
+            self._is_first = torch.zeros(len(frames), dtype=torch.bool, device="cpu")
         else:
-            is_continued = torch.zeros(len(frames), dtype=torch.bool, device="cpu")
-            self._is_first = is_continued if self._is_reset is None else self._is_reset.cpu()
+            self._is_first = self._is_reset.cpu()
         return super()._update_belief(frames)
 
     def _infer(

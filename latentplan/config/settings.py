@@ -55,8 +55,8 @@ class EnvConfig:
             environment; in `dm_control` keys of the task's observation, or `proprioception` for all of them.
         render_quality: `exact` is dm_control's default; `fast` has a small shadow map; `fastest` has no shadows,
             reflections or anti-aliasing, which makes learning easier.
-        render_slices: Flat sides around a round shape in the agent's pictures, except at quality `exact`, which draws
-            28; agents of earlier versions have 28 too. Fewer sides are drawn faster.
+        render_slices: Flat sides around a round shape in the agent's pictures, in [4, 64]; quality `exact` always draws
+            28, and agents of earlier versions have 28. Fewer sides are drawn faster.
         floor: `suite` draws the floor as the suite does, which ends two metres behind a walker's start; `endless` draws
             the floor there as well, for goals that lead backwards. Physics and the picture ahead are the same.
         num_envs: Environments that collect at the same time; if there are several, each runs in its own process.
@@ -93,9 +93,8 @@ class EnvConfig:
             raise ValueError(f"vectors must be different keys, got {' '.join(self.vectors)}")
         if len(set(self.cameras)) != len(self.cameras) or len(self.cameras) > MOST_CAMERAS:
             raise ValueError(f"cameras must be at most {MOST_CAMERAS} different ones, got {' '.join(self.cameras)}")
-        within(
-            self, action_repeat=(1, MAX_REPEAT), num_envs=(1, MAX_ENVS), camera=(-1, MAX_CAMERA), render_slices=(4, 64)
-        )
+        within(self, action_repeat=(1, MAX_REPEAT), num_envs=(1, MAX_ENVS), camera=(-1, MAX_CAMERA))
+        within(self, render_slices=(4, 64))
         one_of(self, render_quality=RENDER_QUALITIES, floor=FLOORS, pixels=PIXELS)
 
 

@@ -26,7 +26,7 @@ class FrameRenderer:
     so that no larger buffer has to be cleared; the picture does not depend on the size of the buffer.
     """
 
-    def __init__(self, physics: Physics, size: int, camera: int, quality: str, slices: int | None = None) -> None:
+    def __init__(self, physics: Physics, size: int, camera: int, quality: str, slices: int | None) -> None:
         """Makes the OpenGL context and the scene.
 
         Args:

@@ -90,9 +90,8 @@ class MuJoCoModel:
         self.action_dim = int(mjmodel.nu)
         limits = torch.from_numpy(mjmodel.actuator_ctrlrange.copy())
         is_limited = torch.from_numpy(mjmodel.actuator_ctrllimited.astype(bool))[:, None]
-        self.action_low, self.action_high = torch.where(is_limited, limits, limits.new_tensor([-1.0, 1.0])).unbind(
-            dim=1
-        )
+        bounds = torch.where(is_limited, limits, limits.new_tensor([-1.0, 1.0]))
+        self.action_low, self.action_high = bounds.unbind(dim=1)
         if terminal_cost is not None:  # a planner detects an optional method by the attribute
             self.value = self._value
 

@@ -12,6 +12,8 @@ import sys
 import time
 from pathlib import Path
 
+from latentplan.config.writing import write_whole
+
 STEP, PAUSE_S = 20, 0.02
 HEADER = "env_frames,updates,minutes,planner_return,actor_return,actor"  # the last is a loss
 
@@ -52,13 +54,6 @@ def main(words):
     final = {"env_frames": frames, "updates": frames // 2, "minutes": frames / 10, "planner": 7.0, "actor": 5.0}
     write_whole(folder / "final.json", json.dumps(final))
     return 0
-
-
-def write_whole(path, text):
-    """Writes a file that is never seen half written."""
-    part = path.with_suffix(".part")
-    part.write_text(text)
-    part.replace(path)
 
 
 if __name__ == "__main__":
