@@ -44,7 +44,8 @@ class Collect(lightning.Callback):
     replaced in the same way.
 
     Where several ranks learn together, each collects its share of a round in a worker of its own, and rank 0 evaluates.
-    Nobody stores a round or an evaluation before all have it, so that the clocks of all ranks agree.
+    Nobody stores a round or an evaluation before all have it, so that the clocks of all ranks agree. The error of a
+    worker that cannot be replaced is raised on all ranks, so that they save together.
 
     Args:
         config: Settings of the run.
@@ -169,7 +170,7 @@ class Collect(lightning.Callback):
             # Set only now, so that a resumed run repeats an evaluation that was interrupted.
             self.state.next_evaluation = self._evaluation_after(entry)
             self.requests["evaluate"] = None
-        self._notice_end()
+        self.ranks.together(self._notice_end)
 
     def _start_epoch(self, learner: Learner) -> None:
         state = self.state
@@ -276,11 +277,14 @@ class Collect(lightning.Callback):
         if not self._is_continued:
             return False
         self._is_continued = False
+        self.ranks.together(self._restore_worker)
+        return True
+
+    def _restore_worker(self) -> None:
         try:
             self.continue_requests()
         except WorkerEnded as error:
             self.replace_worker(error)
-        return True
 
     def _next_round(self) -> dict[str, Any] | None:
         """Arguments of the next round; None if the budget has no frames left, or the run collects nothing."""

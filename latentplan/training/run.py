@@ -388,8 +388,7 @@ class _Run:
                     return Result(self.folder, 0, self._finish(trainer, save, videos / "final.webm"))
             agree_on_signals(state, ranks)
         except WorkerEnded:
-            if ranks.size == 1:  # other ranks may not know of it, and all of them save together
-                save.save(trainer, self.learner)
+            save.save(trainer, self.learner)
             raise
         except EnvironmentFault as fault:
             save.save(trainer, self.learner)

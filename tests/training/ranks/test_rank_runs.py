@@ -95,6 +95,22 @@ def test_run_of_one_process_resumes_with_two(root, finished, tmp_path):
     assert after["learner"]["updates"] > before["learner"]["updates"]
 
 
+def equal_runs(folders):
+    """Whether two runs have ended with the same weights and the same rows."""
+    one, other = (read_state(folder)["learner"]["weights"] for folder in folders)
+    rows = [read_saved_rows(folder)[0] for folder in folders]
+    return all(torch.equal(value, other[name]) for name, value in one.items()) and np.array_equal(*rows)
+
+
+@pytest.mark.parametrize("rank", [0, 1])
+def test_both_processes_save_when_the_collection_of_one_ends_too_often(root, pair, tmp_path, rank):
+    code, _ = run_program(root, tmp_path / "run", 2, FRAMES, ENDS_WITH=f"{rank}:4")
+    before = read_state(tmp_path / "run")
+    assert code == 2 and before["run"]["env_frames"] == 78
+    assert run_program(root, tmp_path / "run", 2, FRAMES)[0] == 0
+    assert equal_runs((pair[0], tmp_path / "run"))
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(("rank", "number"), [(0, signal.SIGTERM), (1, signal.SIGTERM), (1, signal.SIGKILL)])
 def test_signal_to_one_process_ends_both_and_the_resumed_run_equals_one_without(root, pair, tmp_path, rank, number):
@@ -105,8 +121,4 @@ def test_signal_to_one_process_ends_both_and_the_resumed_run_equals_one_without(
         assert code in (2, -signal.SIGKILL)  # the latter where Lightning kills the others first
     assert read_state(tmp_path / "run")["run"]["env_frames"] < FRAMES
     assert run_program(root, tmp_path / "run", 2, FRAMES)[0] == 0
-    states = [read_state(folder)["learner"]["weights"] for folder in (pair[0], tmp_path / "run")]
-    assert all(torch.equal(value, states[1][name]) for name, value in states[0].items())
-    assert [row.tolist() for row in read_saved_rows(tmp_path / "run")[0]] == [
-        row.tolist() for row in read_saved_rows(pair[0])[0]
-    ]
+    assert equal_runs((pair[0], tmp_path / "run"))
