@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from matplotlib.artist import Artist
     from matplotlib.axes import Axes
 
-COLUMNS = 4
+COLUMNS = 3
 NUM_THRESHOLDS = 201
 COLORS = dict(
     zip(
@@ -32,11 +32,11 @@ COLORS = dict(
 def plot_curves(curves: Curves, png: Path) -> None:
     """Draws evaluation returns against env frames: one panel per task, one line per seed for planner and actor."""
     from matplotlib.figure import Figure
-    from matplotlib.ticker import EngFormatter
+    from matplotlib.ticker import EngFormatter, MaxNLocator
 
     columns = min(COLUMNS, len(curves))
     rows = -(-len(curves) // columns)
-    figure = Figure(figsize=(max(3.4 * columns, 5.0), 2.7 * rows + 0.9), layout="constrained")
+    figure = Figure(figsize=(max(2.6 * columns, 5.0), 2.0 * rows + 0.9), layout="constrained")
     entries: dict[str, Artist] = {}
     for place, (task, runs) in enumerate(curves.items(), start=1):
         axes = figure.add_subplot(rows, columns, place)
@@ -47,6 +47,7 @@ def plot_curves(curves: Curves, png: Path) -> None:
         axes.set(xlim=(0.0, 1.1 * last), ylim=(min(0.0, axes.get_ylim()[0]), None))
         if place > len(curves) - columns:  # the lowest panel of a column
             axes.set_xlabel("environment frames")
+        axes.xaxis.set_major_locator(MaxNLocator(3))
         axes.xaxis.set_major_formatter(EngFormatter(sep=""))
         axes.grid(alpha=0.25)
         entries |= {label: handle for handle, label in zip(*axes.get_legend_handles_labels(), strict=True)}
