@@ -16,6 +16,7 @@ from bench.suite_scores import (
     LARGEST_RETURN,
     Curves,
     aggregate,
+    balanced,
     completed,
     improvement,
     newest_curves,
@@ -60,7 +61,7 @@ def write_report(rows: Sequence[Row], frames: int, path: Path) -> None:
     if reached:
         parts += _describe_all(reached, frames)
         tasks = list(reached)
-        own = {mode: score_matrix(reached, tasks, mode) for mode in MODES}
+        own = {mode: score_matrix(balanced(reached), tasks, mode) for mode in MODES}
         plot_profile(own, _methods_with(tasks, published_frames(frames)), figures["profile"])
         parts += ["## Performance profile", _describe_profile(tasks, frames), _picture("profile", figures["profile"])]
     plot_curves(curves, figures["curves"])
@@ -144,10 +145,15 @@ def _describe_table(frames: int) -> str:
 
 
 def _describe_all(reached: Mapping[str, Sequence[Row]], frames: int) -> list[str]:
-    num_runs = min(map(len, reached.values()))
-    reached = {task: rows[:num_runs] for task, rows in reached.items()}  # the same number in every table
+    counts = [len(rows) for rows in reached.values()]
+    num_runs = min(counts)
+    reached = balanced(reached)
     if num_runs == 1:
-        bounds = "One run per task counts; without a second seed there are no intervals."
+        several = f", by the mean of its runs where it has several (tasks: {sum(count > 1 for count in counts)})"
+        bounds = (
+            f"Each task counts once{several if max(counts) > 1 else ''}; without a second seed of every task there are "
+            "no intervals."
+        )
     else:
         bounds = (
             f"{num_runs} runs per task count, and brackets are 95 % stratified bootstrap intervals by `rliable`, which "

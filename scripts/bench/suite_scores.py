@@ -60,10 +60,25 @@ def completed(results: Mapping[str, Mapping[int, Row]], frames: int) -> dict[str
     return {task: rows for task, rows in reached.items() if rows}
 
 
+def balanced(reached: Mapping[str, Sequence[Row]]) -> dict[str, list[Row]]:
+    """As many rows of each task as of every other.
+
+    Args:
+        reached: By task, a row of each of its runs, at least one.
+
+    Returns:
+        Where each task has several runs, the first rows of a task, as many as the task with the fewest has. Else one
+        row per task, with the mean returns of its runs.
+    """
+    num_runs = min(map(len, reached.values()))
+    if num_runs > 1:
+        return {task: list(rows[:num_runs]) for task, rows in reached.items()}
+    return {task: [_averaged(rows)] for task, rows in reached.items()}
+
+
 def score_matrix(rows: Mapping[str, Sequence[Row]], tasks: Sequence[str], mode: str) -> Scores:
-    """Scores of planner or actor, (run, task), of as many runs per task as every task has."""
-    num_runs = min(len(rows[task]) for task in tasks)
-    returns = [[getattr(row, mode) for row in rows[task][:num_runs]] for task in tasks]
+    """Scores of planner or actor, (run, task), of as many runs of each task as of every other."""
+    returns = [[getattr(row, mode) for row in rows[task]] for task in tasks]
     return np.array(returns, float).T / LARGEST_RETURN
 
 
@@ -114,6 +129,11 @@ def profile(scores: Scores, thresholds: Scores) -> tuple[Scores, Scores | None, 
 
     share, low, high = _estimate(scores, compute)
     return (share, None, None) if low[0] is None else (share, low, high)
+
+
+def _averaged(rows: Sequence[Row]) -> Row:
+    planner, actor = (float(np.mean([getattr(row, mode) for row in rows])) for mode in ("planner", "actor"))
+    return rows[0]._replace(planner=planner, actor=actor)
 
 
 def _estimate(scores: Scores | list[Scores], compute: Callable[..., Scores]) -> tuple[Any, Any, Any]:

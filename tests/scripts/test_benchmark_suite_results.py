@@ -146,9 +146,19 @@ def test_report_needs_nothing_but_a_file_of_results(tmp_path, capsys):
     assert "no run has an evaluation within 20 frames" in capsys.readouterr().err
 
 
-def test_report_counts_the_same_number_of_runs_in_every_table(tmp_path):
-    rows = [make_row("walker-walk", seed, planner=500.0 + seed) for seed in (0, 1)] + [make_row("fish-swim")]
+def test_report_takes_the_mean_of_a_tasks_runs_where_another_task_has_one_run(tmp_path):
+    rows = [make_row("walker-walk", seed, planner=400.0 + 200.0 * seed) for seed in (0, 1)]
+    rows.append(make_row("fish-swim", planner=100.0))
     write_report(rows, 100_000, tmp_path / "report.md")
     together = (tmp_path / "report.md").read_text().partition("## All tasks together")[2]
-    assert "One run per task counts; without a second seed there are no intervals." in together
+    assert "Each task counts once, by the mean of its runs where it has several (tasks: 1); without a" in together
+    assert "\n| mean | 300 |" in together and "\n| DreamerV3 | 1 | 500 / 625 |" in together
     assert not re.search(r"\d \(\d", together)
+
+
+def test_report_takes_as_many_runs_of_each_task_as_the_fewest_where_all_have_several(tmp_path):
+    counts = {"walker-walk": 3, "fish-swim": 2}
+    rows = [make_row(task, seed, planner=100.0 * seed) for task, count in counts.items() for seed in range(count)]
+    write_report(rows, 100_000, tmp_path / "report.md")
+    together = (tmp_path / "report.md").read_text().partition("## All tasks together")[2]
+    assert "2 runs per task count" in together and "\n| mean | 50 (" in together
