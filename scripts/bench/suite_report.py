@@ -59,9 +59,9 @@ def write_report(rows: Sequence[Row], frames: int, path: Path) -> None:
     parts = [f"# Suite at {frames:,} frames", _describe_runs(curves, results, frames)]
     parts += [_describe_table(frames), task_table(results, frames)]
     if reached:
-        parts += _describe_all(reached, frames)
-        tasks = list(reached)
-        own = {mode: score_matrix(balanced(reached), tasks, mode) for mode in MODES}
+        even, tasks = balanced(reached), list(reached)
+        parts += _describe_all(even, [len(rows) for rows in reached.values()], frames)
+        own = {mode: score_matrix(even, tasks, mode) for mode in MODES}
         plot_profile(own, _methods_with(tasks, published_frames(frames)), figures["profile"])
         parts += ["## Performance profile", _describe_profile(tasks, frames), _picture("profile", figures["profile"])]
     plot_curves(curves, figures["curves"])
@@ -144,10 +144,9 @@ def _describe_table(frames: int) -> str:
     )
 
 
-def _describe_all(reached: Mapping[str, Sequence[Row]], frames: int) -> list[str]:
-    counts = [len(rows) for rows in reached.values()]
+def _describe_all(reached: Mapping[str, Sequence[Row]], counts: Sequence[int], frames: int) -> list[str]:
+    """Tables over all tasks, from as many rows of each task as of every other; `counts` are the runs of the tasks."""
     num_runs = min(counts)
-    reached = balanced(reached)
     if num_runs == 1:
         several = f", by the mean of its runs where it has several (tasks: {sum(count > 1 for count in counts)})"
         bounds = (
