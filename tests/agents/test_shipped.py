@@ -17,7 +17,7 @@ FLOORS = {
     "ball_in_cup-catch": (1, 75, 70),  #    119        0
     "cartpole-balance": (0, 200, 250),  #   400      156
     "cartpole-swingup": (0, 75, 250),  #    462      103
-    "cheetah-run": (0, 75, 50),  #          111        1
+    "cheetah-run": (0, 125, 60),  #         115        4
     "finger-spin": (0, 75, 60),  #          122        0
     "pendulum-swingup": (0, 150, 100),  #   228        0
     "reacher-easy": (0, 50, 100),  #        188        0
