@@ -120,6 +120,13 @@ class ModelAgent:
         self.imagined: WorldModel | TurnedModel = model if self._turns == 1 else TurnedModel(model)
         self.seed(seed)
 
+    def __getstate__(self) -> dict[str, Any]:
+        return {name: value for name, value in self.__dict__.items() if name != "_frame_functions"}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__dict__.update(state)
+        self._frame_functions = self.model.backend.frame_functions(self.model)
+
     def seed(self, seed: int) -> None:
         """Restarts the agent's random stream."""
         self.generator.manual_seed(seed)
@@ -250,7 +257,7 @@ class ModelAgent:
         state = State(*(torch.cat(parts) for parts in zip(*beliefs, strict=True)))
         state = State(*(part.expand(num, -1).contiguous() for part in state))
         if actions is None:
-            mode = torch.zeros(num, steps, self.num_actions, device=self.model.device)
+            mode = torch.zeros(num, steps, self.num_actions, device=self.model.device, dtype=torch.float32)
             given = self.model.backend.propose(self.model, state, mode)
         else:
             given = torch.as_tensor(actions, dtype=torch.float32, device=self.model.device)
@@ -407,7 +414,7 @@ class CorrelatedNoise:
             is_new: Environments whose episode begins, (batch,) bool: their noise is independent of the past. None
                 stands for no environment.
         """
-        white = torch.randn(like.shape, generator=generator, device=like.device)
+        white = torch.randn(like.shape, generator=generator, device=like.device, dtype=torch.float32)
         noise = white
         if self.last is not None and self.correlation > 0.0:
             noise = self.correlation * self.last + (1.0 - self.correlation**2) ** 0.5 * white

@@ -214,7 +214,11 @@ class GatedAgent(PlanningAgent):
     def _measure_signals(self, state: State, action: Tensor) -> dict[str, Tensor]:
         """The signals of a decision by name, (batch,) each; logarithms, except for `random`."""
         if "random" in self._signal_names:
-            return {"random": torch.randn(len(action), generator=self.generator, device=self.generator.device)}
+            return {
+                "random": torch.randn(
+                    len(action), generator=self.generator, device=self.generator.device, dtype=torch.float32
+                )
+            }
         assert self._mismatch is not None and self._drift is not None
         if self._is_goal_untrained:
             return {"drift": self._drift.clamp_min(1e-6).log()}

@@ -174,6 +174,8 @@ def run(request: Request) -> int:
         played = env if goals is None else score_env(env, goals, agent if request.mode in planning_modes() else None)
         try:
             return _play_and_report(request, played, agent, about, clock)
+        except BrokenPipeError:
+            raise
         except OSError as error:
             raise UserError(f"an output could not be written: {error}") from error
     finally:

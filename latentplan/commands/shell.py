@@ -30,8 +30,11 @@ def run_guarded(command: Callable[[Sequence[str]], int], argv: Sequence[str]) ->
 
     A failed environment gives one line and the environment's own traceback. Ctrl-C gives 130, SIGTERM 143 and SIGHUP
     129. A reader that closes the output early, as in `train.py --help | head`, gives 141. Characters that stdout cannot
-    encode are printed as escapes, as Python does on stderr.
+    encode are printed as escapes, as Python does on stderr. Output to a stream that is closed is lost.
     """
+    for name in ("stdout", "stderr"):
+        if getattr(sys, name) is None:  # closed before the program began
+            setattr(sys, name, open(os.devnull, "w"))
     if isinstance(sys.stdout, io.TextIOWrapper) and sys.stdout.errors == "strict":
         sys.stdout.reconfigure(errors="backslashreplace")  # for names of files that are not UTF-8
     try:
@@ -41,9 +44,7 @@ def run_guarded(command: Callable[[Sequence[str]], int], argv: Sequence[str]) ->
         finally:
             sys.stdout.flush()
     except EnvironmentFault as error:
-        code = refuse(str(error))
-        print(error.origin, file=sys.stderr, end="")
-        return code
+        return refuse(str(error), error.origin)
     except (UserError, FloatingPointError) as error:
         return refuse(str(error))
     except ModuleNotFoundError as error:
@@ -241,8 +242,14 @@ def _is_out_of_memory(error: RuntimeError) -> bool:
     return "can't allocate memory" in text or "out of memory" in text or "Storage size calculation overflowed" in text
 
 
-def refuse(message: str) -> int:
-    """Prints an error as one line on stderr, and returns the exit code 2."""
+def refuse(message: str, details: str = "") -> int:
+    """Prints an error as one line on stderr, and returns the exit code 2.
+
+    Args:
+        message: The error.
+        details: Further lines, such as a traceback, each with its end.
+    """
     line = cut(" ".join(message.split())).encode(sys.stderr.encoding or "utf-8", "backslashreplace")
-    print(f"error: {line.decode(sys.stderr.encoding or 'utf-8')}", file=sys.stderr)
+    with contextlib.suppress(OSError):  # where nothing can be printed, the exit code still tells
+        print(f"error: {line.decode(sys.stderr.encoding or 'utf-8')}\n{details}", file=sys.stderr, end="", flush=True)
     return 2

@@ -37,7 +37,7 @@ class Request(ComputeRequest):
         mode: Agent that chooses the actions.
         objective: Objective in place of the task, such as 'speed -> 2.0 and height > 1.1'.
         constraint: Condition that must hold at every moment, such as 'cart < 0.5'; may be repeated.
-        control_hz: Decisions per second of the wall clock; None takes the body's own rate.
+        control_hz: Decisions per second of the wall clock, in [0.001, 1e6]; None takes the body's own rate.
         host: Address to listen at; another one than this machine's own needs the token that is printed.
         port: Port to listen at; 0 takes any free one.
         open: Whether the browser of this machine is opened.
@@ -68,6 +68,8 @@ class Request(ComputeRequest):
         at_least(self, seed=0)
         one_of(self, mode=list_modes())
         above_zero(self, "control_hz")
+        if self.control_hz is not None:
+            within(self, control_hz=(0.001, 1e6))
         within(self, port=(0, LARGEST_PORT))
 
 

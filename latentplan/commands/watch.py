@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from latentplan.config.checks import above_zero
+from latentplan.config.checks import within
 from latentplan.config.parsing import option
 
 if TYPE_CHECKING:
@@ -23,7 +23,7 @@ class Request:
 
     Attributes:
         folder: Folder of the run.
-        every: Seconds between two looks into the folder.
+        every: Seconds between two looks into the folder, in [0.001, 86,400].
     """
 
     NOTES = "Watching only reads: it never changes or slows the run. Ctrl-C ends the watching and not the run."
@@ -32,7 +32,7 @@ class Request:
     every: float = 1.0
 
     def __post_init__(self) -> None:
-        above_zero(self, "every")
+        within(self, every=(0.001, 86_400))
 
 
 def run(request: Request) -> int:

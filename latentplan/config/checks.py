@@ -11,6 +11,8 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
+from latentplan.config.writing import part_of
+
 MAX_THREADS = 1024  # more threads would exhaust the machine
 MAX_EPISODES = 1_000_000
 SHOWN = 60  # characters of a wrong value that an error repeats
@@ -105,12 +107,7 @@ def output_file(path: Path, flag: str) -> Path:
     import tempfile  # imported here because every command imports this module, and few write files
 
     given = str(path)
-    try:
-        path.lstat()
-    except (FileNotFoundError, NotADirectoryError):
-        pass
-    except OSError as error:  # such as a name that is too long
-        raise UserError(f"{flag} {given!r} cannot be written: {error.strerror}; give another name") from None
+    _check_name(path, flag, given)
     if path.is_symlink():  # the link stays and its target is replaced
         path = Path(os.path.realpath(path))
         if path.is_symlink() or not path.parent.is_dir():
@@ -123,11 +120,21 @@ def output_file(path: Path, flag: str) -> Path:
     if not folder.is_dir():
         existing = next(parent for parent in folder.parents if parent.is_dir())
         raise UserError(f"{flag}: there is no folder {str(folder)!r}; the nearest that exists is {str(existing)!r}")
+    _check_name(part_of(path), flag, given)  # the file is first written under this longer name
     try:
         tempfile.TemporaryFile(dir=folder).close()
     except OSError as error:
         raise UserError(f"{flag}: cannot write in {str(folder)!r}: {error.strerror}; choose another folder") from None
     return path
+
+
+def _check_name(path: Path, flag: str, given: str) -> None:
+    try:
+        path.lstat()
+    except (FileNotFoundError, NotADirectoryError):
+        pass
+    except OSError as error:  # such as a name that is too long
+        raise UserError(f"{flag} {given!r} cannot be written: {error.strerror}; give another name") from None
 
 
 def at_least(config: Any, **bounds: float) -> None:

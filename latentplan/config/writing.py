@@ -16,13 +16,18 @@ def replaced_whole(path: Path) -> Iterator[Path]:
     Readers therefore never see a file that is half written. A block that raises leaves `path` as it was. A process that
     is killed leaves the path beside; see `remove_parts`.
     """
-    part = path.with_name(f".{path.name}.{os.getpid()}")
+    part = part_of(path)
     part.unlink(missing_ok=True)
     try:
         yield part
         part.replace(path)
     finally:
         part.unlink(missing_ok=True)
+
+
+def part_of(path: Path) -> Path:
+    """The path beside a file to which this process writes before it replaces the file."""
+    return path.with_name(f".{path.name}.{os.getpid()}")
 
 
 def remove_parts(path: Path) -> None:

@@ -89,6 +89,7 @@ class WorldModel(nn.Module):
         self.goal_dim = 0
         if goal_dim:
             self.add_goal_heads(goal_dim)
+        self.float()  # whatever torch's default dtype
 
     def trunk_precision(self, *, cache: bool = True) -> AbstractContextManager[None]:
         """A context in which matrix products use `trunk_dtype`; the last layers of heads use float32.
@@ -147,7 +148,7 @@ class WorldModel(nn.Module):
         if not self.goal_names:
             raise ValueError("this model was trained without labels, so it has no quantities that a goal could name")
         features, config = self.config.deter_dim + self.config.latent_dim, self.config
-        heads = GoalHeads(features, goal_dim, self.action_dim, config.num_bins, self.goal_scales.clone())
+        heads = GoalHeads(features, goal_dim, self.action_dim, config.num_bins, self.goal_scales.clone()).float()
         self.goal_dim, self.goal_heads = goal_dim, heads.to(self.device)
 
     def goal_action(self, features: Tensor, code: Tensor) -> tuple[Tensor, Tensor]:
@@ -209,7 +210,7 @@ class WorldModel(nn.Module):
             generators: One random stream per state, so that samples do not depend on the other states of the call.
         """
         draws = [
-            torch.randn(num, horizon, self.action_dim, generator=generator, device=self.device)
+            torch.randn(num, horizon, self.action_dim, generator=generator, device=self.device, dtype=torch.float32)
             for generator in generators
         ]
         noise = torch.stack(draws)
@@ -224,15 +225,15 @@ class WorldModel(nn.Module):
     def policy(self, state: State, generator: torch.Generator | None = None) -> Tensor:
         """The actor's action (rows, action): a sample when a generator is given, else its mode."""
         with self.trunk_precision():
-            if isinstance(self.actor, MixedActor) and generator is not None:
-                shape = *state.deter.shape[:-1], self.action_dim
-                return self.actor.sample(
-                    state.features, torch.randn(shape, generator=generator, device=state.deter.device)
-                )
+            if generator is None:
+                mean, _ = self.actor(state.features)
+                return mean
+            shape = *state.deter.shape[:-1], self.action_dim
+            noise = torch.randn(shape, generator=generator, device=state.deter.device, dtype=torch.float32)
+            if isinstance(self.actor, MixedActor):
+                return self.actor.sample(state.features, noise)
             mean, std = self.actor(state.features)
-        if generator is None:
-            return mean
-        return sample_action(mean, std, torch.randn(mean.shape, generator=generator, device=mean.device))
+        return sample_action(mean, std, noise)
 
     def continues(self, state: State) -> Tensor:
         """The probability (rows,) that the episode continues at a state."""

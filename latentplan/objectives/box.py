@@ -99,7 +99,7 @@ class BoxView:
         """The model with reward, value and policy of the box."""
         open_ends = (-math.inf, math.inf)
         ends = [self.intervals.get(name, open_ends) for name in model.goal_names]
-        low, high = torch.tensor(ends, device=model.device).unbind(-1)
+        low, high = torch.tensor(ends, device=model.device, dtype=torch.float32).unbind(-1)
         return BoxModel(model, low, high, self.frames_per_step)
 
 
@@ -153,13 +153,14 @@ class BoxModel:
             mean, std = self.model.goal_action(state.features, self._code)
         if generator is None:
             return mean  # type: ignore[no-any-return]
-        noise = torch.randn(mean.shape, generator=generator, device=mean.device)
+        noise = torch.randn(mean.shape, generator=generator, device=mean.device, dtype=torch.float32)
         return (mean + std * noise).clamp(-1.0, 1.0)  # type: ignore[no-any-return]
 
     def propose(self, state: Any, num: int, horizon: int, generators: Sequence[torch.Generator]) -> Tensor:
         """Action sequences of the actor for the box from each state, the mode first, (batch num, horizon, action)."""
         size = (num, horizon, self.model.action_dim)
-        noise = torch.stack([torch.randn(size, generator=each, device=self.model.device) for each in generators])
+        settings: Any = {"device": self.model.device, "dtype": torch.float32}
+        noise = torch.stack([torch.randn(size, generator=each, **settings) for each in generators])
         noise[:, 0] = 0.0
         rows, actions = repeat_rows(state, num), []
         for draw in noise.flatten(0, 1).unbind(1):

@@ -24,7 +24,9 @@ def read_goal_image(path: str, size: int = GOAL_IMAGE_SIZE) -> NDArray[np.uint8]
         if not Path(path).is_file():
             reason = "is a folder" if Path(path).is_dir() else "does not exist"
             raise UserError(f"goal image {path!r} {reason}; give a square image such as a frame of the camera")
-        image = cv2.imread(path, cv2.IMREAD_COLOR)
+        # OpenCV would end the process where the path is not UTF-8, so that it does not read the file itself.
+        content = np.frombuffer(Path(path).read_bytes(), np.uint8)
+        image = cv2.imdecode(content, cv2.IMREAD_COLOR) if len(content) else None
     except (OSError, cv2.error) as error:  # a file name or an image that is too large
         raise UserError(f"goal image {path!r} cannot be read: {' '.join(str(error).split())}") from None
     if image is None:

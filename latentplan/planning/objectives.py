@@ -46,6 +46,7 @@ class Rollout:
         states: State after each step if a term needs the states, otherwise empty.
         find_last_action: Returns the action executed last, (batch, action), NaN where unknown; None where no plan came
             before.
+        generator: Random stream of a model that samples; None for other models.
     """
 
     model: Any
@@ -58,6 +59,7 @@ class Rollout:
     last_state: State
     states: tuple[State, ...]
     find_last_action: Callable[[], Tensor] | None = None
+    generator: torch.Generator | None = None
 
     @property
     def last_action(self) -> Tensor:
@@ -428,7 +430,8 @@ def _conditioned_return(view: View, rollout: Rollout) -> Tensor:
     require(viewed, "value", "a learned goal")
     before = (rollout.start, *rollout.states[:-1])
     pairs = zip(before, rollout.actions.unbind(1), strict=True)
-    rewards = torch.stack([call_with(viewed.step, None, state, action)[1] for state, action in pairs], dim=1)
+    steps = [call_with(viewed.step, rollout.generator, state, action) for state, action in pairs]
+    rewards = torch.stack([reward for _, reward in steps], dim=1)
     rewards = rewards.to(rollout.rewards.dtype)
     value: Tensor = viewed.value(rollout.last_state).to(rewards.dtype)  # type: ignore[attr-defined]
     return (rewards * rollout.weights[..., :-1]).sum(dim=1) + rollout.weights[..., -1] * value

@@ -28,6 +28,7 @@ _THEMED = {INK: "var(--ink)", FAINT: "var(--faint)"} | {
 }
 _STYLE: Any = {
     "svg.fonttype": "none",
+    "text.parse_math": False,  # names hold dollar signs as they are
     "font.size": 9.0,
     "font.family": "sans-serif",
     "text.color": INK,
@@ -101,9 +102,9 @@ def plot_lines(lines: Sequence[Line], labels: Labels, *, large_x: bool = False, 
         for index, line in enumerate(lines):
             color, style = COLORS[index % len(COLORS)], line.style or DASHES[index % len(DASHES)]
             if line.style == "o":
-                axes.plot(line.x, line.y, "o", color=color, markersize=3, label=line.name or None)
+                axes.plot(line.x, line.y, "o", color=color, markersize=3, label=_legend_name(line.name))
                 continue
-            axes.plot(line.x, line.y, ls=style, lw=1.4, color=color, label=line.name or None)
+            axes.plot(line.x, line.y, ls=style, lw=1.4, color=color, label=_legend_name(line.name))
             x, y = np.asarray(line.x, float), np.asarray(line.y, float)
             is_alone = _find_lone_points(y)
             axes.plot(x[is_alone], y[is_alone], "o", color=color, markersize=3)
@@ -131,7 +132,7 @@ def plot_histogram(values: Sequence[tuple[str, ArrayLike]], labels: Labels, bins
 
     def draw(axes: Axes) -> None:
         for index, (name, each) in enumerate(values):
-            axes.hist(each, bins=bins, color=COLORS[index], alpha=0.6, label=name or None)
+            axes.hist(each, bins=bins, color=COLORS[index], alpha=0.6, label=_legend_name(name))
 
     return _draw(draw, labels)
 
@@ -166,9 +167,9 @@ def _draw(draw: Callable[[Axes], None], labels: Labels) -> str:
         axes = figure.add_subplot()
         draw(axes)
         for index, (name, value) in enumerate(labels.levels):
-            axes.axhline(value, color=FAINT, lw=1.0, ls=DASHES[(index + 1) % len(DASHES)], label=name)
+            axes.axhline(value, color=FAINT, lw=1.0, ls=DASHES[(index + 1) % len(DASHES)], label=_legend_name(name))
         for index, (name, value) in enumerate(labels.marks):
-            axes.axvline(value, color=INK, lw=1.2, ls=DASHES[(index + 1) % len(DASHES)], label=name)
+            axes.axvline(value, color=INK, lw=1.2, ls=DASHES[(index + 1) % len(DASHES)], label=_legend_name(name))
         axes.set_xlabel(labels.x)
         axes.set_ylabel(labels.y)
         axes.grid(color=FAINT, alpha=0.25, lw=0.5)
@@ -182,6 +183,12 @@ def _draw(draw: Callable[[Axes], None], labels: Labels) -> str:
                 if handle is not None:
                     handle.set_alpha(1.0)
         return _to_svg(figure, labels.alt)
+
+
+def _legend_name(name: str) -> str | None:
+    """The name as a legend shows it; None for none. Matplotlib leaves out names that begin with an underscore."""
+    shown = name.encode("utf-8", "backslashreplace").decode()
+    return f" {shown}" if shown.startswith("_") else shown or None
 
 
 def _to_svg(figure: Figure, alt: str) -> str:

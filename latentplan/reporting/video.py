@@ -36,7 +36,7 @@ class VideoWriter:
             size: Width and height in pixels, both even.
 
         Raises:
-            UserError: The name has another ending.
+            UserError: The name has another ending, or the path is not UTF-8.
             ValueError: The size or rate is not allowed.
             OSError: The file cannot be opened.
         """
@@ -96,15 +96,26 @@ class VideoWriter:
 
 
 def check_video_path(path: str | os.PathLike[str]) -> Path:
-    """The path, if its ending is allowed for a film.
+    """The path, if a film can have it.
 
     Raises:
-        UserError: The ending is not allowed; the message names the allowed endings.
+        UserError: The ending is not allowed, and the message names the allowed endings; or the path is not UTF-8.
     """
     checked = Path(path)
     if checked.suffix not in CODECS:
         raise UserError(f"a film's name must end in {' or '.join(CODECS)}, got {checked.name!r}")
+    if not _is_readable_by_opencv(checked):
+        raise UserError(f"a film's path must be UTF-8, got {str(checked.absolute())!r}")
     return checked
+
+
+def _is_readable_by_opencv(path: Path) -> bool:
+    """Whether OpenCV, which ends the process where a path is not UTF-8, can be given the absolute path."""
+    try:
+        str(path.absolute()).encode()
+    except UnicodeEncodeError:
+        return False
+    return True
 
 
 def _check_film(path: Path, size: tuple[int, int], num_frames: int) -> None:
@@ -128,7 +139,11 @@ def _check_film(path: Path, size: tuple[int, int], num_frames: int) -> None:
 @contextlib.contextmanager
 def _quiet_stderr() -> Iterator[None]:
     """Mutes the process's stderr, where FFmpeg warns without reason that WebM does not know the tag of VP9."""
-    saved = os.dup(2)
+    try:
+        saved = os.dup(2)
+    except OSError:  # stderr is closed
+        yield
+        return
     with open(os.devnull, "wb") as nowhere:
         os.dup2(nowhere.fileno(), 2)
     try:
@@ -144,6 +159,8 @@ def read_frames(path: Path, num: int) -> list[Frame]:
     Raises:
         OSError: The film cannot be read.
     """
+    if not _is_readable_by_opencv(path):
+        raise OSError(f"the path of the film {str(path)!r} is not UTF-8")
     capture = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG)
     frames: list[Frame] = []
     try:

@@ -1,5 +1,8 @@
 """The table of agent modes: every mode is usable, and a new row in the table is enough for a new mode."""
 
+import copy
+import pickle
+
 import numpy as np
 import pytest
 import torch
@@ -8,10 +11,12 @@ from latentplan.agents.checkpoint import load_agent, save_checkpoint
 from latentplan.agents.modes import MODES, AgentMode, planning_modes
 from latentplan.agents.planning import PlanningAgent
 from latentplan.config import UserError
-from tests.agents.small_agents import CONFIG, make_model
+from latentplan.models.fast import accelerate
+from tests.agents.small_agents import CONFIG, make_model, make_plain_model
 
 FRAME = np.zeros((64, 64, 3), np.uint8)
 HERE = "tests.agents.test_modes"
+GOAL = "cart -> 0.5 and cart_speed < 1"
 
 
 class ReversedAgent(PlanningAgent):
@@ -83,15 +88,55 @@ def test_registered_mode_that_does_not_plan_takes_no_planner_settings(checkpoint
         load_agent(checkpoint, "resting", horizon=2)
 
 
-@pytest.mark.parametrize("mode", sorted(MODES.keys() - {"background"}))  # whose actions depend on the clock
-def test_actions_do_not_depend_on_torchs_default_device(checkpoint, film, mode):
-    def play():
-        agent = load_agent(checkpoint, mode, device="cpu")
-        agent.seed(0)
-        actions = [agent.act(frames) for frames in film]
-        agent.reset()
-        return np.concatenate([*actions, *(agent.act(frames) for frames in film)])
+@pytest.fixture(scope="module")
+def with_goals(tmp_path_factory):
+    """A checkpoint of an agent with heads for goals."""
+    folder = tmp_path_factory.mktemp("with-goals")
+    model = make_plain_model(labels={"cart": 1.0, "cart_speed": 1.0})
+    model.add_goal_heads(8)
+    info = {"domain": "cartpole", "task": "swingup", "env_frames": 1, "discount": 0.9}
+    save_checkpoint(folder, accelerate(model), CONFIG, info)
+    return folder
 
-    expected = play()
+
+REPEATABLE = sorted(MODES.keys() - {"background"})  # whose actions depend on the clock
+
+
+def play(checkpoint, film, mode):
+    """Actions of two short episodes, the second one for a goal."""
+    agent = load_agent(checkpoint, mode, device="cpu")
+    agent.seed(0)
+    actions = [agent.act(frames) for frames in film]
+    agent.reset()
+    if MODES[mode].plans:
+        agent.set_objective(GOAL)
+        agent.act(film[0])
+        agent.imagine_along([agent.belief()], None, 2)
+    return np.concatenate([*actions, *(agent.act(frames) for frames in film)])
+
+
+@pytest.mark.parametrize("mode", REPEATABLE)
+def test_actions_do_not_depend_on_torchs_default_device(with_goals, film, mode):
+    expected = play(with_goals, film, mode)
     with torch.device("meta"):  # a tensor on this device has no numbers, so that its use fails
-        assert np.array_equal(play(), expected)
+        assert np.array_equal(play(with_goals, film, mode), expected)
+
+
+@pytest.mark.parametrize("mode", REPEATABLE)
+def test_actions_do_not_depend_on_torchs_default_dtype(with_goals, film, mode):
+    expected = play(with_goals, film, mode)
+    torch.set_default_dtype(torch.float64)
+    try:
+        assert np.array_equal(play(with_goals, film, mode), expected)
+    finally:
+        torch.set_default_dtype(torch.float32)
+
+
+@pytest.mark.parametrize("copied", [copy.deepcopy, lambda agent: pickle.loads(pickle.dumps(agent))])
+@pytest.mark.parametrize("mode", REPEATABLE)
+def test_agent_that_has_acted_can_be_copied_and_acts_on_alike(with_goals, film, mode, copied):
+    agent = load_agent(with_goals, mode, device="cpu")
+    agent.seed(0)
+    agent.act(film[0])
+    twin = copied(agent)
+    assert all(np.array_equal(twin.act(frames), agent.act(frames)) for frames in film[1:])

@@ -194,6 +194,29 @@ def test_eval_refuses_names_that_are_too_long(assert_refused, checkpoint):
         assert_refused(["eval", *flags], "too long")
 
 
+def test_eval_refuses_names_that_are_too_long_while_they_are_written(assert_refused, tmp_path, checkpoint):
+    for flags in (["--json", tmp_path / ("a" * 250)], ["--report", tmp_path / f"{'a' * 248}.html"]):
+        assert_refused(["eval", "--checkpoint", checkpoint, *flags], "too long")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_eval_refuses_a_film_in_a_folder_whose_name_is_not_utf8(assert_refused, tmp_path, checkpoint, monkeypatch):
+    folder = tmp_path / "\udcff"
+    folder.mkdir()
+    monkeypatch.chdir(folder)
+    assert_refused(["eval", "--checkpoint", checkpoint, "--video", "film.webm"], "a film's path must be UTF-8")
+
+
+def test_eval_ends_when_nobody_reads_its_output(root, checkpoint):
+    command = [sys.executable, root / "scripts" / "eval.py", "--checkpoint", checkpoint, "--mode", "random"]
+    command += ["--episodes", "3", "--device", "cpu"]
+    process = subprocess.Popen([*map(str, command)], stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+    process.stdout.readline()
+    process.stdout.close()
+    complaint = process.stderr.read()
+    assert (process.wait(), complaint) == (141, b"")
+
+
 @pytest.mark.parametrize("flag", ["--video", "--json"])
 def test_eval_tries_outputs_before_it_plays(assert_refused, tmp_path, checkpoint, flag):
     name = {"--video": "film.mp4", "--json": "result.json"}[flag]

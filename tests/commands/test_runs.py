@@ -2,6 +2,7 @@
 
 import csv
 import errno
+import html
 import io
 import json
 import os
@@ -21,6 +22,7 @@ from latentplan.config.run_results import find_state, note_state, read_progress
 from latentplan.evaluation.statistics import confidence_interval
 from latentplan.reporting.compare import group_runs, mean_curve
 from latentplan.reporting.runs import find_runs, read_run
+from latentplan.reporting.svg import Labels, Line, plot_lines
 
 COLUMNS = ("env_frames", "updates", "minutes", "planner_return", "actor_return")
 
@@ -191,9 +193,21 @@ def test_compare_groups_seeds_and_names_the_settings_that_differ(make_run, tmp_p
     text = capsys.readouterr().out
     assert re.search(r"^horizon 12 +cartpole-swingup +0, 1 .* 250\.0 \(-?[\d.]+ to [\d.]+\)", text, re.MULTILINE)
     assert re.search(r"^planner\.horizon +12 +5$", text, re.MULTILINE)
-    html = page.read_text()
-    assert "planner.horizon" in html and "<svg" in html
-    assert not re.search(r"""(?:src|href)=["'](?!data:|#)""", html)
+    text = page.read_text()
+    assert "planner.horizon" in text and "<svg" in text
+    assert not re.search(r"""(?:src|href)=["'](?!data:|#)""", text)
+
+
+def test_watch_refuses_a_period_that_no_clock_can_wait_for(assert_refused, make_run):
+    assert_refused(
+        ["watch", make_run("run"), "--every", "1e10"], "--every must be in [0.001, 86400], got 10000000000.0"
+    )
+
+
+@pytest.mark.parametrize("name", ["$HOME/x_y_$USER", "_hidden", "\udcff", "$\\frac$"])
+def test_figures_show_every_name_as_it_is(name):
+    drawn = plot_lines([Line(name, [0.0, 1.0], [1.0, 2.0]), Line("b", [0.0, 1.0], [2.0, 1.0])], Labels("", "x", "y"))
+    assert html.escape(name.encode("utf-8", "backslashreplace").decode(), quote=False) in drawn
 
 
 def test_compare_gives_every_group_a_name_of_its_own(make_run):

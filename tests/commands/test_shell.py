@@ -70,6 +70,13 @@ def test_scripts_end_silently_when_nobody_reads_their_output(words, root):
     assert (process.wait(), complaint) == (141, b"")
 
 
+@pytest.mark.parametrize("stream", [">&-", "2>&-", ">&- 2>&-", "2>/dev/full"])
+@pytest.mark.parametrize(("words", "code"), [("--version", 0), ("bogus", 2)])
+def test_exit_code_is_the_same_where_nothing_can_be_printed(stream, words, code):
+    command = f"exec {sys.executable} -m latentplan {words} {stream}"
+    assert subprocess.run(["sh", "-c", command], capture_output=True).returncode == code
+
+
 def test_use_device_sets_the_given_threads_else_those_of_the_command():
     before = torch.get_num_threads()
     try:

@@ -86,6 +86,7 @@ def test_view_ends_by_sigterm_while_a_page_is_open(start):
         (("--objective", "speed -> 1"), ("'speed'",)),
         (("--constraint", "cart"), ("cart",)),
         (("--control-hz", "0"), ("--control-hz", "above 0")),
+        (("--control-hz", "1e-12"), ("--control-hz", "[0.001, 1000000.0]")),
         (("--seed", "-1"), ("--seed", "at least 0")),
         (("--planner.num_elites", "9"), ("num_elites (9)", "num_samples (8)")),
         (("--host", "no such host", "--port", "0"), ("--host 'no such host'",)),

@@ -3,6 +3,7 @@
 from typing import NamedTuple
 
 import cv2
+import numpy as np
 import pytest
 import torch
 from torch import Tensor
@@ -235,12 +236,20 @@ def test_read_goal_image_names_the_file_when_it_cannot_be_read(tmp_path, name, r
         read_goal_image(str(tmp_path / name))
 
 
-def test_read_goal_image_gives_opencvs_reason_when_the_image_is_too_large(tmp_path, monkeypatch):
-    (tmp_path / "large.png").touch()
+def test_goal_image_may_lie_in_a_folder_whose_name_is_not_utf8(tmp_path):
+    folder = tmp_path / "\udcff"
+    folder.mkdir()
+    picture = np.full((64, 64, 3), 7, np.uint8)
+    (folder / "goal.png").write_bytes(cv2.imencode(".png", picture)[1].tobytes())
+    assert np.array_equal(read_goal_image(str(folder / "goal.png")), picture)
 
-    def refuse(path, flags):
+
+def test_read_goal_image_gives_opencvs_reason_when_the_image_is_too_large(tmp_path, monkeypatch):
+    (tmp_path / "large.png").write_bytes(b"a picture")
+
+    def refuse(content, flags):
         raise cv2.error("(-215:Assertion failed) pixels <= CV_IO_MAX_IMAGE_PIXELS")
 
-    monkeypatch.setattr(cv2, "imread", refuse)
+    monkeypatch.setattr(cv2, "imdecode", refuse)
     with pytest.raises(UserError, match="CV_IO_MAX_IMAGE_PIXELS"):
         read_goal_image(str(tmp_path / "large.png"))

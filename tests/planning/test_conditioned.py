@@ -53,6 +53,20 @@ def test_conditioned_has_the_same_return_in_a_sum(point, states, make_planner, s
     assert torch.allclose(alone.expected_return, summed.expected_return, atol=1e-4)
 
 
+def noisy_dynamics(state, action, generator=None):
+    moved = goal_dynamics(state, action)
+    return moved + 0.3 * torch.randn(moved.shape, generator=generator)
+
+
+def test_sum_repeats_in_a_model_that_samples_and_leaves_torchs_stream(states, make_planner, seeded):
+    noisy = FunctionModel(noisy_dynamics, GOAL.reward, value=GOAL.value)
+    objective = conditioned(lambda model: noisy) + 0.1 * action_penalty()
+    before = torch.get_rng_state()
+    plans = [make_planner().plan(noisy, states, objective=objective, generator=seeded()) for _ in range(2)]
+    assert torch.equal(plans[0].actions, plans[1].actions)
+    assert torch.equal(torch.get_rng_state(), before)
+
+
 class Idle:
     """An executor that never has a plan."""
 

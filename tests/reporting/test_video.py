@@ -6,7 +6,7 @@ import pytest
 
 from latentplan.config import UserError
 from latentplan.reporting.frame import compose_frame
-from latentplan.reporting.video import VideoWriter
+from latentplan.reporting.video import VideoWriter, read_frames
 
 SIZE = (96, 64)
 
@@ -80,6 +80,15 @@ def test_video_writer_refuses_a_wrong_rate_or_odd_size(tmp_path, fps, size):
 def test_video_writer_refuses_other_file_endings(tmp_path, name):
     with pytest.raises(UserError, match=r"\.mp4 or \.webm"):
         VideoWriter(tmp_path / name, 20, SIZE)
+
+
+def test_films_in_a_folder_whose_name_is_not_utf8_are_refused(tmp_path):
+    folder = tmp_path / "\udcff"  # OpenCV would end the process
+    folder.mkdir()
+    with pytest.raises(UserError, match="must be UTF-8"):
+        VideoWriter(folder / "film.webm", 20, SIZE)
+    with pytest.raises(OSError, match="not UTF-8"):
+        read_frames(folder / "film.webm", 1)
 
 
 def test_video_writer_raises_at_once_when_the_folder_is_missing(tmp_path):

@@ -15,6 +15,7 @@ from latentplan.planning.model import (
     State,
     action_dtype,
     count_rows,
+    is_sampling,
     state_device,
     supports,
     take_step,
@@ -110,7 +111,8 @@ class PlanScheduler:
             them: a change of the executor's goals counts as a call of `set_objective`.
         max_age: See `PlanBuffer`.
         fresh_ticks: See `PlanBuffer`; None follows the predicted latency.
-        generator: Draws the seed of each request; None leaves the seed to the executor.
+        generator: Draws the seed of each request, and at first the seed of the stream of a model that samples; None
+            leaves the seeds to the executor and the model.
     """
 
     def __init__(
@@ -124,6 +126,9 @@ class PlanScheduler:
         generator: torch.Generator | None = None,
     ) -> None:
         self.planner, self.model, self.executor, self.generator = planner, model, executor, generator
+        self._stream: torch.Generator | None = None  # of a model that samples
+        if generator is not None and is_sampling(model):
+            self._stream = torch.Generator(generator.device).manual_seed(self._draw_seed(generator))
         self.buffer = PlanBuffer(max_age, 1 if fresh_ticks is None else fresh_ticks)
         self.tick = 0  # of the next decision; never reset, so that a late plan is not mistaken for a newer plan
         self._follows_latency = fresh_ticks is None
@@ -226,7 +231,7 @@ class PlanScheduler:
         self.buffer.submit(plan.actions, tick)
         now, nominals = self.tick, self._nominals.items()
         self._nominals = {first: nominal for first, nominal in nominals if now - first < nominal.actions.shape[1]}
-        self._nominals[tick] = NominalTrajectory(self.model, requested[2], plan.actions)
+        self._nominals[tick] = NominalTrajectory(self.model, requested[2], plan.actions, self._stream)
         self._failures = {first: failed for first, failed in self._failures.items() if first in self._nominals}
         if bool(failures.any()):
             self._failures[tick] = failures.to(plan.actions.device)
@@ -240,16 +245,17 @@ class PlanScheduler:
         if self._last is not None:
             due = max(due, self._last[0] + 1)  # each plan starts at a later tick than the last
         for tick in range(self.tick + 1, due + 1):
-            state, _ = take_step(self.model, state, action)
+            state, _ = take_step(self.model, state, action, self._stream)
             if tick < due:
                 planned = self.buffer.peek(tick)
                 action = self._act_by_policy(state) if planned is None else self._act_by_plan(state, tick, planned[1])
-        seed = None
-        if self.generator is not None:
-            device = self.generator.device
-            seed = int(torch.randint(2**62, (1,), generator=self.generator, device=device))
+        seed = None if self.generator is None else self._draw_seed(self.generator)
         if self.executor.request(state, due, self._warm_start(due), seed):
             self._requested = (self.tick, due, state)
+
+    @staticmethod
+    def _draw_seed(generator: torch.Generator) -> int:
+        return int(torch.randint(2**62, (1,), generator=generator, device=generator.device))
 
     def _warm_start(self, due: int) -> Plan | None:
         if self._last is None or due - self._last[0] >= self._last[1].mean.shape[1]:
@@ -315,16 +321,18 @@ class NominalTrajectory:
         model: The model that predicts the states.
         start: Start of the plan, rows (batch,).
         actions: The plan, (batch, horizon, action).
+        generator: Random stream of a model that samples; None leaves the stream to the model.
     """
 
-    def __init__(self, model: Model, start: State, actions: Tensor) -> None:
-        self.model, self.actions = model, actions
+    def __init__(self, model: Model, start: State, actions: Tensor, generator: torch.Generator | None = None) -> None:
+        self.model, self.actions, self._generator = model, actions, generator
         self._states = [start]
 
     def state_at(self, age: int) -> State:
         """Returns the predicted state after `age` actions of the plan, rows (batch,)."""
         while len(self._states) <= age:
-            following, _ = take_step(self.model, self._states[-1], self.actions[:, len(self._states) - 1])
+            action = self.actions[:, len(self._states) - 1]
+            following, _ = take_step(self.model, self._states[-1], action, self._generator)
             self._states.append(following)
         return self._states[age]
 

@@ -187,19 +187,28 @@ def _serve(connection: Connection) -> None:
         signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
     torch.set_num_threads(1)
     try:
+        message = connection.recv_bytes()
         try:
-            problem = pickle.loads(connection.recv_bytes())
-        except (AttributeError, ImportError, pickle.UnpicklingError) as error:
-            # The problem uses a definition of a module that this process cannot import.
+            problem = pickle.loads(message)
+        except Exception as error:  # it may use a definition of a module that this process cannot import
             connection.send_bytes(pickle.dumps(("error", _make_portable(error))))
             return
         search = _Search(problem)
         settle()
         connection.send_bytes(pickle.dumps(("ready", None)))
         while True:
-            connection.send_bytes(pickle.dumps(search(pickle.loads(connection.recv_bytes()))))
+            connection.send_bytes(pickle.dumps(_answer(search, connection.recv_bytes())))
     except (EOFError, OSError):
         return
+
+
+def _answer(search: _Search, message: bytes) -> Answer:
+    """Returns the answer to a pickled request; a state that this process cannot unpickle is an error."""
+    try:
+        request = pickle.loads(message)
+    except Exception as error:
+        return "error", _make_portable(error)
+    return search(request)
 
 
 class _Search:

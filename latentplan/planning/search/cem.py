@@ -12,7 +12,7 @@ import torch
 
 from latentplan.config.checks import shown
 from latentplan.config.planner import WIDEST_STD, SearchOptions, check_whole
-from latentplan.planning.model import Bound, Model, State, per_dimension, per_step, state_device
+from latentplan.planning.model import Bound, Model, State, count_rows, per_dimension, per_step, state_device
 from latentplan.planning.objectives import Constraint, Term
 from latentplan.planning.plan import Iteration, Plan
 from latentplan.planning.search.choices import read_choices
@@ -48,7 +48,7 @@ class CEMPlanner(SearchOptions):
     Attributes:
         action_dim: Numbers in an action.
         action_low: Lowest action: one number, one per dimension, one per step (horizon, action), or (batch, horizon,
-            action). The first step is the present one.
+            action). The first step is the present one. Bounds lie in [-1e15, 1e15].
         action_high: Highest action, like `action_low`.
         action_choices: Discrete actions. A number n lets every dimension take the values 0 to n - 1, and a sequence
             lists the values. A mapping from dimensions to numbers or sequences makes the other dimensions continuous.
@@ -147,7 +147,7 @@ class CEMPlanner(SearchOptions):
         Raises:
             TypeError: An argument, or what the user's functions returned, has a wrong type.
             ValueError: The model lacks a method that an option needs, a method of the model returned a wrong shape,
-                the bounds are no pair, or the deadline is negative.
+                the bounds are no pair or do not fit each other, or the deadline is negative.
         """
         clock = self.clock or time.perf_counter
         started = clock()
@@ -159,7 +159,7 @@ class CEMPlanner(SearchOptions):
         # In inference mode the plan could not be a training target, and gradient steps would fail.
         with torch.inference_mode(False), torch.no_grad():
             low, high = self.bounds if bounds is None else self._read_bounds(*_as_pair(bounds))
-            last = None if last_action is None else torch.as_tensor(last_action, device=state_device(state))
+            last = None if last_action is None else _place_beside(state, last_action)
             start, spread, discount = self._init_mean, self._init_std, self.discount
             goals, seen = (objective, constraints), self.first_searches
             problem = Problem(model, state, *goals, low, high, start, spread, discount, self.choices, last, seen)
@@ -183,6 +183,12 @@ class CEMPlanner(SearchOptions):
 
     def _read_bounds(self, low: Bound, high: Bound) -> tuple[torch.Tensor, torch.Tensor]:
         lowest, highest = read_bounds(low, high, self.action_dim, self.choices)
+        sizes = zip(lowest.shape, highest.shape, strict=True)
+        if any(first != second and 1 not in (first, second) for first, second in sizes):
+            shapes = f"{tuple(lowest.shape)} and {tuple(highest.shape)}"
+            raise ValueError(f"action_low and action_high must fit each other, (batch, horizon, action), got {shapes}")
+        if not bool((torch.maximum(-lowest, highest) <= WIDEST_STD).all()):
+            raise ValueError(f"action_low and action_high must lie in [-{WIDEST_STD:g}, {WIDEST_STD:g}]")
         if not bool((lowest < highest).all()):
             given = f"action_low {lowest.squeeze().tolist()} must lie below action_high {highest.squeeze().tolist()}"
             raise ValueError(given)
@@ -234,6 +240,11 @@ OWN_OPTIONS: dict[Callable[..., Any], set[str]] = {
     icem_planner: set(ICEM),
     mppi_planner: {*MPPI, "num_elites", "warm_start_iterations"},
 }
+
+
+def _place_beside(state: State, action: Any) -> torch.Tensor:
+    count_rows(state)  # refuses what is no state
+    return torch.as_tensor(action, device=state_device(state))
 
 
 def _as_pair(bounds: Any) -> tuple[Bound, Bound]:

@@ -222,7 +222,7 @@ class Scorer:
             rewards, last_state = call_with(self.model.rollout, self.generator, start, actions)  # type: ignore[attr-defined]
             check_shape("rollout()'s rewards", rewards, actions.shape[:2])
             rewards, states, weights = rewards.to(self.discounts.dtype), (), self.discounts
-        parts = (actions, rewards, weights, start, last_state, states, self.find_last_action)
+        parts = (actions, rewards, weights, start, last_state, states, self.find_last_action, self.generator)
         return Rollout(self.model, batch, particles, *parts)
 
     def _step_through(

@@ -7,6 +7,7 @@ import sys
 import threading
 import time
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import pytest
 import torch
@@ -211,6 +212,27 @@ def test_poll_raises_when_a_search_exits_its_thread():
             background.request(STATE, 0)
             with pytest.raises(RuntimeError, match="SystemExit: 3"):
                 wait_for_plan(background)
+
+
+def refuse_to_load():
+    raise AttributeError("there is no such class here")
+
+
+class Unreadable(NamedTuple):
+    """A state that another process cannot unpickle, as one of a class below a main guard."""
+
+    x: torch.Tensor
+
+    def __reduce__(self):
+        return refuse_to_load, ()
+
+
+def test_poll_raises_when_a_state_cannot_be_unpickled_and_the_planner_goes_on(process):
+    process.request(Unreadable(STATE), 0)
+    with pytest.raises(AttributeError, match="no such class"):
+        wait_for_plan(process)
+    assert process.request(STATE, 1)
+    assert wait_for_plan(process)[0] == 1
 
 
 def test_program_ends_without_close_and_leaves_no_process(run_python, tmp_path):

@@ -286,6 +286,20 @@ def test_scheduler_repeats_its_decisions_with_equal_seeds_and_durations(model):
     assert torch.equal(*runs)
 
 
+def noisy_dynamics(state, action, generator=None):
+    return dynamics(state, action) + 0.1 * torch.randn(state.shape, generator=generator)
+
+
+def test_scheduler_repeats_its_decisions_in_a_model_that_samples(model):
+    noisy, runs = FunctionModel(noisy_dynamics, reward, policy=model.policy), []
+    before = torch.get_rng_state()
+    for _ in range(2):
+        scheduler, executor = make(noisy, [1.3] * 100)
+        runs.append(torch.cat([decision.action for decision in drive(scheduler, executor, 20)[0]]))
+    assert torch.equal(*runs)
+    assert torch.equal(torch.get_rng_state(), before)
+
+
 def test_scheduler_uses_longer_plans_for_objectives_to_their_end(model):
     """Plans for an objective may be longer than plans for the predicted return."""
     planner = CEMPlanner(action_dim=1, horizon=2, goal_horizon=6, num_samples=32, num_elites=4)

@@ -292,6 +292,9 @@ def test_controller_brings_a_point_mass_to_rest(point, make_planner, seeded):
         ({"num_policy_samples": -1}, "num_policy_samples"),
         ({"goal_horizon": 2.5}, "goal_horizon"),
         ({"gradient_steps": -1}, "gradient_steps"),
+        ({"action_low": -1e39, "action_high": 1e39}, "action_low and action_high must lie in"),
+        ({"action_low": -torch.ones(2, 3, 2), "action_high": torch.ones(3, 3, 2)}, "must fit each other"),
+        ({"action_low": -torch.ones(3, 2), "action_high": torch.ones(4, 2)}, "must fit each other"),
     ],
 )
 def test_planner_names_a_bad_option(make_planner, options, name):
@@ -304,6 +307,8 @@ def test_plan_names_wrong_shapes_from_the_model(point, states, make_planner):
         make_planner().plan(FunctionModel(point.dynamics, lambda state, action: state[:, :1]), states)
     with pytest.raises(TypeError, match="tensor or a pytree"):
         make_planner().plan(point, [1.0, 2.0])
+    with pytest.raises(TypeError, match="tensor or a pytree"):
+        make_planner().plan(point, None, last_action=torch.zeros(1, 2))
     plan = make_planner().plan(point, states[:3])
     with pytest.raises(ValueError, match="last plan is for 3 environments and actions of 2, this search for 5"):
         make_planner().plan(point, states, plan)

@@ -201,6 +201,20 @@ def test_dataclass_states_plan_like_tensors(point, make_planner, seeded):
         assert background.request(world, 0)
 
 
+def test_dataclass_state_may_come_with_the_last_action_at_the_first_call():
+    @dataclasses.dataclass
+    class Place:
+        position: torch.Tensor
+
+    class Mover:
+        def step(self, state, action):
+            return Place(state.position + action), -state.position.square().sum(dim=1)
+
+    planner = CEMPlanner(action_dim=2, horizon=3, num_samples=8)
+    plan = planner.plan(Mover(), Place(torch.zeros(1, 2)), last_action=torch.zeros(1, 2))
+    assert torch.isfinite(plan.action).all()
+
+
 def test_dataclass_with_other_fields_is_refused():
     @dataclasses.dataclass
     class Named:
