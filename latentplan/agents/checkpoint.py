@@ -162,7 +162,8 @@ def _make_model(
         state = {name: value.float() for name, value in load(content).items()}
         with torch.device("meta"):  # compares shapes before a model is allocated whose size the file names
             WorldModel(config.model, *sizes).load_state_dict(state, assign=True)
-        with torch.device("cpu"):  # the arrays of the file lie there, whatever torch's default device
+        # The arrays of the file lie on the CPU, whatever torch's default device, and loading draws no random number.
+        with torch.device("cpu"), torch.random.fork_rng(devices=[]):
             model = WorldModel(config.model, *sizes)
         model.load_state_dict(state)
     except (RuntimeError, SafetensorError, TypeError, ValueError) as error:

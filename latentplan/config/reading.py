@@ -67,14 +67,15 @@ def read_yaml(path: Path) -> Any:
     """The content of a YAML file of settings, made of plain values.
 
     Raises:
-        UserError: The file cannot be read (see `read_text`), is not valid YAML, is nested too deeply, or has aliases.
+        UserError: The file cannot be read (see `read_text`), is not valid YAML, is nested too deeply, has aliases, or
+            gives a key twice.
     """
     import yaml
 
     text = read_text(path)
     loader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
     try:
-        if (reason := _find_excess(text)) is not None:
+        if (reason := _find_excess(text) or _find_repetition(text)) is not None:
             raise UserError(f"cannot read {path}: {reason}")
         return yaml.load(text, Loader=loader)  # a safe loader makes plain values only
     except yaml.YAMLError as error:
@@ -157,4 +158,27 @@ def _find_excess(text: str) -> str | None:
         depth += isinstance(event, yaml.CollectionStartEvent) - isinstance(event, yaml.CollectionEndEvent)
         if depth > DEEPEST:
             return f"it is nested more than {DEEPEST} levels deep"
+    return None
+
+
+def _find_repetition(text: str) -> str | None:
+    """Which key a mapping of a YAML text gives twice, of which a parser would keep the last; None if there is none."""
+    import yaml
+
+    keys: list[set[str] | None] = [None]  # of the open collections; None of a list
+    is_value = [False]  # whether the next node of each is the value of a key
+    for event in yaml.parse(text, Loader=getattr(yaml, "CSafeLoader", yaml.SafeLoader)):
+        if isinstance(event, yaml.CollectionEndEvent):
+            keys.pop()
+            is_value.pop()
+        elif isinstance(event, yaml.NodeEvent):
+            known = keys[-1]
+            if known is not None and not is_value[-1] and isinstance(event, yaml.ScalarEvent):
+                if event.value in known:
+                    return f"line {event.start_mark.line + 1} gives {shown(event.value)} a second time"
+                known.add(event.value)
+            is_value[-1] = known is not None and not is_value[-1]
+            if isinstance(event, yaml.CollectionStartEvent):
+                keys.append(set() if isinstance(event, yaml.MappingStartEvent) else None)
+                is_value.append(False)
     return None

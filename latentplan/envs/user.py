@@ -158,10 +158,11 @@ class PixelEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         """
         if self._needs_reset:
             raise ResetNeeded("the episode is over; call reset() first")
-        scaled = self.inner_action(action)
+        self._check_action(action)
         total, env_frames, terminated, truncated = 0.0, 0, False, False
         while env_frames < self.action_repeat and not (terminated or truncated):
-            picture, reward, terminated, truncated, info = self._env.step(scaled)
+            # A new value for each step, because the environment may change it in place.
+            picture, reward, terminated, truncated, info = self._env.step(self._actions.value(action))
             total += check_reward(reward)
             terminated, truncated = check_end(terminated, "terminated"), check_end(truncated, "truncated")
             env_frames += 1
@@ -176,9 +177,12 @@ class PixelEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         Raises:
             ValueError: The action has another shape or is not finite.
         """
+        self._check_action(action)
+        return self._actions.value(action)
+
+    def _check_action(self, action: np.ndarray) -> None:
         if np.shape(action) != self.action_space.shape or not np.isfinite(action).all():
             raise ValueError(f"the action must be {self.action_space.shape} finite numbers, got {action!r}")
-        return self._actions.value(action)
 
     def render(self) -> np.ndarray:  # type: ignore[override]
         """The first camera's last picture, a new uint8 array (size, size, 3)."""

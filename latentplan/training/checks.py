@@ -169,11 +169,13 @@ def check_folder(run_dir: str, flag: str = "--run-dir") -> None:
         flag: The flag that names it, for the error.
 
     Raises:
-        UserError: The name is empty, a file is in the way, or the folders above may not be read.
+        UserError: The name is empty or not UTF-8, a file is in the way, or the folders above may not be read.
         OSError: The name is too long.
     """
     if run_dir == "":
         raise UserError(f"{flag} must name a folder, got an empty text")
+    if not run_dir.isprintable() and any("\ud800" <= character <= "\udfff" for character in run_dir):
+        raise UserError(f"{flag} must be UTF-8, got {run_dir!r}")  # settings are written as UTF-8
     folder = Path(run_dir).absolute()
     try:
         existing = next(path for path in (folder, *folder.parents) if path.exists())

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import sys
 import time
 from typing import Any
 
@@ -14,6 +16,17 @@ from latentplan.training.state import RunState
 
 SECONDS_ON_A_TERMINAL = 0.5
 SECONDS_IN_A_LOG = 30.0
+
+
+class SteadyConsole(Console):
+    """A console that goes silent where nobody reads it any more, as after `train | head`: the run goes on."""
+
+    def on_broken_pipe(self) -> None:
+        """Sends what would be printed later to nowhere."""
+        self.quiet = True
+        nowhere = os.open(os.devnull, os.O_WRONLY)
+        os.dup2(nowhere, sys.stdout.fileno())
+        os.close(nowhere)
 
 
 class Progress:
@@ -29,7 +42,7 @@ class Progress:
     """
 
     def __init__(self, run: RunConfig, is_quiet: bool = False) -> None:
-        self.run, self.console = run, Console(highlight=False, quiet=is_quiet)
+        self.run, self.console = run, SteadyConsole(highlight=False, quiet=is_quiet)
         self.episode_return: float | None = None
         self._evaluation = ""
         self._last_time, self._last_updates = time.monotonic(), 0
@@ -88,7 +101,7 @@ class StatusLine:
     """Shows one live line on a terminal or one line every 30 seconds in a log, between lines that stay."""
 
     def __init__(self) -> None:
-        self.console = Console(highlight=False)
+        self.console = SteadyConsole(highlight=False)
         self._last_time = time.monotonic()
         self._live = self.console.status("starting") if self.console.is_terminal else None
 

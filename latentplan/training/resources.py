@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import warnings
+from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
 import torch
@@ -45,6 +47,16 @@ def choose_threads(collectors: int, processes: int = 1) -> int:
 def choose_collector_threads(device: torch.device, collectors: int = 1) -> int:
     """CPU threads of each collection process: one if the learner uses the CPU, up to 4 if the learner uses a GPU."""
     return 1 if device.type == "cpu" else min(max(1, count_cores() // (4 * collectors)), COLLECTOR_THREADS)
+
+
+@contextlib.contextmanager
+def keep_threads() -> Iterator[None]:
+    """Gives torch its number of CPU threads back when the context ends."""
+    before = torch.get_num_threads()
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
 
 
 def set_up_torch(threads: int, device: torch.device) -> None:

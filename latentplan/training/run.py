@@ -21,7 +21,7 @@ from lightning.pytorch.utilities.exceptions import SIGTERMException
 
 from latentplan.agents.checkpoint import INFO, load_model
 from latentplan.agents.files import is_checkpoint
-from latentplan.config import USER_DOMAIN, Config, Device, EnvironmentFault, Strategy, UserError, derive_seed
+from latentplan.config import USER_DOMAIN, Config, Device, Strategy, UserError, derive_seed
 from latentplan.config.commit import Save
 from latentplan.config.env_id import as_file_name, repeat_flag
 from latentplan.config.files import dump_config, read_config
@@ -40,7 +40,7 @@ from latentplan.training.checks import check_folder, check_settings
 from latentplan.training.collection.collector import Description, EnvFactory
 from latentplan.training.collection.crew import Worker, check_memory, make_worker
 from latentplan.training.collection.episodes import Stopped, to_arrays
-from latentplan.training.collection.keeping import refuse_used_folder
+from latentplan.training.collection.keeping import check_kept, refuse_used_folder
 from latentplan.training.collection.process import WorkerEnded
 from latentplan.training.console import Progress
 from latentplan.training.demonstrations.seeding import count_rows, read_demonstrations, seed_replay
@@ -51,8 +51,8 @@ from latentplan.training.learner.curriculum import Curriculum
 from latentplan.training.learner.graphed import make_learner
 from latentplan.training.learner.skips import NotFiniteError
 from latentplan.training.ranks import Ranks, join_ranks, place_ranks
-from latentplan.training.resources import choose_device, choose_threads, make_trainer, set_up_torch
-from latentplan.training.saving import Guard, Restore, Stop
+from latentplan.training.resources import choose_device, choose_threads, keep_threads, make_trainer, set_up_torch
+from latentplan.training.saving import Guard, Restore, Stop, name_save
 from latentplan.training.saving import Save as SaveRun
 from latentplan.training.signals import Signals, exit_code
 from latentplan.training.state import (
@@ -230,7 +230,8 @@ def _run_until_end(
     failed_at = -1
     while True:
         try:
-            return _Run(config, folder, make_env, signals, ranks, resume=resume).execute()
+            with keep_threads():
+                return _Run(config, folder, make_env, signals, ranks, resume=resume).execute()
         except NotFiniteError as error:
             if error.update <= failed_at:
                 raise  # the same again: another try would end here too
@@ -287,6 +288,7 @@ class _Run:
         """The newest save that is whole; warns of newer ones that are not."""
         save, problems = self.saves.newest()
         warn_of_loss(save, problems)
+        check_kept(self.config, self.saves.find(RUN_FILE), has_other_ranks=count_ranks(save) != self.ranks.size)
         return save
 
     def _build(self, save: Save | None) -> None:
@@ -387,12 +389,9 @@ class _Run:
                 if not state.interrupted:
                     return Result(self.folder, 0, self._finish(trainer, save, videos / "final.webm"))
             agree_on_signals(state, ranks)
-        except WorkerEnded:
+        except (WorkerEnded, UserError) as error:
             save.save(trainer, self.learner)
-            raise
-        except EnvironmentFault as fault:
-            save.save(trainer, self.learner)
-            raise EnvironmentFault(f"{fault}; the run is saved in {self.folder}", fault.origin) from None
+            raise name_save(error, self.folder) from None
         command = f"python scripts/train.py --resume {self.folder}{repeat_flag(config.env)}"
         if config.env.domain == USER_DOMAIN:
             command = f'latentplan.training.resume("{self.folder}", make_env=...)'
@@ -403,7 +402,7 @@ class _Run:
         batches = ReplayBatches(self.replay, self.config, self.curriculum, self.learner)
         self.console.start(self.learner.updates)
         try:
-            with contextlib.suppress(SIGTERMException):  # of a signal before `Stop` has begun; `signals` has it too
+            with contextlib.suppress(SIGTERMException), torch.random.fork_rng(devices=[]):  # a signal before `Stop`
                 trainer.fit(self.learner, datamodule=ReplayData(batches))
         finally:
             self.console.stop()

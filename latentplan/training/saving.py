@@ -14,7 +14,8 @@ import lightning
 import torch
 
 from latentplan.agents.checkpoint import save_checkpoint
-from latentplan.config import Config
+from latentplan.config import Config, UserError
+from latentplan.config.checks import EnvironmentFault
 from latentplan.config.commit import PART, Saves
 from latentplan.config.files import dump_config
 from latentplan.config.manifest import Extent
@@ -38,6 +39,13 @@ SAVE_MINUTES = 5.0
 SAVE_SHARE = 0.01  # timed saves take at most this share of the time
 SKIPPED_FOLDER = "skipped"
 KEPT_BATCHES = 10
+
+
+def name_save(error: Exception, folder: Path) -> Exception:
+    """The error that ended a run which has been saved, with the folder of the run where the user is at fault."""
+    if isinstance(error, EnvironmentFault):
+        return EnvironmentFault(f"{error}; the run is saved in {folder}", error.origin)
+    return UserError(f"{error}; the run is saved in {folder}") if isinstance(error, UserError) else error
 
 
 class Save(lightning.Callback):

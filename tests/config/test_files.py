@@ -176,6 +176,11 @@ def test_read_config_inverts_dump_config(tmp_path, config):
         ("env: !!python/object:os.system {}", "not valid YAML"),
         ("1: {2: 3}", "unknown section"),
         ("[" * 3000, "cannot read {path}"),
+        (
+            "planner: {horizon: 3}\nrun: {frames: 9}\nplanner: {num_samples: 64}",
+            "{path}: line 3 gives 'planner' a second",
+        ),
+        ("run:\n  frames: 100\n  minutes: 1\n  frames: 200", "{path}: line 4 gives 'frames' a second time"),
     ],
 )
 def test_read_layer_refuses_malformed_files(text, expected, write_yaml):

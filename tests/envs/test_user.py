@@ -61,6 +61,20 @@ def test_step_scales_actions_to_the_users_bounds():
     assert clock.actions[0].dtype == np.float32
 
 
+def test_every_step_gets_the_action_though_the_environment_changes_it():
+    class Doubling(Clock):
+        def step(self, action):
+            self.actions.append(action.copy())
+            action *= 2.0
+            return super().step(action)
+
+    clock = Doubling()
+    env = wrap_user_env(clock, action_repeat=3)
+    env.reset()
+    env.step(np.array([0.0, 0.5]))
+    assert np.allclose(clock.actions[::2], [[1.0, 2.0]] * 3)
+
+
 def test_step_sums_rewards_and_stops_at_the_end_of_the_episode():
     env = wrap_user_env(Clock(), action_repeat=4)
     env.reset()

@@ -2,6 +2,8 @@
 
 import errno
 import shutil
+import subprocess
+import sys
 import warnings
 from pathlib import Path
 
@@ -213,3 +215,33 @@ def test_train_explains_that_episodes_are_too_short(tiny, dot, tmp_path):
 def test_train_shortens_the_prefill_to_a_small_budget(tiny, dot, tmp_path):
     run = train(tiny(tmp_path / "run", run={"frames": 25}), dot)
     assert read_state(run.run_dir)["run"]["env_frames"] == 25
+
+
+def test_train_and_load_agent_leave_torchs_stream_and_threads(tiny, dot, tmp_path):
+    stream, threads = torch.get_rng_state(), torch.get_num_threads()
+    try:
+        train(tiny(tmp_path / "run", run={"threads": threads + 1}), dot)
+        assert torch.get_num_threads() == threads
+        load_agent(tmp_path / "run")
+        assert torch.equal(torch.get_rng_state(), stream)
+    finally:
+        torch.set_num_threads(threads)
+
+
+def test_train_refuses_a_folder_whose_name_is_not_utf8(tiny, dot, tmp_path):
+    for changes in ({}, {"collection": {"keep_episodes": str(tmp_path / "\udcff")}}):
+        with pytest.raises(UserError, match="must be UTF-8"):
+            train(tiny(tmp_path / ("run" if changes else "\udcff"), **changes), dot)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_display_goes_silent_when_nobody_reads_it():
+    code = (
+        "import sys; from latentplan.training.console import StatusLine; console = StatusLine().console\n"
+        "for _ in range(2000): console.print('x' * 100)\n"
+        "print('more'); print('done', file=sys.stderr)"
+    )
+    process = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+    process.stdout.close()
+    complaint = process.stderr.read()
+    assert (process.wait(), complaint) == (0, b"done\n")

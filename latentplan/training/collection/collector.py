@@ -129,7 +129,9 @@ class Collector:
         self.discount = discount = config.learning.discount or _choose_discount(self._decisions)
         self.labels: dict[str, float] = facts["labels"] or {}
         self.spaces: Spaces = facts["spaces"] or Spaces()
-        self.model = accelerate(WorldModel(config.model, action_dim, self.labels, spaces=self.spaces).to(device))
+        with torch.random.fork_rng(devices=[]):  # the weights come with each round
+            model = WorldModel(config.model, action_dim, self.labels, spaces=self.spaces)
+        self.model = accelerate(model.to(device))
         noise, correlation = config.collection.noise_std, config.collection.noise_correlation
         planner, goal_planner = (
             PlanningAgent(self.model, config, discount, noise_std=noise, noise_correlation=correlation)
@@ -361,15 +363,22 @@ class Collector:
     def _play(self, agent: Any, seeds: Sequence[int], on_step: OnStep | None = None) -> list[Episode]:
         """Whole episodes of an agent; an episode in which the environment failed is played again.
 
+        The second try has the same start. Later ones have starts that derive from it and from the number of the try, as
+        an environment may fail from one start alone.
+
         Raises:
             EnvironmentFault: The environment failed more often than the budget of restarts allows.
         """
         played: list[Episode] = []
+        tries = 0
         while len(played) < len(seeds):
-            before = self.restarts.count
+            before, seed = self.restarts.count, seeds[len(played)]
+            start = seed if tries < 2 else derive_seed(seed, "evaluation try", tries)
             try:
-                played += run_episodes(self._eval_env, agent, [seeds[len(played)]], on_step=None if played else on_step)
+                played += run_episodes(self._eval_env, agent, [start], on_step=None if played else on_step)
+                tries = 0
             except EnvironmentFault:
+                tries += 1
                 if self.restarts.count == before:
                     raise
         return played

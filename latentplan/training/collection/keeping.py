@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import gymnasium
 import numpy as np
 
-from latentplan.config import EnvConfig, UserError, make_folder
+from latentplan.config import Config, EnvConfig, UserError, make_folder
 from latentplan.config.extras import require_extra
+from latentplan.config.files import read_config
 from latentplan.envs.spaces import Actions, Interface
 from latentplan.envs.vector import read_own_facts
 from latentplan.training.demonstrations.episode_file import write_episode
@@ -32,13 +34,14 @@ class EpisodeKeeper:
         num_envs: Number of environments.
 
     Raises:
-        UserError: The folder cannot be made.
+        UserError: The folder cannot be made, or a file cannot hold the names of pictures and vectors.
     """
 
     def __init__(
         self, folder: Path, env: EnvConfig, interface: Interface, labels: tuple[str, ...], num_envs: int
     ) -> None:
         require_extra("keeping episodes", "h5py")
+        _check_names([*interface.pictures, *(name for name, _ in interface.vectors)])
         make_folder(folder)
         self.folder, self._env, self._interface, self._quantities = folder, env, interface, labels
         self._actions = Actions(interface.action_space)
@@ -142,7 +145,41 @@ def refuse_used_folder(folder: Path) -> None:
         UserError: The folder holds episodes.
     """
     if folder.is_dir() and list_episode_files(folder):
-        raise UserError(f"{folder} already holds recorded episodes: choose another folder to keep episodes in")
+        raise UserError(
+            f"{folder} already holds recorded episodes: choose another folder to keep episodes in "
+            "(collection.keep_episodes)"
+        )
+
+
+def _check_names(names: Sequence[Any]) -> None:
+    """Refuses names of observations that are no names of HDF5, where a slash begins a group."""
+    for name in names:
+        parts = name.split("/") if isinstance(name, str) else [""]
+        if not set(parts).isdisjoint(("", ".", "..")):
+            raise UserError(f"episodes cannot be kept: a file cannot hold an observation of the name {name!r}")
+        if any(other != name and str(other).startswith(f"{name}/") for other in names):
+            raise UserError(f"episodes cannot be kept: the observation {name!r} is named like a folder of others")
+
+
+def check_kept(config: Config, copy: Path | None, *, has_other_ranks: bool) -> None:
+    """Refuses a run that resumes and would replace episodes that are kept.
+
+    A run that resumes repeats the episodes after its last save, and replaces their files by equal ones. In a folder
+    that it has not used, or with another number of processes, it would replace other episodes.
+
+    Args:
+        config: Settings of the run.
+        copy: File of its settings in its last save; None where there is none.
+        has_other_ranks: Whether another number of processes learns than before.
+
+    Raises:
+        UserError: The folder holds episodes.
+    """
+    folder = config.collection.keep_episodes
+    if folder is None:
+        return
+    if has_other_ranks or copy is None or read_config(copy).collection.keep_episodes != folder:
+        refuse_used_folder(Path(folder))
 
 
 def _known(info: dict[str, Any]) -> np.ndarray | None:

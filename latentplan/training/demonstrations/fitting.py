@@ -98,6 +98,11 @@ class FittedRecording:
             if self.target.labels:
                 assert episode.quantities is not None
                 labels = np.asarray(episode.quantities, np.float32)
+                if labels.shape != (len(moments), len(self.target.labels)) or not np.isfinite(labels).all():
+                    raise UserError(
+                        f"{self.recording.path}: quantities of episode {index} must be finite, "
+                        f"{len(self.target.labels)} numbers for each of {len(moments)} frames"
+                    )
             if self.target.interface.vectors:
                 vectors = np.stack([self._observations.read_vectors(moment) for moment in moments])
                 labels = np.concatenate([labels, vectors], axis=1)

@@ -11,11 +11,13 @@ import pytest
 import torch
 
 from latentplan.commands.shell import run_guarded
-from latentplan.config import EnvironmentFault
+from latentplan.config import EnvironmentFault, derive_seed
+from latentplan.evaluation.episodes import episode_seed
 from latentplan.training import resume, train
 from latentplan.training.collection.collector import Collector
 from latentplan.training.run import _Run
 from tests.envs.faulty import Faulty
+from tests.training.dot import Dot
 from tests.training.run_folder import list_saves, read_state
 
 pytestmark = pytest.mark.filterwarnings("ignore:.*its episode is cut short:RuntimeWarning")
@@ -119,6 +121,30 @@ def test_evaluation_plays_an_episode_again_when_its_environment_fails(collect, t
     other.close()
     assert other.restarts.count == 1
     assert [len(returns[mode]) for mode in returns] == [2, 2] and returns == expected
+
+
+class Brittle(Dot):
+    """Fails at the third step of the episode with one seed, as often as it is played."""
+
+    bad = episode_seed(derive_seed(0, "evaluation"), 0)
+
+    def reset(self, *, seed=None, options=None):
+        self.fails = seed == self.bad
+        return super().reset(seed=seed, options=options)
+
+    def step(self, action):
+        if self.fails and self.steps == 2:
+            raise ZeroDivisionError("the simulation diverged")
+        return super().step(action)
+
+
+@pytest.mark.filterwarnings("ignore:.*the simulation diverged:RuntimeWarning")
+def test_evaluation_takes_another_start_where_the_environment_always_fails(tiny):
+    collector = Collector(tiny("", collection={"max_restarts": 9}), Brittle, "cpu")
+    returns = collector.evaluate(2)
+    collector.close()
+    assert [len(returns[mode]) for mode in returns] == [2, 2]
+    assert collector.restarts.count == 4  # two tries of the planner and two of the actor
 
 
 def read_metrics(folder):

@@ -10,7 +10,7 @@ import pytest
 
 from latentplan.config import EnvConfig, UserError
 from latentplan.envs import wrap_user_env
-from latentplan.training.collection.keeping import KeepingEnv
+from latentplan.training.collection.keeping import EpisodeKeeper, KeepingEnv
 from latentplan.training.demonstrations.episode_file import EpisodeFile, write_episode
 from latentplan.training.demonstrations.fitting import FittedRecording, fit_all
 from latentplan.training.demonstrations.opening import open_recordings
@@ -163,6 +163,24 @@ def test_other_steps_cameras_and_tasks_are_noticed(folder):
         fit_all(recordings, aim, 21)
     with pytest.warns(RuntimeWarning, match=r"user-Dot, and this run learns dm_control-user-Other: .*\(2 of 2"):
         fit_all(recordings, replace(aim, env=replace(aim.env, task="Other")), 5)
+
+
+@pytest.mark.parametrize("values", [np.full((21, 1), np.nan), np.zeros((20, 1)), np.zeros((21, 2))])
+def test_quantities_that_do_not_fit_are_refused_in_one_line(values, folder, tmp_path):
+    aim = target(TwoParts, vectors=("place",))
+    episode = replace(open_recordings([str(folder)])[0].read(0), quantities=values)
+    write_episode(tmp_path / "one.hdf5", episode, aim.interface, ("speed",), CONFIG)
+    fitted = FittedRecording(EpisodeFile(tmp_path / "one.hdf5"), replace(aim, labels=("speed",)))
+    with pytest.raises(UserError, match="quantities of episode 0 must be finite, 1 numbers for each of 21 frames"):
+        fitted.read(0)
+
+
+@pytest.mark.parametrize("names", [("cam", "cam/wrist"), (".",), ("/",), ("a//b",), (0, 1)])
+def test_names_that_a_file_cannot_hold_are_refused_before_an_episode(names, tmp_path):
+    interface = replace(target().interface, pictures=names)
+    with pytest.raises(UserError, match="episodes cannot be kept: .*observation"):
+        EpisodeKeeper(tmp_path / "kept", CONFIG, interface, (), 1)
+    assert not (tmp_path / "kept").exists()
 
 
 def test_used_folder_is_refused(folder):

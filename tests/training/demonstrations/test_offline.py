@@ -14,6 +14,8 @@ from latentplan.config.run_results import read_evaluations
 from latentplan.replay.disk import count_saved
 from latentplan.training import resume, saving, train
 from latentplan.training.callbacks import Collect
+from latentplan.training.collection import keeping
+from latentplan.training.collection.keeping import check_kept
 from latentplan.training.demonstrations.fitting import FittedRecording
 from latentplan.training.demonstrations.opening import open_recordings
 from tests.training.demonstrations.recorded import target, write_minari
@@ -70,6 +72,43 @@ def test_resumed_run_keeps_the_same_episodes(kept, tiny, dot, tmp_path, interrup
 def test_new_run_refuses_a_folder_with_episodes(kept, tiny, dot, tmp_path):
     with pytest.raises(UserError, match="already holds recorded episodes"):
         train(tiny(tmp_path / "run", collection={"keep_episodes": str(kept[1])}), dot)
+
+
+def test_resumed_run_refuses_a_folder_with_episodes_of_others(kept, tiny, dot, tmp_path):
+    before = {path.name: path.read_bytes() for path in kept[1].iterdir()}
+    run, own = tmp_path / "run", tmp_path / "episodes"
+    train(tiny(run, run={"seed": 7}, collection={"keep_episodes": str(own)}), dot)
+    text = (run / "config.yaml").read_text()
+    (run / "config.yaml").write_text(text.replace(str(own), str(kept[1])))
+    with (
+        pytest.warns(RuntimeWarning, match="was edited"),
+        pytest.raises(UserError, match=f"{kept[1]} already holds recorded episodes"),
+    ):
+        resume(run, frames=120, make_env=dot)
+    assert {path.name: path.read_bytes() for path in kept[1].iterdir()} == before
+    copy = list_saves(run)[-1] / "config.yaml"
+    check_kept(read_config(copy), copy, has_other_ranks=False)
+    with pytest.raises(UserError, match=f"{own} already holds recorded episodes"):
+        check_kept(read_config(copy), copy, has_other_ranks=True)
+
+
+def test_run_whose_episodes_cannot_be_written_is_saved(tiny, dot, tmp_path, monkeypatch):
+    config = tiny(tmp_path / "run", collection={"keep_episodes": str(tmp_path / "episodes"), "overlap": False})
+    write, written = keeping.write_episode, []
+
+    def write_two(path, *arguments):
+        if len(written) == 2:
+            raise UserError(f"the episode {path} cannot be written: No space left on device")
+        written.append(path)
+        write(path, *arguments)
+
+    with monkeypatch.context() as patched:
+        patched.setattr(keeping, "write_episode", write_two)
+        with pytest.raises(UserError, match=r"No space left on device; the run is saved in .*run"):
+            train(config, dot)
+    assert read_state(tmp_path / "run")["run"]["env_frames"] > 0
+    assert resume(tmp_path / "run", make_env=dot).exit_code == 0
+    assert len(list((tmp_path / "episodes").iterdir())) == 4
 
 
 def test_offline_run_learns_evaluates_and_counts_no_frames(kept, tiny, dot, tmp_path):
