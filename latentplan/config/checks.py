@@ -128,6 +128,15 @@ def output_file(path: Path, flag: str) -> Path:
     return path
 
 
+def is_utf8(text: str) -> bool:
+    """Whether a text has an encoding in UTF-8; the name of a file whose bytes are no UTF-8 has none."""
+    try:
+        text.encode()
+    except UnicodeEncodeError:
+        return False
+    return True
+
+
 def _check_name(path: Path, flag: str, given: str) -> None:
     try:
         path.lstat()

@@ -16,6 +16,7 @@ import cv2
 import numpy as np
 
 from latentplan.config import UserError
+from latentplan.config.checks import is_utf8
 from latentplan.reporting.frame import Frame
 
 CODECS = {".mp4": "vp09", ".webm": "VP90"}
@@ -104,18 +105,9 @@ def check_video_path(path: str | os.PathLike[str]) -> Path:
     checked = Path(path)
     if checked.suffix not in CODECS:
         raise UserError(f"a film's name must end in {' or '.join(CODECS)}, got {checked.name!r}")
-    if not _is_readable_by_opencv(checked):
+    if not is_utf8(str(checked.absolute())):  # OpenCV would end the process
         raise UserError(f"a film's path must be UTF-8, got {str(checked.absolute())!r}")
     return checked
-
-
-def _is_readable_by_opencv(path: Path) -> bool:
-    """Whether OpenCV, which ends the process where a path is not UTF-8, can be given the absolute path."""
-    try:
-        str(path.absolute()).encode()
-    except UnicodeEncodeError:
-        return False
-    return True
 
 
 def _check_film(path: Path, size: tuple[int, int], num_frames: int) -> None:
@@ -159,7 +151,7 @@ def read_frames(path: Path, num: int) -> list[Frame]:
     Raises:
         OSError: The film cannot be read.
     """
-    if not _is_readable_by_opencv(path):
+    if not is_utf8(str(path)):  # OpenCV would end the process
         raise OSError(f"the path of the film {str(path)!r} is not UTF-8")
     capture = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG)
     frames: list[Frame] = []

@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from latentplan.config import USER_DOMAIN, Config, EnvConfig, RunConfig, UserError
-from latentplan.config.checks import shown
+from latentplan.config.checks import is_utf8, shown
 from latentplan.config.env_id import is_by_id
 from latentplan.config.extras import EXTRAS, require_extra
 from latentplan.config.parsing import raise_unknown
@@ -174,8 +174,8 @@ def check_folder(run_dir: str, flag: str = "--run-dir") -> None:
     """
     if run_dir == "":
         raise UserError(f"{flag} must name a folder, got an empty text")
-    if not run_dir.isprintable() and any("\ud800" <= character <= "\udfff" for character in run_dir):
-        raise UserError(f"{flag} must be UTF-8, got {run_dir!r}")  # settings are written as UTF-8
+    if not is_utf8(run_dir):  # as the settings, which hold it
+        raise UserError(f"{flag} must be UTF-8, got {run_dir!r}")
     folder = Path(run_dir).absolute()
     try:
         existing = next(path for path in (folder, *folder.parents) if path.exists())

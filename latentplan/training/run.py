@@ -402,7 +402,8 @@ class _Run:
         batches = ReplayBatches(self.replay, self.config, self.curriculum, self.learner)
         self.console.start(self.learner.updates)
         try:
-            with contextlib.suppress(SIGTERMException), torch.random.fork_rng(devices=[]):  # a signal before `Stop`
+            # SIGTERMException is that of a signal before `Stop` has begun; `signals` has the signal too.
+            with contextlib.suppress(SIGTERMException), torch.random.fork_rng(devices=[]):
                 trainer.fit(self.learner, datamodule=ReplayData(batches))
         finally:
             self.console.stop()
