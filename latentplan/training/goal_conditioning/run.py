@@ -152,7 +152,10 @@ def _load_or_play(
     if (agent / RUN_FILE).exists() and (agent / SAVES_FOLDER).exists():
         save, problems = run_saves(agent).newest()
         warn_of_loss(save, problems)
-        return load_replay(save, model)
+        replay = load_replay(save, model)
+        if len(replay) == 0:
+            raise UserError(f"{agent} has collected nothing that goals could be learned from: train it for longer")
+        return replay
     origin = {"sha256": sha256, "seed": settings.seed, "play_decisions": settings.play_decisions}
     played = Saves(folder / PLAYED_FOLDER, "replay", REPLAY_FORMAT)
     if played.exist():

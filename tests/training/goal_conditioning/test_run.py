@@ -238,6 +238,15 @@ def test_learn_goals_refuses_folders_and_agents_it_cannot_use(run, finished, tin
     assert "goals" in read_info(tmp_path / "c")
 
 
+def test_learn_goals_refuses_a_run_that_has_collected_nothing(run, tmp_path, monkeypatch):
+    def load_nothing(save, model):
+        return Replay(ROWS, 1, model.config.deter_dim, 1, torch.device("cpu"), len(model.labels))
+
+    monkeypatch.setattr(goal_run, "load_replay", load_nothing)
+    with pytest.raises(UserError, match="has collected nothing that goals could be learned from"):
+        learn_goals(run, tmp_path / "out", SETTINGS)
+
+
 @pytest.mark.parametrize(
     ("spaces", "words"),
     [(Spaces(vector_dim=2), "from pictures alone, without env.vectors"), (Spaces((3,)), "continuous actions only")],
