@@ -16,11 +16,12 @@ from typing import TYPE_CHECKING, Any
 
 from latentplan.commands.flags import overrides
 from latentplan.commands.shell import ComputeRequest, check_search, read_search, saved_config, search_settings
-from latentplan.config import EnvConfig, PlannerConfig, UserError, to_dict
+from latentplan.config import USER_DOMAIN, EnvConfig, PlannerConfig, UserError, to_dict
 from latentplan.config.checks import MAX_EPISODES, above_zero, at_least, one_of, within
-from latentplan.config.env_id import ENV_FLAGS, EnvChoice, choose_env, is_by_id
+from latentplan.config.env_id import ENV_FLAGS, EnvChoice, choose_env, is_by_id, require_imported
 from latentplan.config.origin import present_facts
 from latentplan.config.parsing import option
+from latentplan.config.suites import check_task
 from latentplan.config.writing import write_whole
 
 if TYPE_CHECKING:
@@ -140,6 +141,7 @@ def run(request: Request) -> int:
     info = read_info(request.checkpoint)
     config = saved_config(request.checkpoint, info)
     chosen = choose_env(config.env, request.env)
+    check_env(chosen)
     planner = search_settings(config, request.planner)
     if request.mode in planning_modes():
         check_search(planner, config.model)
@@ -208,6 +210,17 @@ def open_env(config: EnvConfig, info: dict[str, Any]) -> Any:
         env.close()
         raise
     return env
+
+
+def check_env(config: EnvConfig) -> None:
+    """Refuses an environment that does not exist, or whose module nobody has imported, before torch is imported.
+
+    Raises:
+        UserError: There is no such environment, or its module has to be named again.
+    """
+    if config.domain != USER_DOMAIN:
+        check_task(config.suite, config.domain, config.task)
+        require_imported(config)
 
 
 def check_expressions(objective: str | None, constraint: str | None, domain: str) -> None:

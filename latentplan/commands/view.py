@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from latentplan.commands.evaluate import check_expressions, list_modes, open_env
+from latentplan.commands.evaluate import check_env, check_expressions, list_modes, open_env
 from latentplan.commands.flags import overrides
 from latentplan.commands.shell import ComputeRequest, check_search, read_search, saved_config, search_settings
 from latentplan.config import PlannerConfig
@@ -91,6 +91,7 @@ def run(request: Request) -> int:
     info = read_info(request.checkpoint)
     config = saved_config(request.checkpoint, info)
     chosen = choose_env(config.env, request.env)
+    check_env(chosen)
     check_search(search_settings(config, request.planner), config.model)
     check_expressions(request.objective, request.constraint, chosen.domain)
     from latentplan.view.access import listen

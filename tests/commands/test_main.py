@@ -11,6 +11,7 @@ import pytest
 import yaml
 
 from latentplan import __version__
+from latentplan.agents.checkpoint import seal_checkpoint
 from latentplan.agents.files import write_files
 from latentplan.commands.flags import GENERAL_FLAGS
 from latentplan.commands.main import COMMANDS, SHELLS, main
@@ -93,6 +94,12 @@ def test_agents_and_their_settings_are_refused_before_torch_is_imported(run_pyth
         words += [["eval", *good, *flags], ["distill", *good, *flags]]
     words += [["eval", *good, flag, "nonsense ->"] for flag in ("--objective", "--constraint")]
     words += [["eval", *good, "--control-hz", "50", "--latency", str(tmp_path)]]
+    elsewhere = shutil.copytree(checkpoint, tmp_path / "elsewhere")
+    info = json.loads((elsewhere / "info.json").read_text())
+    info["config"]["env"]["domain"] = "nowhere"
+    (elsewhere / "info.json").write_text(json.dumps(info))
+    seal_checkpoint(elsewhere)
+    words += [["eval", "--checkpoint", str(elsewhere)]]
     code = (
         "import sys\nfrom latentplan.commands.main import main\n"
         f"for words in {words!r}:\n"
