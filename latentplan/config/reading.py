@@ -75,7 +75,7 @@ def read_yaml(path: Path) -> Any:
     text = read_text(path)
     loader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
     try:
-        if (reason := _find_excess(text) or _find_repetition(text)) is not None:
+        if (reason := _find_excess(text)) is not None:
             raise UserError(f"cannot read {path}: {reason}")
         return yaml.load(text, Loader=loader)  # a safe loader makes plain values only
     except yaml.YAMLError as error:
@@ -139,46 +139,41 @@ def is_shallow(text: str) -> bool:
     import yaml
 
     try:
-        return _find_excess(text) is None
+        return _find_excess(text, may_repeat=True) is None
     except (ValueError, yaml.YAMLError):
         return True  # the parser stops at the same place, before the text is deep
 
 
-def _find_excess(text: str) -> str | None:
-    """Why a YAML text may not be parsed: nesting and aliases make small texts deep or large; None if it may.
+def _find_excess(text: str, *, may_repeat: bool = False) -> str | None:
+    """Why a YAML text may not be parsed; None if it may.
 
-    Events are read one by one, without recursion. A parser that builds values recurses, in C without a limit.
+    Nesting and aliases make small texts deep or large, and of a key that a mapping gives twice a parser keeps the last
+    value in silence. Events are read one by one, without recursion. A parser that builds values recurses, in C without
+    a limit.
+
+    Args:
+        text: The text.
+        may_repeat: Whether a mapping may give a key twice.
     """
     import yaml
 
-    depth = 0
+    keys: list[set[str] | None] = [None]  # of each open collection; None of a list
+    is_value = [False]  # whether the next node of each is the value of a key
     for event in yaml.parse(text, Loader=getattr(yaml, "CSafeLoader", yaml.SafeLoader)):
         if isinstance(event, yaml.AliasEvent):
             return f"it has an alias (*{event.anchor}); write the value out"
-        depth += isinstance(event, yaml.CollectionStartEvent) - isinstance(event, yaml.CollectionEndEvent)
-        if depth > DEEPEST:
-            return f"it is nested more than {DEEPEST} levels deep"
-    return None
-
-
-def _find_repetition(text: str) -> str | None:
-    """Which key a mapping of a YAML text gives twice, of which a parser would keep the last; None if there is none."""
-    import yaml
-
-    keys: list[set[str] | None] = [None]  # of the open collections; None of a list
-    is_value = [False]  # whether the next node of each is the value of a key
-    for event in yaml.parse(text, Loader=getattr(yaml, "CSafeLoader", yaml.SafeLoader)):
         if isinstance(event, yaml.CollectionEndEvent):
-            keys.pop()
-            is_value.pop()
+            keys.pop(), is_value.pop()
         elif isinstance(event, yaml.NodeEvent):
             known = keys[-1]
             if known is not None and not is_value[-1] and isinstance(event, yaml.ScalarEvent):
-                if event.value in known:
+                if event.value in known and not may_repeat:
                     return f"line {event.start_mark.line + 1} gives {shown(event.value)} a second time"
                 known.add(event.value)
             is_value[-1] = known is not None and not is_value[-1]
             if isinstance(event, yaml.CollectionStartEvent):
                 keys.append(set() if isinstance(event, yaml.MappingStartEvent) else None)
                 is_value.append(False)
+                if len(keys) - 1 > DEEPEST:
+                    return f"it is nested more than {DEEPEST} levels deep"
     return None

@@ -42,7 +42,7 @@ KEPT_BATCHES = 10
 
 
 def name_save(error: Exception, folder: Path) -> Exception:
-    """The error that ended a run which has been saved, with the folder of the run where the user is at fault."""
+    """The error that ended a run which has been saved; the line that a user reads names the folder of the run."""
     if isinstance(error, EnvironmentFault):
         return EnvironmentFault(f"{error}; the run is saved in {folder}", error.origin)
     return UserError(f"{error}; the run is saved in {folder}") if isinstance(error, UserError) else error
