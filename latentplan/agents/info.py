@@ -77,6 +77,20 @@ def read_info(path: str | Path) -> dict[str, Any]:
     return read_contents(resolve_checkpoint(path))[0]
 
 
+def require_unchanged(path: str | Path, info: dict[str, Any]) -> None:
+    """Refuses an agent that is no longer the one described, as a training run replaces its best agent.
+
+    Args:
+        path: A checkpoint or a run folder.
+        info: What `read_info` found there before.
+
+    Raises:
+        UserError: Another agent is at the path, or none.
+    """
+    if read_info(path)["sha256"] != info["sha256"]:
+        raise UserError(f"the agent in {path} was replaced meanwhile: call the command again, or give a copy of it")
+
+
 def read_contents(folder: Path, *, is_sealed: bool = True) -> tuple[dict[str, Any], bytes]:
     """The description and the weights of a checkpoint, both checked.
 

@@ -53,6 +53,8 @@ class Request(ComputeRequest):
         at_least(self, seed=0)
         if self.episodes is not None:
             within(self, episodes=(1, MAX_EPISODES))
+        elif self.seed:
+            raise UserError("--seed has no effect without --episodes: no episode is played")
         if not re.fullmatch(r"[a-z0-9][a-z0-9.-]{0,60}", self.licence):
             raise UserError(f"--licence must be an identifier such as mit or apache-2.0, got {shown(self.licence)}")
 

@@ -135,7 +135,7 @@ def run(request: Request) -> int:
     Raises:
         UserError: The checkpoint, an objective, the latency or an output cannot be used.
     """
-    from latentplan.agents.info import read_info
+    from latentplan.agents.info import read_info, require_unchanged
     from latentplan.config.latency import MEASURED, read_durations
 
     info = read_info(request.checkpoint)
@@ -168,6 +168,7 @@ def run(request: Request) -> int:
             env = KeepingEnv(env, request.keep_episodes, world)
         clock = VirtualClock(request.control_hz, latency)
         agent = load_timed_agent(request.checkpoint, request.mode, clock, device, **changes)
+        require_unchanged(request.checkpoint, info)
         about = _describe(request, info, world, planner, goals)
         print(
             f"{about['domain']}-{about['task']}, {request.mode} on {device}, pictures by {about['renderer']}",
@@ -175,7 +176,7 @@ def run(request: Request) -> int:
         )
         played = env if goals is None else score_env(env, goals, agent if request.mode in planning_modes() else None)
         try:
-            return _play_and_report(request, played, agent, about, clock)
+            return _play_and_report(request, played, agent, info, about, clock)
         except BrokenPipeError:
             raise
         except OSError as error:
@@ -248,6 +249,7 @@ def _play_and_report(
     request: Request,
     env: SuiteEnv | ScoredEnv,
     agent: Any,
+    info: dict[str, Any],
     about: dict[str, Any],
     clock: VirtualClock,
 ) -> int:
@@ -280,7 +282,7 @@ def _play_and_report(
                     result["surprised"] = sum(episode.surprised for episode in episodes)
                 _report(request, result)
         if episodes and request.report is not None:
-            _write_page(request, env, result, episodes, film, recorder)
+            _write_page(request, env, info, result, episodes, film, recorder)
     return 130 if interrupted else 0
 
 
@@ -332,6 +334,7 @@ def _watch(
 def _write_page(
     request: Request,
     env: Any,
+    info: dict[str, Any],
     result: dict[str, Any],
     episodes: Sequence[Episode],
     film: Path | None,
@@ -339,13 +342,11 @@ def _write_page(
 ) -> None:
     import numpy as np
 
-    from latentplan.agents.info import read_info
     from latentplan.config.run_results import read_log
     from latentplan.evaluation.statistics import confidence_interval
     from latentplan.reporting.report import ReportData, Returns, render_report
 
     assert request.report is not None
-    info = read_info(request.checkpoint)
     rate, deadline = env.unwrapped.metadata.get("render_fps"), result.get("planner", {}).get("deadline_ms")
     deadlines = {"deadline of the search": deadline, "period of control": 1000.0 / rate if rate else None}
     if request.control_hz is not None:

@@ -12,6 +12,7 @@ from latentplan.config.checks import within
 from latentplan.config.parsing import option
 
 if TYPE_CHECKING:
+    from latentplan.config.run_results import Evaluation
     from latentplan.reporting.runs import RunSummary
 
 SECONDS_IN_A_LOG = 30.0
@@ -46,16 +47,18 @@ def run(request: Request) -> int:
     """
     from latentplan.reporting.runs import format_evaluation, read_run
 
-    num_shown, last_line_s = 0, time.monotonic()
+    shown: set[Evaluation] = set()
+    last_line_s = time.monotonic()
     print_heading = True
     while True:
         seen = read_run(request.folder)
         if print_heading:
             print(f"{seen.task}, seed {seen.config.run.seed}, in {seen.folder}", flush=True)
             print_heading = False
-        for entry in seen.evaluations[num_shown:]:
-            _print(format_evaluation(entry))
-        num_shown = len(seen.evaluations)
+        for entry in seen.evaluations:
+            if entry not in shown:  # a run that goes on replaces its final evaluation
+                _print(format_evaluation(entry))
+        shown.update(seen.evaluations)
         if seen.state != "running":
             _print(_describe(seen) + (f": {seen.reason}" if seen.reason else ""))
             return int(seen.state == "failed")

@@ -150,7 +150,7 @@ def find_state(folder: Path) -> tuple[StateName, str | None]:
         return "failed", cut(str(facts.get("reason") or "unknown"))
     if state in ("finished", "stopped"):
         return state, None
-    return ("finished" if _has_final_evaluation(folder) else "stopped"), None
+    return ("finished" if has_final_evaluation(folder) else "stopped"), None
 
 
 def moment_of(evaluation: Evaluation) -> tuple[int, int]:
@@ -162,7 +162,7 @@ def _is_whole(entry: Mapping[str, Any]) -> bool:
     return all(isinstance(entry.get(name), int | float) for name in Evaluation._fields)
 
 
-def _has_final_evaluation(folder: Path) -> bool:
+def has_final_evaluation(folder: Path) -> bool:
     """Whether the run was evaluated finally after the last frames that it has collected."""
     try:
         return bool(read_facts(folder, FINAL_FILE)["env_frames"] >= read_progress(folder)["env_frames"])

@@ -200,6 +200,8 @@ class ScoredEnv(gymnasium.Wrapper[Any, Any, Any, Any]):
         if phase is not None:
             terms = phase.objective.terms
             score = sum(weight * self._score_term(term, values, reward, picture) for weight, term in terms)
+            if not np.isfinite(score):
+                raise UserError(f"the objective gave a score that is not finite: {score}")
             self.objective_scores.append(float(score))
             degrees = [
                 (clause.text, float(clause_degree(shortfall(clause, values.__getitem__))))

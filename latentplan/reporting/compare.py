@@ -10,7 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from latentplan.config.run_results import comparable_settings
+from latentplan.config import UserError
+from latentplan.config.run_results import comparable_settings, has_final_evaluation
 from latentplan.reporting.page import LARGEST_FILM, Section, figure, film, render_page, table
 from latentplan.reporting.published import published_returns_of
 from latentplan.reporting.runs import RunSummary, format_return
@@ -29,7 +30,8 @@ class Group:
     """Runs that differ in their seeds alone.
 
     Attributes:
-        name: Settings that tell the group from all others; the task where no setting differs.
+        name: Settings that tell the group from all others; the task where no setting differs. The folder of the runs
+            follows where only folders tell two groups apart.
         task: The task as domain-task.
         runs: The runs, by seed.
     """
@@ -42,18 +44,29 @@ class Group:
 def group_runs(runs: Sequence[RunSummary]) -> tuple[list[Group], dict[str, list[Any]]]:
     """Runs in groups, in the order in which they were given, and the settings that differ.
 
+    Runs that repeat the settings and the seed of another run are no further seed: the runs of these settings make one
+    group for each folder that holds them.
+
     Returns:
         The groups; by setting that differs between groups, the value in each group.
+
+    Raises:
+        UserError: Two runs of one folder have the same settings and the same seed.
     """
-    found: list[list[RunSummary]] = []
-    settings: list[dict[str, Any]] = []
+    alike: list[tuple[dict[str, Any], list[RunSummary]]] = []
     for run in runs:
         own = comparable_settings(run.config)
         own.pop(SEED)
-        if own not in settings:
+        members = next((members for known, members in alike if known == own), None)
+        if members is None:
+            alike.append((own, members := []))
+        members.append(run)
+    settings, places, found = [], [], []
+    for own, members in alike:
+        for place, part in _part_by_folder(members):
             settings.append(own)
-            found.append([])
-        found[settings.index(own)].append(run)
+            places.append(place)
+            found.append(part)
     names = list(dict.fromkeys(name for own in settings for name in own))
     differ = {name: [own.get(name) for own in settings] for name in names}
     differ = {name: values for name, values in differ.items() if any(value != values[0] for value in values)}
@@ -63,8 +76,23 @@ def group_runs(runs: Sequence[RunSummary]) -> tuple[list[Group], dict[str, list[
         words = [f"{name.partition('.')[2]} {differ[name][index]}" for name in chosen]
         name = ", ".join(words) + (f" and {len(differ) - len(words)} more" if len(differ) > len(words) else "")
         ordered = sorted(members, key=lambda run: run.config.run.seed)
-        groups.append(Group(name or members[0].task, members[0].task, ordered))
+        groups.append(Group((name or members[0].task) + places[index], members[0].task, ordered))
     return groups, differ
+
+
+def _part_by_folder(runs: list[RunSummary]) -> list[tuple[str, list[RunSummary]]]:
+    """Runs with the same settings, together where no seed repeats, otherwise by the folder that holds them."""
+    if len({run.config.run.seed for run in runs}) == len(runs):
+        return [("", runs)]
+    parts: dict[Path, dict[int, RunSummary]] = {}
+    for run in runs:
+        part = parts.setdefault(run.folder.parent, {})
+        first = part.setdefault(run.config.run.seed, run)
+        if first is not run:
+            raise UserError(
+                f"{first.folder} and {run.folder} have the same settings and the same seed: give one of them"
+            )
+    return [(f" in {folder}", list(part.values())) for folder, part in parts.items()]
 
 
 def _choose_settings(differ: dict[str, list[Any]]) -> list[str]:
@@ -178,10 +206,12 @@ def render_comparison(runs: Sequence[RunSummary], interval: Interval) -> str:
 
 
 def latest_film(folder: Path) -> Path | None:
-    """The film of the final evaluation of a run, or of its latest evaluation; None without a film."""
+    """The film of the latest evaluation of a run; None without a film."""
     films = sorted(path for path in (folder / "videos").glob("*.webm") if not path.name.startswith("."))
     final = folder / "videos" / "final.webm"
-    return final if final in films else films[-1] if films else None
+    others = [path for path in films if path != final]
+    is_latest = final in films and (has_final_evaluation(folder) or not others)
+    return final if is_latest else others[-1] if others else None
 
 
 def _curves(groups: Sequence[Group], interval: Interval) -> list[str]:

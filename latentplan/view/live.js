@@ -23,7 +23,10 @@
     future: showFuture,
     settings: showSettings,
     picture: addPicture,
-    refused: refuse
+    refused: function (reason) {
+      refuse(reason);
+      if (settings) { showChoices(settings); }  // instead of what was refused
+    }
   };
 
   function connect() {
@@ -101,16 +104,12 @@
     if (mode.options.length === 0) {
       given.modes.forEach(function (name) { mode.add(new Option(name)); });
     }
-    mode.value = given.mode;
     find("plans").hidden = given.plans;
-    function fill(name, value) {  // but not where someone types
-      if (document.activeElement !== find(name)) { find(name).value = value; }
-    }
     fill("objective", given.objective);
     fill("constraint", given.constraint);
+    showChoices(given);
     SEARCH.forEach(function (name) {
       var own = given.own[name];
-      fill(name, given.search[name] === null ? "" : given.search[name]);
       find(name).placeholder = own === null ? (name === "deadline_ms" ? "none" : "half of the first") : own;
     });
     if (given.goal_horizon && given.search.horizon === null) {
@@ -128,9 +127,21 @@
     }
   }
 
+  function fill(name, value) {  // but not where someone types
+    if (document.activeElement !== find(name)) { find(name).value = value; }
+  }
+
+  function showChoices(given) {
+    find("mode").value = given.mode;
+    SEARCH.forEach(function (name) { fill(name, given.search[name] === null ? "" : given.search[name]); });
+  }
+
   function addPicture(given) {
+    var known = Array.from(find("gallery").children).some(function (each) { return each.dataset.name === given.name; });
+    if (known) { return; } // a page that opens may be sent a picture twice
     var button = document.createElement("button"), picture = document.createElement("img");
     button.type = "button";
+    button.dataset.name = given.name;
     button.title = "Pursue " + given.name;
     picture.src = given.address;
     picture.alt = "Goal picture " + given.name;

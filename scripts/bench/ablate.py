@@ -55,6 +55,7 @@ def run(request: Request) -> int:
     planner = config.planner
     arms = parse_arms(request.arms, planner)
     device = request.use_device()
+    from latentplan.agents.info import require_unchanged
     from latentplan.evaluation.episodes import episode_seed
 
     seeds = [episode_seed(seed, index) for index in range(episodes)]
@@ -72,6 +73,7 @@ def run(request: Request) -> int:
     outcomes: dict[str, Outcome] = {}
     play = partial(play_arm, checkpoint=checkpoint, seeds=seeds, device=device)
     for outcome in run_in_order(play, arms, workers):
+        require_unchanged(checkpoint, info)
         outcomes[outcome.arm.name] = outcome
         print(f"{outcome.arm.name}: mean return {sum(outcome.returns) / episodes:.1f}", flush=True)
         write_csv(request.csv, episode_rows(list(outcomes.values()), seeds))

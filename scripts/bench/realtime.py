@@ -67,6 +67,7 @@ def run(request: Request) -> int:
     from bench.machine import describe_machine
     from bench.realtime_measurements import Trial
     from latentplan.agents.checkpoint import load_model
+    from latentplan.agents.info import require_unchanged
     from latentplan.envs import make_env
     from latentplan.evaluation.episodes import episode_seed
 
@@ -88,6 +89,7 @@ def run(request: Request) -> int:
     try:
         trial = Trial(checkpoint, device, env, seeds, planner.horizon)
         for part, row in measure_parts(trial, request.parts, request.rates):
+            require_unchanged(checkpoint, info)
             result[part].append(row)
             print(_progress_line(part, row), flush=True)
             write_json(request.json, {**about, **result})

@@ -51,8 +51,8 @@ class Request(ComputeRequest):
         budgets: What is the same for every planner: `evaluations`, `milliseconds`, or both, one after the other.
         samples: Candidates per iteration.
         iterations: Iterations per decision at equal evaluations.
-        budget_ms: Milliseconds per decision at equal time; None takes those of this library's first planner at equal
-            evaluations.
+        budget_ms: Milliseconds per decision at equal time; None takes those of the results of `earlier`, or else those
+            of this library's first planner at equal evaluations.
         timed: Decisions of each planner that are timed, in turns.
         jobs: Libraries that play at once; decisions are always timed alone.
         earlier: Results of earlier calls with other planners or libraries, whose rows join the tables and the result.
@@ -86,6 +86,9 @@ class Request(ComputeRequest):
         for name in () if self.peers == ("none",) else self.peers:
             if name not in PEERS:
                 raise_unknown("peer", name, [*PEERS, "none"])
+        has_budget = self.budget_ms is not None or self.earlier or "milliseconds" not in self.budgets
+        if self.planners == ("none",) and not has_budget:
+            raise UserError("--planners none has no milliseconds to compare with: give --budget-ms or --earlier")
 
     def compared(self) -> dict[str, Any]:
         """The settings that must be the same in results that are compared."""
@@ -151,6 +154,7 @@ class Arm:
 def run(request: Request) -> int:
     """Plays every problem with every planner; prints a table and writes the result after each problem."""
     earlier = [row for path in request.earlier for row in read_rows(path, request)]
+    budgets_ms = {problem: find_budget_ms(request, earlier, problem) for problem in request.problems}
     request.use_device(1)
     import torch
 
@@ -175,7 +179,8 @@ def run(request: Request) -> int:
                 for library, planners in listed.items()
                 for planner, choices in planners.items()
             ]
-            found = compare(arms, request, left_out) + [row for row in earlier if row["problem"] == problem]
+            found = compare(arms, request, budgets_ms[problem], left_out)
+            found += [row for row in earlier if row["problem"] == problem]
             rows += found
             print(f"\n{problem}, {request.seeds} seeds\n{cost_table(found)}", flush=True)
             best += compare_best(rows, problem)
@@ -241,8 +246,34 @@ def select_planners(request: Request, known: dict[str, Any]) -> dict[str, Any]:
     return {name: known[name] for name in request.planners}
 
 
-def compare(arms: Sequence[Arm], request: Request, left_out: dict[str, str]) -> list[dict[str, Any]]:
-    """The rows of one problem: each planner at equal evaluations, then at equal milliseconds."""
+def find_budget_ms(request: Request, earlier: Sequence[dict[str, Any]], problem: str) -> float | None:
+    """Milliseconds of a decision on a problem: those given, or those of earlier results; None where there are none.
+
+    Raises:
+        UserError: Earlier results were measured with different milliseconds, or do not note them.
+    """
+    if request.budget_ms is not None:
+        return request.budget_ms
+    timed = [row for row in earlier if row["problem"] == problem and row["budget"] == "milliseconds"]
+    found = {row.get("budget_ms") for row in timed}
+    if None in found:
+        raise UserError("--earlier names a result of a version that did not note its milliseconds: measure it again")
+    if len(found) > 1:
+        raise UserError(f"--earlier names results with different milliseconds on {problem}: give --budget-ms to each")
+    return found.pop() if found else None
+
+
+def compare(
+    arms: Sequence[Arm], request: Request, budget_ms: float | None, left_out: dict[str, str]
+) -> list[dict[str, Any]]:
+    """The rows of one problem: each planner at equal evaluations, then at equal milliseconds.
+
+    Args:
+        arms: The planners.
+        request: The flags.
+        budget_ms: Milliseconds of a decision; None takes those of the first planner of this library that is left.
+        left_out: Receives the reason of an arm that fails.
+    """
 
     def each(task: Callable[[Arm], Any], among: Sequence[Arm]) -> dict[int, Any]:
         """Results of a task by the arm's identity; libraries work at once, the arms of a library one by one."""
@@ -266,17 +297,20 @@ def compare(arms: Sequence[Arm], request: Request, left_out: dict[str, str]) -> 
     equal = play(base, arms)
     times = take_turns([arm for arm in arms if id(arm) in equal], base, request, left_out)
     arms = [arm for arm in arms if id(arm) in times]
-    if not arms:
-        return []
     rows = [make_row("evaluations", arm, equal, base, times) for arm in arms]
     if "milliseconds" not in request.budgets:
         return rows
-    counts = fit_counts(arms, request.budget_ms or times[id(arms[0])], times, request, left_out)
+    if budget_ms is None:
+        budget_ms = next((times[id(arm)] for arm in arms if arm.library == OURS), None)
+    if budget_ms is None:
+        print("no planner of this library is left, whose milliseconds the others would get", flush=True)
+        return rows if "evaluations" in request.budgets else []
+    counts = fit_counts(arms, budget_ms, times, request, left_out)
     timely = {key: equal[key] for key, count in counts.items() if count == request.iterations}
     timely |= play(counts, [arm for arm in arms if id(arm) in counts and id(arm) not in timely])
     times = take_turns([arm for arm in arms if id(arm) in timely], counts, request, left_out)
     rows = rows if "evaluations" in request.budgets else []
-    return rows + [make_row("milliseconds", arm, timely, counts, times) for arm in arms if id(arm) in times]
+    return rows + [make_row("milliseconds", arm, timely, counts, times, budget_ms) for arm in arms if id(arm) in times]
 
 
 def fit_counts(
@@ -339,14 +373,16 @@ def make_row(
     played: dict[int, Any],
     counts: dict[int, int],
     times: dict[int, float],
+    budget_ms: float | None = None,
 ) -> dict[str, Any]:
-    """One row of the result."""
+    """One row of the result; `budget_ms` is the milliseconds that all planners got, None at equal evaluations."""
     costs = played[id(arm)]["costs"]
     return {
         "problem": arm.problem,
         "planner": arm.planner,
         "library": arm.library,
         "budget": budget,
+        "budget_ms": budget_ms,
         "cost_mean": fmean(costs),
         "cost_sd": stdev(costs),
         "evaluations": played[id(arm)]["evaluations"],

@@ -121,7 +121,7 @@ def _serving(flags: Sequence[str]) -> Iterator[str]:
     """A live view in a program of its own; its address."""
     command = [sys.executable, "-m", "latentplan", "view", *flags]
     environment = {**os.environ, "PYTHONPATH": str(ROOT)}
-    with subprocess.Popen(command, cwd=ROOT, env=environment, stdout=subprocess.PIPE, text=True) as process:
+    with subprocess.Popen(command, env=environment, stdout=subprocess.PIPE, text=True) as process:
         assert process.stdout is not None
         try:
             found = re.search(r"http://\S+", process.stdout.readline() + process.stdout.readline())

@@ -25,10 +25,16 @@ def run_in_order(function: Callable[[Job], Result], jobs: Sequence[Job], workers
     from concurrent.futures import ProcessPoolExecutor
 
     context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(min(workers, len(jobs)), context, _limit_threads) as pool:
-        futures = [pool.submit(function, job) for job in jobs]
-        for future in futures:
+    pool = ProcessPoolExecutor(min(workers, len(jobs)), context, _limit_threads)
+    try:
+        for future in [pool.submit(function, job) for job in jobs]:
             yield future.result()
+    except BaseException:  # an interruption too: no further job begins, and those that run are given up
+        pool.shutdown(wait=False, cancel_futures=True)
+        for process in multiprocessing.active_children():
+            process.terminate()
+        raise
+    pool.shutdown()
 
 
 def _limit_threads() -> None:

@@ -122,6 +122,7 @@ def run(request: Request) -> int:
         check_search(planner, trained.model)
     changes = {name: getattr(planner, name) for name in request.planner}
     device = request.use_device()
+    from latentplan.agents.info import require_unchanged
     from latentplan.evaluation.episodes import episode_seed
     from latentplan.evaluation.goals import goal_env
 
@@ -143,6 +144,7 @@ def run(request: Request) -> int:
     rows: list[dict[str, Any]] = []
     conditions = Conditions(checkpoint, seeds, device, changes, push, trained_for)
     for row in run_in_order(partial(play_job, conditions), jobs, workers):
+        require_unchanged(checkpoint, info)
         rows.append(row)
         print(f"{row['goal']}, {row['player']}: {format_number(row['mean'], row['digits'])}", flush=True)
         write_json(request.json, {**about, "rows": rows})

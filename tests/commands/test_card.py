@@ -83,6 +83,7 @@ def test_film_of_another_origin_is_kept(agent, capsys):
     ("flags", "words"),
     [
         (["--episodes", 0], "--episodes"),
+        (["--seed", 7], "--seed has no effect without --episodes"),
         (["--licence", "My own"], "--licence must be an identifier"),
         (["--env-kwargs", "{}"], "--env-kwargs has no effect"),
     ],

@@ -15,10 +15,11 @@ import pytest
 import torch
 
 from latentplan.agents.checkpoint import load_model, save_checkpoint
+from latentplan.agents.info import read_info
 from latentplan.agents.random import RandomAgent
 from latentplan.config import USER_DOMAIN
 from latentplan.envs import make_env
-from latentplan.evaluation import evaluate_agent
+from latentplan.evaluation import evaluate_agent, timed
 from latentplan.models import WorldModel
 from tests.commands.conftest import CONFIG, count_frames, result_of, run_eval
 
@@ -263,3 +264,18 @@ def test_eval_writes_a_report_and_the_same_results_as_without(tmp_path, checkpoi
     text = page.read_text()
     assert all(f"<h2>{name}</h2>" in text for name in ("Film", "Returns", "Decision time", "Searches", "Provenance"))
     assert [path.name for path in tmp_path.glob("*.webm")] == []
+
+
+def test_agent_that_is_replaced_while_it_is_loaded_is_refused(assert_refused, checkpoint, tmp_path, monkeypatch):
+    agent = shutil.copytree(checkpoint, tmp_path / "agent")
+    load = timed.load_timed_agent
+
+    def replace_and_load(path, *settings, **changes):
+        save_checkpoint(path, WorldModel(CONFIG.model, 1), CONFIG, read_info(checkpoint))  # other random weights
+        return load(path, *settings, **changes)
+
+    monkeypatch.setattr(timed, "load_timed_agent", replace_and_load)
+    assert_refused(
+        ["eval", "--checkpoint", agent, "--episodes", 1, "--device", "cpu"],
+        f"the agent in {agent} was replaced meanwhile",
+    )

@@ -18,9 +18,9 @@ from latentplan.commands.main import main
 from latentplan.config import Config, EnvConfig, PlannerConfig, RunConfig
 from latentplan.config.files import dump_config
 from latentplan.config.run_folder import lock_folder
-from latentplan.config.run_results import find_state, note_state, read_progress
+from latentplan.config.run_results import find_state, note_state, read_facts, read_progress
 from latentplan.evaluation.statistics import confidence_interval
-from latentplan.reporting.compare import group_runs, mean_curve
+from latentplan.reporting.compare import group_runs, latest_film, mean_curve
 from latentplan.reporting.runs import find_runs, read_run
 from latentplan.reporting.svg import Labels, Line, plot_lines
 
@@ -261,3 +261,49 @@ def test_a_run_that_is_compared_alone_is_refused(make_run, capsys):
 def test_find_runs_takes_a_run_itself(make_run):
     runs, problems = find_runs(make_run("run"))
     assert len(runs) == 1 and not problems
+
+
+def test_runs_that_repeat_a_seed_are_compared_by_folder(make_run, tmp_path):
+    names = ("one/seed0", "one/seed1", "two/seed0", "two/seed1", "two/seed2")
+    runs = [read_run(make_run(name, seed=int(name[-1]))) for name in names]
+    groups, differ = group_runs(runs)
+    assert [[run.folder for run in group.runs] for group in groups] == [
+        [tmp_path / name for name in names if name.startswith(folder)] for folder in ("one", "two")
+    ]
+    assert [group.name for group in groups] == [f"cartpole-swingup in {tmp_path / folder}" for folder in ("one", "two")]
+    assert differ == {}
+    assert len(group_runs(runs[1:3])[0]) == 1  # two seeds in two folders
+
+
+def test_compare_refuses_two_runs_of_a_folder_with_the_same_settings_and_seed(make_run, assert_refused):
+    one, two = make_run("one"), make_run("two")
+    assert_refused(["compare", one, two], f"{one} and {two} have the same settings and the same seed: give one of them")
+
+
+def test_watch_prints_the_new_final_evaluation_of_a_run_that_goes_on(make_run, monkeypatch, capsys):
+    folder = make_run("run", (100.0, 200.0))
+
+    def finish(frames, planner):
+        final = {"env_frames": frames, "minutes": 1.0, "updates": frames, "planner": planner, "actor": 0.0}
+        (folder / "final.json").write_text(json.dumps(final))
+
+    def go_on(_):
+        finish(4000, 777.0)
+        note_state(folder, "finished")
+
+    finish(3000, 333.0)
+    monkeypatch.setattr("latentplan.config.run_results.is_locked", lambda folder: read_facts(folder) == {})
+    monkeypatch.setattr("time.sleep", go_on)
+    assert main(["watch", str(folder)]) == 0
+    shown = re.findall(r"([\d,]+) frames .*planner +([\d.]+)", capsys.readouterr().out)
+    assert shown == [("1,000", "100.0"), ("2,000", "200.0"), ("3,000", "333.0"), ("4,000", "777.0")]
+
+
+def test_latest_film_of_a_run_that_goes_on_is_not_the_earlier_final_one(make_run):
+    folder = make_run("run")  # evaluated last at 3,000 frames
+    (folder / "videos").mkdir()
+    for name in ("final.webm", "000003000.webm"):
+        (folder / "videos" / name).touch()
+    for frames, name in ((2000, "000003000.webm"), (3000, "final.webm")):
+        (folder / "final.json").write_text(json.dumps({"env_frames": frames}))
+        assert latest_film(folder).name == name

@@ -131,6 +131,11 @@ def test_scored_env_scores_each_episode_on_its_own(env):
     assert scored.summarize(2)["objective_returns"] == [first, other]
 
 
+def test_score_that_is_not_finite_is_refused(env):
+    with pytest.raises(UserError, match="a score that is not finite: inf"):
+        played(env, "abs(1e200*cart)*1e200")
+
+
 def test_scored_env_reports_each_change_of_the_objective(env):
     changes = []
     goals = read_goals("cart > 0; 250: cart < 0; 260: upright", None, "cartpole")

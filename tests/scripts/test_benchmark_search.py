@@ -200,7 +200,7 @@ class FailingProcess:
 def compare_with(failing):
     arms = [Arm("latentplan", "cem", "lq", FailingProcess(), [{}]), Arm("peer", "A", "lq", failing, [{}])]
     left_out = {}
-    rows = search.compare(arms, search.Request(seeds=2, timed=1, iterations=3, budget_ms=5.0), left_out)
+    rows = search.compare(arms, search.Request(seeds=2, timed=1, iterations=3), 5.0, left_out)
     return [(row["planner"], row["budget"], row["iterations"], row["cost_mean"]) for row in rows], left_out
 
 
@@ -242,6 +242,35 @@ def test_earlier_result_of_other_settings_is_refused_in_one_line(result, tmp_pat
     assert captured.err.count("\n") == 1 and "--earlier" in captured.err and named in captured.err
 
 
+@pytest.mark.parametrize(
+    ("budget_ms", "words"), [(None, "did not note its milliseconds"), (9.0, "different milliseconds on lq")]
+)
+def test_earlier_results_of_other_milliseconds_are_refused_in_one_line(result, tmp_path, capsys, budget_ms, words):
+    paths = tmp_path / "a.json", tmp_path / "b.json"
+    for path, value in zip(paths, (budget_ms, 3.0), strict=True):
+        rows = [row | {"budget_ms": value if row["budget"] == "milliseconds" else None} for row in result["rows"]]
+        path.write_text(json.dumps(result | {"rows": rows}))
+    given = ["--problems", "lq", "--planners", "icem", "--seeds", "2", "--earlier", ",".join(map(str, paths))]
+    assert benchmark.main(["search", *SMALL, *given]) == 2
+    captured = capsys.readouterr()
+    assert captured.err.count("\n") == 1 and words in captured.err
+
+
+def test_planners_get_the_milliseconds_of_earlier_results(result):
+    (budget_ms,) = {row["budget_ms"] for row in result["rows"] if row["problem"] == "lq" and row["budget_ms"]}
+    assert search.find_budget_ms(search.Request(), result["rows"], "lq") == budget_ms
+    assert search.find_budget_ms(search.Request(budget_ms=2.0), result["rows"], "lq") == 2.0
+    assert search.find_budget_ms(search.Request(), [], "lq") is None
+
+
+def test_peers_alone_have_no_milliseconds_of_their_own(capsys):
+    left_out = {}
+    arms = [Arm("peer", "A", "lq", FailingProcess(), [{}])]
+    rows = search.compare(arms, search.Request(seeds=2, timed=1, iterations=3), None, left_out)
+    assert [row["budget"] for row in rows] == ["evaluations"]
+    assert "no planner of this library is left" in capsys.readouterr().out
+
+
 def test_library_that_cannot_be_installed_is_left_out_in_one_line(tmp_path, monkeypatch, capsys):
     (tmp_path / "file").write_text("in the way of an environment")
     monkeypatch.setattr(search, "FOLDER", tmp_path / "file")
@@ -265,6 +294,7 @@ def test_search_refuses_an_unknown_planner_before_it_installs_others(monkeypatch
         (["--seeds", "1"], "--seeds"),
         (["--budgets", "evaluation"], "'evaluations'"),
         (["--budget-ms", "0"], "--budget-ms"),
+        (["--planners", "none"], "--budget-ms"),
         (["--earlier", "no_such.json"], "no_such.json"),
     ],
 )

@@ -27,6 +27,7 @@ from latentplan.training.signals import Signals
 from latentplan.training.sweep.space import Range, Space, as_layer
 
 PART = "latentplan sweep"
+SHARED = ("frames", "minutes", "updates", "seed")  # settings of the run that decide what a trial earns
 TUNE_FOLDER, SETTINGS_FOLDER, SWEEP_FILE, TRIAL_FILE = "tune", "settings", "sweep.json", "trial.json"
 POLL_S = 0.5
 SAVING_S = 60.0  # for a run that was asked to stop
@@ -286,7 +287,7 @@ def _note(sweep: Sweep, shared: RunConfig) -> None:
         "file": sweep.file,
         "given": {name: fields for name, fields in sweep.given.items() if name != "run"},
         "preset": sweep.preset,
-        "frames": shared.frames,
+        **{name: getattr(shared, name) for name in SHARED},
         "env_id": sweep.env_id,
     }
     facts = json.loads(json.dumps(facts, default=str))
@@ -299,7 +300,7 @@ def _note(sweep: Sweep, shared: RunConfig) -> None:
     except (OSError, ValueError):
         raise UserError(f"{path} cannot be read: choose another --out") from None
     for name, value in facts.items():
-        if known.get(name) != value:
+        if known.get(name, value) != value:  # an earlier version noted less
             raise UserError(f"{sweep.folder} holds a sweep with other settings ({name}): choose another --out")
 
 

@@ -2,11 +2,12 @@
 
 import contextlib
 import json
+from dataclasses import replace
 from types import SimpleNamespace
 
 import pytest
 
-from latentplan.config import UserError
+from latentplan.config import RunConfig, UserError
 from latentplan.config.run_results import note_state
 from latentplan.training.sweep import trials
 from latentplan.training.sweep.trials import Sweep, Trial
@@ -61,3 +62,19 @@ def test_run_goes_on_until_its_state_is_finished(sweep, state):
         assert (process is None) == (state == "finished")
         if process is not None:
             process.wait(20.0)
+
+
+@pytest.mark.parametrize("change", [{"frames": 91}, {"seed": 1}, {"minutes": 3.0}, {"updates": 7}])
+def test_sweep_does_not_go_on_with_another_budget_or_seed(sweep, change):
+    trials._note(sweep, RunConfig(frames=90))
+    trials._note(sweep, RunConfig(frames=90))
+    with pytest.raises(UserError, match=rf"a sweep with other settings \({next(iter(change))}\)"):
+        trials._note(sweep, replace(RunConfig(frames=90), **change))
+
+
+def test_sweep_of_a_version_that_noted_less_goes_on(sweep):
+    trials._note(sweep, RunConfig(frames=90, seed=3))
+    path = sweep.folder / trials.SWEEP_FILE
+    known = json.loads(path.read_text())
+    path.write_text(json.dumps({name: known[name] for name in known if name not in ("seed", "minutes", "updates")}))
+    trials._note(sweep, RunConfig(frames=90, seed=3))
