@@ -54,6 +54,8 @@ class Request:
         lay_env(self.settings.get("env", {}), self.env_id)
         if "run_dir" in self.settings.get("run", {}):
             raise UserError("--run-dir is the folder of one run: give --out, the folder of the sweep")
+        if self.settings.get("collection", {}).get("keep_episodes") is not None:
+            raise UserError("--collection.keep_episodes is the folder of one run, and a sweep has several")
 
 
 def run(request: Request) -> int:

@@ -140,14 +140,14 @@ def lock_folder(folder: Path, holder: str = "another process learns") -> Iterato
         raise UserError(f"cannot write to {folder}: {error.strerror}; choose another") from None
     try:
         with contextlib.suppress(OSError):
-            if not _try_lock(lock):
+            if not try_lock(lock):
                 raise UserError(f"{holder} in {folder}: end it first, or choose another folder")
         yield
     finally:
         os.close(lock)
 
 
-def _try_lock(lock: int) -> bool:
+def try_lock(lock: int) -> bool:
     """Locks an open file; whoever asks whether the file is locked holds it for an instant, so a few tries are made."""
     for pause_s in (0.02, 0.05, 0.0):
         try:

@@ -12,7 +12,7 @@ from gymnasium.envs import registration
 from gymnasium.error import DependencyNotInstalled, UnregisteredEnv
 
 from latentplan.config import EnvConfig, UserError
-from latentplan.config.checks import nearest
+from latentplan.config.checks import nearest, shown
 from latentplan.config.env_id import FLAG, require_imported, split_id
 from latentplan.config.extras import describe_missing
 from latentplan.config.reading import read_kwargs
@@ -42,6 +42,7 @@ def make_inner(config: EnvConfig) -> gymnasium.Env[Any, Any]:
         EnvironmentFault: The environment's own code failed.
     """
     name, kwargs = find_id(config), read_kwargs(config.kwargs)
+    _check_kwargs(kwargs)
     if config.pixels == "render":
         kwargs = {"render_mode": MODE, **kwargs}
     try:
@@ -62,6 +63,17 @@ def make_inner(config: EnvConfig) -> gymnasium.Env[Any, Any]:
     if config.pixels == "render":
         _draw_small(env, kwargs, config.frame_size)
     return env
+
+
+def _check_kwargs(kwargs: dict[str, Any]) -> None:
+    """Refuses arguments that are gymnasium's and not the environment's, unless they can be passed on."""
+    for name in ("id", "disable_env_checker"):
+        if name in kwargs:
+            raise UserError(f"--env-kwargs cannot hold {name!r}, which this program sets: leave it out")
+    limit = kwargs.get("max_episode_steps", -1)
+    if type(limit) is not int or limit == 0 or limit < -1:
+        allowed = "a whole number of at least 1, or -1 for no limit"
+        raise UserError(f"--env-kwargs: max_episode_steps must be {allowed}, got {shown(limit)}")
 
 
 def find_id(config: EnvConfig) -> str:

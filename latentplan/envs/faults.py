@@ -135,11 +135,14 @@ def check_end(end: Any, name: str) -> bool:
         EnvironmentFault: The value is not one truth.
     """
     try:
-        return bool(end)
-    except (TypeError, ValueError):
+        value = np.asarray(end)
+    except Exception:  # arrays of other packages may fail in any way
+        value = np.zeros(0)
+    if value.size != 1 or value.dtype.kind not in "biu":
         raise EnvironmentFault(
             f"the environment must return {name} as True or False, got {shown(end)}: return bool({name})"
-        ) from None
+        )
+    return bool(value.item())
 
 
 def check_reset(result: Any, shape: tuple[int, ...]) -> tuple[np.ndarray, dict[str, Any]]:

@@ -75,7 +75,7 @@ class LocalLane:
             self._env = self._make()
         try:
             return _run(self._env, *self._asked)
-        except Exception as error:
+        except (Exception, SystemExit) as error:
             raise describe_failure(error) from error
 
     def restart(self) -> None:
@@ -95,7 +95,7 @@ class LocalLane:
     def _make(self) -> gymnasium.Env[Any, Any]:
         try:
             return self._factory()
-        except Exception as error:
+        except (Exception, SystemExit) as error:
             raise describe_failure(error) from error
 
 
@@ -141,7 +141,9 @@ class ProcessLane:
 
     def restart(self) -> None:
         """See `Lane.restart`."""
-        self.close(timeout=0.0)
+        if self._has_answered:  # it failed, but runs: it can end its simulator
+            self.ask_to_close()
+        self.close(CLOSING_SECONDS if self._has_answered else 0.0)
         self._start()
 
     def ask_to_close(self) -> None:
@@ -164,14 +166,15 @@ class ProcessLane:
         with single_threaded_children():
             self._process.start()
         child_end.close()
-        self._is_started = False
+        self._is_started = self._has_answered = False
 
     def _await_start(self) -> None:
         if not self._is_started:
-            self._facts = self._receive(max(START_SECONDS, self._timeout_s))
+            self._facts = self._receive(max(START_SECONDS, self._timeout_s))()
             self._is_started = True
 
     def _receive(self, timeout_s: float) -> Any:
+        self._has_answered = False
         try:
             if not self._connection.poll(timeout_s):
                 raise EnvironmentFault(
@@ -186,6 +189,7 @@ class ProcessLane:
                 f"the environment's process ended unexpectedly (exit code {code}): look for os._exit, or a crash or a "
                 "lack of memory in native code"
             ) from None
+        self._has_answered = True
         if kind == "ok":
             return value
         raise value
@@ -209,11 +213,14 @@ def _serve(connection: Connection, factory: CloudpickleWrapper) -> None:
     for number in (signal.SIGINT, signal.SIGHUP):  # they reach the whole process group; the parent handles them
         signal.signal(number, signal.SIG_IGN)
     threading.Thread(target=end_with_parent, daemon=True).start()
+    # Python refuses children to a process that ends with its parent, but a simulator may be one.
+    multiprocessing.current_process()._config["daemon"] = False  # type: ignore[attr-defined]
     env: Any = None
     answer: tuple[str, Any]
     try:
         env = factory()
-        answer = "ok", read_facts(env)
+        facts = read_facts(env)
+        answer = "ok", CloudpickleWrapper(lambda: facts)  # a space may be of a class of the script's own
     except BaseException as error:
         answer = "failed", describe_failure(error)
     while True:

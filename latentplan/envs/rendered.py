@@ -73,6 +73,11 @@ class RenderedEnv(gymnasium.Wrapper[Any, Any, Any, Any]):
                 f"{env.render_mode!r} of {env.metadata.get('render_modes', [])}: give it a render() that returns uint8 "
                 "pictures (height, width, 3)"
             )
+        if ONLY_PICTURE in vectors:
+            raise UserError(
+                f"env.vectors cannot name {ONLY_PICTURE!r} with env.pixels render, whose picture has this name: rename "
+                "this entry of the environment's observations"
+            )
         super().__init__(env)
         self.size, self._vectors = size, list(vectors)
         picture = gymnasium.spaces.Box(0, 255, (size, size, 3), np.uint8)

@@ -398,8 +398,10 @@ def resize(picture: np.ndarray, size: int) -> np.ndarray:
     """The picture at another size, a new uint8 array (size, size, 3)."""
     if picture.shape[:2] == (size, size):
         return picture.copy()
-    shrinks = picture.shape[0] >= size and picture.shape[1] >= size
-    return cv2.resize(picture, (size, size), interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR)
+    height, width = (min(side, size) for side in picture.shape[:2])
+    if (height, width) != picture.shape[:2]:  # a side that shrinks is averaged, also where the other one grows
+        picture = cv2.resize(picture, (width, height), interpolation=cv2.INTER_AREA)
+    return cv2.resize(picture, (size, size), interpolation=cv2.INTER_LINEAR)
 
 
 def _read_parts(space: gymnasium.Space[Any], name: str) -> Iterator[_Numbers]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import warnings
+import weakref
 from typing import TYPE_CHECKING, Any
 
 import gymnasium
@@ -19,6 +20,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
 
+_made: weakref.WeakValueDictionary[int, gymnasium.Env[Any, Any]] = weakref.WeakValueDictionary()  # by users' factories
 MAX_DECISIONS = 1000  # decisions of an episode without a time limit, as in the longest episodes of dm_control
 
 
@@ -37,6 +39,12 @@ def make_from(
     def build(config: EnvConfig, seed: int | None = None) -> PixelEnv:
         env = factory()
         _require_env(env, "make_env must return")
+        if _made.get(id(env)) is env:
+            raise UserError(
+                "make_env must return a new environment at each call, and returned the same one twice: episodes of "
+                "evaluation and collection would mix"
+            )
+        _made[id(env)] = env
         return wrap_user_env(env, config.action_repeat, seed, config=config)
 
     return build
@@ -125,9 +133,11 @@ class PixelEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         self._needs_reset = True
         self._decisions = 0
         self.action_repeat = action_repeat
-        limit = env.spec.max_episode_steps if env.spec is not None else None
+        limit: Any = env.spec.max_episode_steps if env.spec is not None else None
         if limit is None and env.has_wrapper_attr("_max_episode_steps"):  # a `TimeLimit` without a spec
             limit = env.get_wrapper_attr("_max_episode_steps")
+        if limit is not None and not 1 <= limit < math.inf:
+            limit = None
         if rate := env.metadata.get("render_fps"):
             self.metadata = {**PixelEnv.metadata, "render_fps": rate / action_repeat}
         self.decisions_per_episode = None if limit is None else math.ceil(limit / action_repeat)
@@ -167,7 +177,7 @@ class PixelEnv(gymnasium.Env[np.ndarray, np.ndarray]):
             terminated, truncated = check_end(terminated, "terminated"), check_end(truncated, "truncated")
             env_frames += 1
         self._decisions += 1
-        truncated = truncated or (self.decisions_per_episode is None and self._decisions == MAX_DECISIONS)
+        truncated = truncated or self._decisions >= (self.decisions_per_episode or MAX_DECISIONS)
         self._needs_reset = terminated or truncated
         return self._to_frame(picture), total, terminated, truncated, self._to_info(info, picture, env_frames)
 

@@ -40,7 +40,7 @@ from latentplan.training.checks import check_folder, check_settings
 from latentplan.training.collection.collector import Description, EnvFactory
 from latentplan.training.collection.crew import Worker, check_memory, make_worker
 from latentplan.training.collection.episodes import Stopped, to_arrays
-from latentplan.training.collection.keeping import check_kept, refuse_used_folder
+from latentplan.training.collection.keeping import check_kept, keep_alone, refuse_used_folder
 from latentplan.training.collection.process import WorkerEnded
 from latentplan.training.console import Progress
 from latentplan.training.demonstrations.seeding import count_rows, read_demonstrations, seed_replay
@@ -192,7 +192,7 @@ def _start(config: Config, folder: Path, make_env: EnvFactory | None, *, resume:
 
 def _lead(config: Config, folder: Path, make_env: EnvFactory | None, ranks: Ranks, *, resume: bool) -> Result:
     """Runs as rank 0, which keeps the folder."""
-    with lock_folder(folder), Signals() as signals:
+    with lock_folder(folder), keep_alone(config.collection.keep_episodes), Signals() as signals:
         remove_leftovers(folder)
         facts = present_facts(config.run.device != "cpu" and torch.cuda.is_available())
         run_id = read_facts(folder).get("run_id") or uuid.uuid4().hex[:8]

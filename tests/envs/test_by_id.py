@@ -127,6 +127,22 @@ def test_rendered_pictures_are_squeezed_whole_and_drawn_once_per_decision():
     assert env.render_large(128).shape == (128, 128, 3)
 
 
+@pytest.mark.parametrize(
+    ("kwargs", "message"),
+    [
+        ('{"disable_env_checker": false}', "--env-kwargs cannot hold 'disable_env_checker'"),
+        ('{"id": "x"}', "--env-kwargs cannot hold 'id'"),
+        ('{"max_episode_steps": "200"}', "max_episode_steps must be a whole number of at least 1, .*, got '200'"),
+        ('{"max_episode_steps": 0}', "max_episode_steps must be a whole number of at least 1, .*, got 0"),
+        ('{"max_episode_steps": true}', "max_episode_steps must be a whole number of at least 1, .*, got True"),
+    ],
+)
+def test_arguments_of_gymnasium_that_cannot_be_passed_on_are_not_blamed_on_the_environment(kwargs, message):
+    with pytest.raises(UserError, match=message) as refusal:
+        make_env(config_of("Slider", kwargs=kwargs))
+    assert "the environment raised" not in str(refusal.value)
+
+
 class Sensed(odd.State):
     """Shows vectors, and a picture that nobody sees where pictures are drawn."""
 
@@ -154,6 +170,7 @@ def test_rendered_pictures_may_have_vectors_beside_them():
     [
         (odd.State, {"vectors": ("place",)}, "'place', but observation_space is Box.*or leave env.vectors empty"),
         (Sensed, {"vectors": ("joints",)}, "'joints', which observation_space lacks; it has gear, place"),
+        (Sensed, {"vectors": ("picture",)}, "env.vectors cannot name 'picture' with env.pixels render"),
         (Sensed, {"vectors": ("gear",)}, r"observation_space\['gear'\].* must be a Box of numbers"),
         (Sensed, {"cameras": ("view",)}, "env.cameras has no effect with env.pixels render.*leave env.cameras out"),
     ],

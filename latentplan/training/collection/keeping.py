@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import contextlib
+import os
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +14,7 @@ import numpy as np
 from latentplan.config import Config, EnvConfig, UserError, make_folder
 from latentplan.config.extras import require_extra
 from latentplan.config.files import read_config
+from latentplan.config.run_folder import try_lock
 from latentplan.envs.spaces import Actions, Interface
 from latentplan.envs.vector import read_own_facts
 from latentplan.training.demonstrations.episode_file import write_episode
@@ -115,6 +118,8 @@ class KeepingEnv(gymnasium.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarra
 
     def __init__(self, env: gymnasium.Env[np.ndarray, np.ndarray], folder: Path | str, config: EnvConfig) -> None:
         super().__init__(env)
+        self._lock = contextlib.ExitStack()
+        self._lock.enter_context(keep_alone(Path(folder)))
         refuse_used_folder(Path(folder))
         facts = read_own_facts(env)
         self._keeper = EpisodeKeeper(Path(folder), config, read_interface(facts), tuple(facts["labels"] or ()), 1)
@@ -136,6 +141,39 @@ class KeepingEnv(gymnasium.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarra
         if terminated or truncated:
             self._keeper.write(0, self._number)
         return frame, reward, bool(terminated), bool(truncated), info
+
+    def close(self) -> None:
+        """Closes the environment; from then on others may keep episodes in the folder."""
+        self._lock.close()
+        super().close()
+
+
+@contextlib.contextmanager
+def keep_alone(folder: Path | str | None) -> Iterator[None]:
+    """A context in which nobody else keeps episodes in a folder, whose files would have the same names.
+
+    On a file system without locks the folder stays unlocked.
+
+    Args:
+        folder: The folder; made if needed. None keeps no episodes.
+
+    Raises:
+        UserError: Another run or environment keeps its episodes there, or the folder cannot be made.
+    """
+    if folder is None:
+        yield
+        return
+    make_folder(Path(folder))
+    opened = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
+    try:
+        with contextlib.suppress(OSError):
+            if not try_lock(opened):
+                raise UserError(
+                    f"something else keeps its episodes in {folder}: end it first, or choose another folder"
+                )
+        yield
+    finally:
+        os.close(opened)
 
 
 def refuse_used_folder(folder: Path) -> None:

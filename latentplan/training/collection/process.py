@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import importlib
 import multiprocessing
 import signal
@@ -66,6 +67,12 @@ class Server:
             return "user_error", error if isinstance(error, EnvironmentFault) else UserError(str(error))
         except Exception:
             return "error", traceback.format_exc()
+
+    def close(self) -> None:
+        """Ends the simulators."""
+        if self._collector is not None:
+            with contextlib.suppress(Exception):  # an environment that failed may fail to close too
+                self._collector.close()
 
 
 def await_answer(future: Future[Answer], should_stop: Callable[[], bool]) -> Any:
@@ -231,7 +238,7 @@ class RemoteWorker:
         """Ends the process, even if a method is still running."""
         if self._process.is_alive():
             self._process.terminate()
-        self._process.join(CLOSING_SECONDS)
+        self._process.join(3 * CLOSING_SECONDS)  # for the environments that collect, then for the one that evaluates
         if self._process.is_alive():
             self._process.kill()
             self._process.join()
@@ -259,13 +266,11 @@ def _serve(
         signal.signal(received, signal.SIG_IGN)
     threading.Thread(target=end_with_parent, daemon=True).start()
     server = Server(config, make_user_env, threads, modules, number)
-    while True:
-        try:
+    try:
+        while True:
             method, arguments = connection.recv()
-        except (EOFError, OSError):
-            return
-        answer = server.answer(method, *arguments)
-        try:
-            connection.send(answer)
-        except OSError:  # the learner has ended
-            return
+            connection.send(server.answer(method, *arguments))
+    except (EOFError, OSError):  # the learner has ended
+        return
+    finally:
+        server.close()

@@ -53,7 +53,9 @@ class MinariDataset:
         except Exception as error:  # files of others, read by another package, may raise anything
             raise self._damage(error) from None
         self._is_single = not isinstance(self._storage.observation_space, gymnasium.spaces.Dict)
-        self.space = name_space(path, self._storage.observation_space)
+        named = name_space(path, self._storage.observation_space).spaces
+        nested = gymnasium.spaces.Dict, gymnasium.spaces.Tuple  # of which nothing can be learned
+        self.space = gymnasium.spaces.Dict({key: part for key, part in named.items() if not isinstance(part, nested)})
         self._action_space = self._storage.action_space
         try:
             self.bounds: np.ndarray | None = Actions(self._action_space).bounds
@@ -71,8 +73,9 @@ class MinariDataset:
         except Exception as error:
             raise self._damage(error) from None
         seen = {ONLY_PICTURE: found["observations"]} if self._is_single else found["observations"]
+        seen = {name: values for name, values in seen.items() if name in self.space.spaces}
         rewards = np.asarray(found["rewards"], np.float64)
-        lengths = {len(values) - 1 for name, values in seen.items() if name in self.space.spaces}
+        lengths = {len(values) - 1 for values in seen.values()}
         if lengths | {len(actions), len(rewards)} != {self.lengths[index]}:
             raise UserError(
                 f"{self.path} is damaged: episode {index} must have {self.lengths[index]} actions and one observation "

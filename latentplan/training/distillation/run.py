@@ -28,9 +28,10 @@ from latentplan.agents.base import ModelAgent
 from latentplan.agents.checkpoint import load_model, resolve_checkpoint, save_checkpoint
 from latentplan.agents.planning import PlanningAgent
 from latentplan.config import USER_DOMAIN, DistillConfig, PlannerConfig, UserError, derive_seed, to_dict
-from latentplan.config.env_id import choose_env, repeat_flag
+from latentplan.config.env_id import choose_env, is_by_id, repeat_flag
 from latentplan.config.run_folder import lock_folder
-from latentplan.envs import make_env, make_from
+from latentplan.envs import make_env
+from latentplan.envs.vector import make_guarded_env
 from latentplan.evaluation.compatibility import refuse_other_spaces
 from latentplan.evaluation.episodes import OnStep, Step, episode_seed, iterate_episodes
 from latentplan.evaluation.statistics import confidence_interval
@@ -228,10 +229,14 @@ class _Distillation:
         self.planner_config = replace(planner or self.config.planner, deadline_ms=None)
         self.planning = PlanningAgent(self.model, self.config, self.info["discount"], planner=self.planner_config)
         self.acting = ActorAgent(self.model, self.config)
-        build = make_env if make_user_env is None else make_from(make_user_env)
         chosen = choose_env(self.config.env, env or {}, must_match=True)
-        self.env = build(chosen, 0)
-        refuse_other_spaces(self.env, f"{chosen.domain}-{chosen.task}", self.model.action_dim, self.model.spaces)
+        is_foreign = make_user_env is not None or is_by_id(chosen)
+        self.env: Any = make_guarded_env(chosen, make_env=make_user_env) if is_foreign else make_env(chosen, 0)
+        try:
+            refuse_other_spaces(self.env, f"{chosen.domain}-{chosen.task}", self.model.action_dim, self.model.spaces)
+        except UserError:
+            self.env.close()
+            raise
         self.state, self.demonstrations = DistillationState(), Demonstrations()
         self.student = Student(cast(Actor, self.model.actor), settings)
         self.initial = self.best = copy.deepcopy(self.model.actor.state_dict())

@@ -1,5 +1,6 @@
 """Workers return results in the order of requests, from this process and from another process."""
 
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -8,6 +9,7 @@ import pytest
 import latentplan
 from latentplan.config import EnvironmentFault, UserError
 from latentplan.training.collection.process import LocalWorker, RemoteWorker
+from tests.envs.test_endings import Plain, count
 
 
 def test_collection_process_imports_no_lightning(run_python):
@@ -37,6 +39,14 @@ def test_remote_worker_collects_in_several_environments_and_ends_its_process(tin
     assert not np.array_equal(collected.rows[0].frames, collected.rows[1].frames)
     assert not process.is_alive()
     assert "Traceback" not in capfd.readouterr().err
+
+
+def test_environments_are_closed_when_their_collection_process_ends(tiny, tmp_path):
+    worker = RemoteWorker(tiny(""), partial(Plain, "", tmp_path))
+    worker.submit("describe")
+    worker.result()
+    worker.close()
+    assert count(tmp_path, "made") == count(tmp_path, "closed") > 0
 
 
 def test_remote_worker_raises_user_errors_and_failures_of_the_collector(tiny, dot):

@@ -105,6 +105,14 @@ def test_episodes_of_all_workers_and_processes_of_a_run_are_read(folder):
         KeepingEnv(wrap_user_env(Dot()), folder, CONFIG)
 
 
+def test_two_environments_may_not_keep_their_episodes_in_one_folder(tmp_path):
+    first = KeepingEnv(wrap_user_env(Dot()), tmp_path / "kept", CONFIG)
+    with pytest.raises(UserError, match="something else keeps its episodes in .*kept"):
+        KeepingEnv(wrap_user_env(Dot()), tmp_path / "kept", CONFIG)
+    first.close()
+    KeepingEnv(wrap_user_env(Dot()), tmp_path / "kept", CONFIG).close()
+
+
 def test_write_that_fails_leaves_the_file_before(folder, monkeypatch):
     path = folder / "episode-000-000001.hdf5"
     before, episode = path.read_bytes(), EpisodeFile(path).read(0)

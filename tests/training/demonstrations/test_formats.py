@@ -51,6 +51,24 @@ def test_vector_of_a_minari_dataset_that_looks_like_a_picture_stays_a_vector(tmp
     assert np.allclose(rows.labels, [each["place"].ravel() for each in play(Grid)[0]])
 
 
+def test_minari_dataset_with_a_nested_observation_is_read_by_its_picture(tmp_path):
+    class Kitchen(TwoParts):
+        observation_space = spaces.Dict(
+            {"camera": PICTURE, "goal": spaces.Dict({name: spaces.Box(0.0, 1.0, (2,)) for name in ("kettle", "slide")})}
+        )
+
+        def picture(self):
+            return {"camera": super().picture()["camera"], "goal": {"kettle": np.ones(2), "slide": np.zeros(2)}}
+
+    def stack(name):
+        return np.stack([each["goal"][name] for each in play(Kitchen)[0]])
+
+    cameras = np.stack([each["camera"] for each in play(Kitchen)[0]])
+    observations = {"camera": cameras, "goal": {"kettle": stack("kettle"), "slide": stack("slide")}}
+    rows = read(write_minari(tmp_path / "minari", Kitchen, 1, changes={"observations": observations}), TwoParts)
+    assert np.array_equal(rows.frames, [resize(picture, 64) for picture in cameras])
+
+
 def test_terminal_state_ends_the_rows_of_an_episode(tmp_path):
     rows = read(write_minari(tmp_path / "minari", terminated=True))
     assert np.flatnonzero(rows.continues == 0.0).tolist() == [19]

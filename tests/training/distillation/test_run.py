@@ -9,7 +9,7 @@ import torch
 
 from latentplan.agents.checkpoint import load_agent, load_model, read_info, save_checkpoint
 from latentplan.agents.planning import PlanningAgent
-from latentplan.config import DistillConfig, PlannerConfig, UserError
+from latentplan.config import DistillConfig, EnvironmentFault, PlannerConfig, UserError
 from latentplan.config.commit import Saves
 from latentplan.config.earlier import ADDED
 from latentplan.config.run_folder import lock_folder
@@ -315,3 +315,12 @@ def test_comparison_keeps_the_actor_that_gains_more_than_the_planner_loses(after
     assert all(word in text for word in words), text
     assert ("contains 0" in text) == ("contains 0" in words)
     assert found.is_better == ("kept: the actor of round 4" in words)
+
+
+def test_environment_that_fails_while_an_agent_is_distilled_is_a_fault_of_its_own(checkpoint, dot, tmp_path):
+    class Failing(dot):
+        def step(self, action):
+            raise ZeroDivisionError("the dot is lost")
+
+    with pytest.raises(EnvironmentFault, match="raised ZeroDivisionError: the dot is lost"):
+        distill(checkpoint, tmp_path / "out", make_env=Failing)

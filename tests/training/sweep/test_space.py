@@ -123,3 +123,8 @@ def test_sweep_refuses_a_mistake_before_its_first_trial(tmp_path, capsys, no_opt
     error = capsys.readouterr().err
     assert error.count("\n") == 1 and re.search(message, error), error
     assert not (tmp_path / "out").exists()
+
+
+def test_sweep_refuses_to_keep_the_episodes_of_several_runs_in_one_folder(tmp_path, capsys):
+    assert sweep(tmp_path, "--frames", "1000", "--collection.keep_episodes", str(tmp_path / "kept")) == 2
+    assert "--collection.keep_episodes is the folder of one run" in capsys.readouterr().err
