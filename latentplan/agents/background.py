@@ -8,6 +8,7 @@ from types import TracebackType
 from typing import Any
 
 import numpy as np
+import torch
 from torch import Tensor
 
 from latentplan.agents.base import ModelAgent
@@ -90,7 +91,7 @@ class BackgroundAgent(ModelAgent):
     def reset(self, mask: np.ndarray | None = None) -> None:
         """Forgets the past of all environments, or only of environments where mask (batch,) is true, and all plans."""
         super().reset(mask)
-        self.scheduler.reset()
+        self.scheduler.reset(None if mask is None else torch.tensor(mask, dtype=torch.bool))
 
     def set_objective(
         self, objective: str | Expression | Term | None = None, constraints: str | Sequence[Constraint] = ()

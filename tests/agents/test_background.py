@@ -11,6 +11,7 @@ from latentplan.agents.actor import ActorAgent
 from latentplan.agents.background import BackgroundAgent
 from latentplan.config import Config, PlannerConfig, UserError
 from latentplan.models import WorldModel
+from latentplan.planning import rate_limit
 from tests.agents.small_agents import SIZES, make_plain_model
 
 CONFIG = Config(
@@ -87,6 +88,17 @@ def test_background_agent_plans_a_batch_together_and_drops_its_plans_at_a_masked
     agent.act(film[6])
     assert agent.last_source == "actor"  # the plans of all environments are dropped
     assert agent.state.deter.shape == (3, 16)
+
+
+def test_masked_reset_keeps_the_rate_limit_of_the_other_environments(model, film):
+    agent, actions = make(model), []
+    agent.set_objective(None, [rate_limit(0.002)])
+    for number, frames in enumerate(film):
+        if number == 6:
+            agent.reset(np.array([False, True, False]))
+        actions.append(agent.act(frames))
+    changes = np.abs(np.diff(actions, axis=0)).max(-1)
+    assert (changes[:, [0, 2]] <= 0.002 + 1e-6).all() and changes[5, 1] > 0.002
 
 
 def test_reset_forgets_the_past_and_the_plans(model, film):

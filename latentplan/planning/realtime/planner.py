@@ -155,6 +155,7 @@ class BackgroundPlanner:
         self.objective, self.constraints = objective, tuple(constraints)
         problem = (planner, model, self.objective, self.constraints)
         self._goals: Goals | bytes | None = None  # sent with the next request
+        self._sent: Goals | bytes | None = None  # with the last request
         self._is_idle, self._is_closed = True, False
         self._ready = threading.Event()
         self._requests: SimpleQueue[Request | None] = SimpleQueue()
@@ -204,8 +205,8 @@ class BackgroundPlanner:
         count_rows(state)  # refuses what is no state, and makes dataclasses in it pytrees
         copied = tree_map(lambda leaf: leaf.detach().clone(), state)
         self._is_idle = False
-        goals, self._goals = self._goals, None
-        self._requests.put(Request(copied, tick, previous, seed, goals))
+        self._sent, self._goals = self._goals, None
+        self._requests.put(Request(copied, tick, previous, seed, self._sent))
         return True
 
     def poll(self) -> tuple[int, Plan] | None:
@@ -226,10 +227,13 @@ class BackgroundPlanner:
             self.process.join(CLOSING_SECONDS)
             self.close()
             code = self.process.exitcode
-            hint = '; a script that plans in a process needs `if __name__ == "__main__":`' if code == 1 else ""
+            is_unguarded = code == 1 and not value  # whether the worker had started
+            hint = '; a script that plans in a process needs `if __name__ == "__main__":`' if is_unguarded else ""
             raise RuntimeError(f"the process that plans has ended unexpectedly (exit code {code}){hint}")
         self._is_idle = True
         if kind == "error":
+            if self._goals is None:  # the request may not have reached the search
+                self._goals = self._sent
             error, traceback = value
             raise error from RuntimeError(f"in the worker that plans:\n{traceback}")
         finished: tuple[int, Plan] = value

@@ -175,7 +175,7 @@ class PlanScheduler:
             action, source = self._act_by_policy(state), "actor"
         else:
             action = self._act_by_plan(state, self.tick, age)
-        self._action = action = self._limit_change(action, state)
+        self._action = action = self._limit_change(action, state, age or 0)
         if self.executor.is_idle:
             self._request(state, action)
         self.tick += 1
@@ -190,11 +190,19 @@ class PlanScheduler:
         self.executor.set_objective(objective, constraints)
         self._follow(*self._find_goals(objective, constraints))
 
-    def reset(self) -> None:
-        """Drops all plans, and the plan of the running request when it arrives."""
+    def reset(self, mask: Tensor | None = None) -> None:
+        """Drops all plans, and the plan of the running request when it arrives.
+
+        Args:
+            mask: Environments whose next action may differ from the last one by any amount, bool (batch,); rate limits
+                hold on in the others. None stands for all environments.
+        """
+        last = self._action
         self.buffer.clear()
         self._nominals, self._failures = {}, {}
         self._requested = self._last = self._action = None
+        if mask is not None and last is not None:
+            self._action = torch.where(mask.to(last.device)[:, None], torch.nan, last)
 
     def _find_goals(
         self, objective: Term | None, constraints: Sequence[Constraint]
@@ -286,11 +294,11 @@ class PlanScheduler:
             return bounds.fit_step(self._acting.policy(state, None), 0)
         return bounds.fit_step(((bounds.low + bounds.high) / 2)[:, 0].expand(count_rows(state), -1), 0)
 
-    def _limit_change(self, action: Tensor, state: State) -> Tensor:
-        """Returns the action, near the last one if there are rate limits; the bounds prevail over the limits."""
+    def _limit_change(self, action: Tensor, state: State, step: int) -> Tensor:
+        """Returns the action, near the last one if there are rate limits; the bounds of its step prevail over them."""
         if not self._limits or self._action is None:
             return action
-        bounds, last = self._bounds(state), self._action
+        bounds, last = self._bounds(state, step), self._action
         largest = find_max_change(self._limits, bounds)
         near = torch.clamp(action, last - largest, last + largest)
         return torch.clamp(torch.where(torch.isnan(last), action, near), bounds.low[:, 0], bounds.high[:, 0])

@@ -104,16 +104,18 @@ def drive_process(
     ready: threading.Event,
 ) -> None:
     """Exchanges messages with the process; runs in a thread, so that the control loop never waits for the pipe."""
+    has_started = False
     try:
         connection.send_bytes(problem)
         started = pickle.loads(connection.recv_bytes())
         if started[0] != "ready":
             answers.put(started)
+        has_started = True
         ready.set()
         while (request := requests.get()) is not None:
             answers.put(_exchange(connection, request))
     except (EOFError, OSError):
-        answers.put(("ended", None))
+        answers.put(("ended", has_started))
     finally:
         ready.set()
         connection.close()
@@ -197,9 +199,17 @@ def _serve(connection: Connection) -> None:
         settle()
         connection.send_bytes(pickle.dumps(("ready", None)))
         while True:
-            connection.send_bytes(pickle.dumps(_answer(search, connection.recv_bytes())))
+            connection.send_bytes(_dump_answer(_answer(search, connection.recv_bytes())))
     except (EOFError, OSError):
         return
+
+
+def _dump_answer(answer: Answer) -> bytes:
+    """Returns an answer as bytes; a plan that cannot be pickled, as of a planner with a lambda in it, is an error."""
+    try:
+        return pickle.dumps(answer)
+    except Exception as error:
+        return pickle.dumps(("error", _make_portable(error)))
 
 
 def _answer(search: _Search, message: bytes) -> Answer:

@@ -1,6 +1,7 @@
 """Goals of a background planner: they are pickled, can change between requests, and are refused if not picklable."""
 
 import pickle
+from typing import NamedTuple
 
 import pytest
 import torch
@@ -105,6 +106,27 @@ def test_poll_raises_until_goals_change_when_the_process_cannot_unpickle_them(pr
     process.set_objective()
     process.request(STATE, 3, seed=3)
     assert wait_for_plan(process)[0] == 3
+
+
+class UnreadableState(NamedTuple):
+    """A state that can be pickled, but not unpickled."""
+
+    x: torch.Tensor
+
+    def __reduce__(self):
+        return refuse, ()
+
+
+def test_goals_reach_the_search_after_a_request_that_could_not_be_read(process):
+    goal = goal_term(torch.tensor([9.0]))
+    process.set_objective(goal)
+    process.request(UnreadableState(STATE), 1)
+    with pytest.raises(ValueError, match="not here"):
+        wait_for_plan(process)
+    process.request(STATE, 2, seed=3)
+    expected = CEM.plan(MODEL, STATE, objective=goal, generator=torch.Generator().manual_seed(3))
+    torch.testing.assert_close(wait_for_plan(process)[1].actions, expected.actions)
+    process.set_objective()
 
 
 def towards_zero(state, generator):

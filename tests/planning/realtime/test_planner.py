@@ -2,11 +2,12 @@
 
 import multiprocessing
 import os
+import pickle
 import signal
 import sys
 import threading
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import pytest
@@ -29,7 +30,7 @@ class StubbornError(Exception):
         super().__init__(f"{first} and {second}")
 
 
-THROWS, THROWS_ODDLY, DIES, HANGS, HANGS_ON = (torch.tensor([[value]]) for value in (101.0, 102.0, 103.0, 104.0, 105.0))
+THROWS, THROWS_ODDLY, DIES, HANGS, HANGS_ON, HOLDS_A_LAMBDA = (torch.tensor([[value]]) for value in range(101, 107))
 
 
 @dataclass
@@ -45,6 +46,9 @@ class Scripted:
         cause = self.trouble if self.trouble is not None and self.num_searches > self.num_good else state
         if torch.equal(cause, THROWS):
             raise KeyError("no such plan")
+        if torch.equal(cause, HOLDS_A_LAMBDA):
+            plan = CEM.plan(model, state, previous, generator=generator)
+            return replace(plan, info={**plan.info, "best": lambda: 0})
         if torch.equal(cause, THROWS_ODDLY):
             raise StubbornError("this", "that")
         if torch.equal(cause, DIES):
@@ -230,6 +234,14 @@ class Unreadable(NamedTuple):
 def test_poll_raises_when_a_state_cannot_be_unpickled_and_the_planner_goes_on(process):
     process.request(Unreadable(STATE), 0)
     with pytest.raises(AttributeError, match="no such class"):
+        wait_for_plan(process)
+    assert process.request(STATE, 1)
+    assert wait_for_plan(process)[0] == 1
+
+
+def test_plan_that_cannot_be_pickled_is_an_error_and_the_planner_goes_on(process):
+    process.request(HOLDS_A_LAMBDA, 0)
+    with pytest.raises((AttributeError, pickle.PicklingError)):
         wait_for_plan(process)
     assert process.request(STATE, 1)
     assert wait_for_plan(process)[0] == 1

@@ -6,6 +6,7 @@ import pytest
 import torch
 
 from latentplan.planning import CEMPlanner, FunctionModel, PlanBuffer, PlanScheduler, learned_return, rate_limit
+from latentplan.planning.realtime.scheduler import NominalTrajectory
 from tests.planning.realtime.integrator import dynamics, policy, reward
 
 HORIZON = 4
@@ -158,6 +159,22 @@ def test_changes_of_a_decision_do_not_reach_the_scheduler(policy, constraints):
         first.mul_(10.0)
         for _, executor in made:
             executor.now += 1.0
+
+
+def test_bounds_of_later_steps_prevail_over_a_rate_limit(model):
+    high = torch.tensor([[1.0], [1.0], [0.5], [0.2]])
+    planner = CEMPlanner(action_dim=1, horizon=HORIZON, num_samples=16, num_elites=4, action_high=high)
+    executor = VirtualExecutor(planner, model, itertools.repeat(9.5))
+    executor.set_objective = lambda *goals: None
+    scheduler = PlanScheduler(planner, model, executor)
+    scheduler.set_objective(None, [rate_limit(0.1)])
+    scheduler.tick = 1
+    scheduler.buffer.submit(torch.ones(1, HORIZON, 1), 1)
+    scheduler._nominals[1] = NominalTrajectory(model, torch.tensor([[5.0]]), torch.ones(1, HORIZON, 1))
+    scheduler._batch = 1
+    decisions = [scheduler.decide(torch.tensor([[5.0]])) for _ in range(HORIZON)]
+    assert [decision.age for decision in decisions] == [0, 1, 2, 3]
+    assert all(decision.action <= high[decision.age] + 1e-6 for decision in decisions)
 
 
 def test_scheduler_ignores_plans_without_a_search(model):
