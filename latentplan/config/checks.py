@@ -70,6 +70,18 @@ def shown(value: Any) -> str:
     return text if len(text) <= SHOWN else f"{text[:SHOWN]}..."
 
 
+def no_text(settings: object, *names: str) -> None:
+    """Refuses a text as the value of settings that are tuples of texts, whose letters would be taken one by one.
+
+    Raises:
+        ValueError: A value is a text.
+    """
+    for name in names:
+        value = getattr(settings, name)
+        if isinstance(value, str):
+            raise ValueError(f"{name} must be a tuple such as ({shown(value)},), got the text {shown(value)}")
+
+
 def nearest(name: object, known: Iterable[str], cutoff: float = 0.5) -> str | None:
     """The known name that is most similar to a name; None where none is similar."""
     found = difflib.get_close_matches(str(name)[:SHOWN], list(known), n=1, cutoff=cutoff)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal, get_args
 
-from latentplan.config.checks import MAX_EPISODES, above_zero, at_least, one_of, within
+from latentplan.config.checks import MAX_EPISODES, above_zero, at_least, no_text, one_of, within
 from latentplan.config.parsing import option
 
 Behaviour = Literal["planner", "actor", "both"]
@@ -161,6 +161,7 @@ class CollectionConfig:
     keep_episodes: str | None = option(None, metavar="DIR")
 
     def __post_init__(self) -> None:
+        no_text(self, "goals")
         one_of(self, behaviour=BEHAVIOURS, backend=COLLECTION_BACKENDS)
         within(self, workers=(1, MAX_WORKERS))
         at_least(self, noise_std=0.0, prefill_decisions=1, round_decisions=1, goals_after=0)

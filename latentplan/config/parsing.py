@@ -18,7 +18,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from latentplan.config.checks import UserError, nearest, shown
+from latentplan.config.checks import UserError, cut, nearest, shown
 from latentplan.config.reading import is_shallow
 
 _TYPE_WORDS = {
@@ -323,6 +323,9 @@ def _wrong_type(setting: Setting, values: Mapping[str, Any], names: Mapping[str,
     if separator:
         text = separator.join(map(str, value)) if isinstance(value, list | tuple) else value
         item = _TYPE_WORDS[typing.get_args(setting.hint)[0]].removeprefix("a ")
+        if isinstance(value, str) and setting.key not in names:  # in a file
+            example = cut(", ".join(part.strip() for part in value.split(separator)))
+            return UserError(f"{name} must be a list of {item}s, such as [{example}], got {shown(value)}")
         return UserError(f"{name} must be {item}s, separated by {separator!r}, got {shown(text)}")
     example = '["speed -> 1.0"]' if str in typing.get_args(setting.hint) else "[16, 32]"
     wanted = " or ".join(_TYPE_WORDS.get(kind, f"a list such as {example}") for kind in alternatives(setting.hint))

@@ -10,7 +10,17 @@ import functools
 from dataclasses import dataclass, field
 from typing import Any, Literal, get_args
 
-from latentplan.config.checks import MAX_EPISODES, MAX_THREADS, UserError, above_zero, at_least, one_of, shown, within
+from latentplan.config.checks import (
+    MAX_EPISODES,
+    MAX_THREADS,
+    UserError,
+    above_zero,
+    at_least,
+    no_text,
+    one_of,
+    shown,
+    within,
+)
 from latentplan.config.earlier import as_saved, drop_removed
 from latentplan.config.learning import CollectionConfig, LearningConfig
 from latentplan.config.parsing import Setting, list_settings, option, take_values
@@ -87,6 +97,7 @@ class EnvConfig:
     vectors: tuple[str, ...] = option((), separator=",")
 
     def __post_init__(self) -> None:
+        no_text(self, "cameras", "vectors")
         read_kwargs(self.kwargs)
         check_frame_size(self.frame_size)
         if len(set(self.vectors)) != len(self.vectors):
@@ -156,6 +167,7 @@ class ReplayConfig:
     demonstrations: tuple[str, ...] = option((), separator=",", metavar="FILE")
 
     def __post_init__(self) -> None:
+        no_text(self, "demonstrations")
         above_zero(self, "capacity")
 
 
@@ -223,6 +235,7 @@ class RunConfig:
     def __post_init__(self) -> None:
         one_of(self, device=DEVICES, strategy=STRATEGIES)
         within(self, devices=(1, MAX_RANKS), nodes=(1, MAX_RANKS))
+        no_text(self, "logger")
         for name in self.logger:
             if name not in LOGGERS:
                 raise ValueError(f"logger must be of {', '.join(LOGGERS)}, got {shown(name)}")

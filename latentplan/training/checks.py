@@ -169,11 +169,16 @@ def check_folder(run_dir: str, flag: str = "--run-dir") -> None:
         flag: The flag that names it, for the error.
 
     Raises:
-        UserError: The name is empty or not UTF-8, a file is in the way, or the folders above may not be read.
+        UserError: The name is empty, begins with `~` or is not UTF-8, a file is in the way, or the folders above may
+            not be read.
         OSError: The name is too long.
     """
     if run_dir == "":
         raise UserError(f"{flag} must name a folder, got an empty text")
+    if run_dir.startswith("~"):
+        raise UserError(
+            f"{flag} {run_dir!r} would be a folder named '~' here: write the home folder out, as in $HOME/runs"
+        )
     if not is_utf8(run_dir):  # as the settings, which hold it
         raise UserError(f"{flag} must be UTF-8, got {run_dir!r}")
     folder = Path(run_dir).absolute()

@@ -12,6 +12,7 @@ from latentplan.config import (
     LearningConfig,
     ModelConfig,
     PlannerConfig,
+    ReplayConfig,
     RunConfig,
     UserError,
     derive_seed,
@@ -130,3 +131,19 @@ def test_override_planner_uses_a_given_horizon_for_goals_too():
     assert override_planner(trained, {"horizon": 9}) == trained | {"horizon": 9, "goal_horizon": None}
     both = {"horizon": 9, "goal_horizon": 12}
     assert override_planner(trained, both) == trained | both
+
+
+@pytest.mark.parametrize(
+    ("kind", "field"),
+    [
+        (EnvConfig, "cameras"),
+        (EnvConfig, "vectors"),
+        (ReplayConfig, "demonstrations"),
+        (RunConfig, "logger"),
+        (CollectionConfig, "goals"),
+    ],
+)
+def test_text_in_place_of_a_tuple_is_refused(kind, field):
+    """Its letters would be taken one by one: camera "10" as cameras 1 and 0."""
+    with pytest.raises(ValueError, match=rf"{field} must be a tuple such as \('top',\), got the text 'top'"):
+        kind(**{field: "top"})

@@ -2,6 +2,7 @@
 
 import ast
 import dataclasses
+import re
 from dataclasses import replace
 
 import pytest
@@ -228,3 +229,16 @@ def test_domains_are_those_of_the_suite(run_python):
 def test_suite_with_a_usual_task_alone_leaves_other_tasks_to_its_factory(monkeypatch):
     monkeypatch.setitem(SUITES, "lamps", Suite("nowhere:Lamp", {"lamp": "bright"}))
     assert check_task("lamps", "lamp") == check_task("lamps", "lamp", "dim") == ("bright",)
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("replay: {demonstrations: episodes}", "replay.demonstrations must be a list of texts, such as [episodes]"),
+        ('run: {logger: "tensorboard,csv"}', "run.logger must be a list of texts, such as [tensorboard, csv]"),
+    ],
+)
+def test_text_in_place_of_a_list_in_a_file_is_refused_with_the_list_to_write(tmp_path, text, words):
+    (tmp_path / "settings.yaml").write_text(text)
+    with pytest.raises(UserError, match=re.escape(words)):
+        compose(read_layer(tmp_path / "settings.yaml"), {}, "cpu")

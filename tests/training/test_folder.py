@@ -45,3 +45,9 @@ def test_check_folder_refuses_a_folder_below_one_that_may_not_be_read(monkeypatc
     monkeypatch.setattr(Path, "exists", refuse)
     with pytest.raises(UserError, match=r"cannot make the folder .*Permission denied: .*choose another --run-dir"):
         check_folder("private/run")
+
+
+@pytest.mark.parametrize("name", ["~/runs/mine", "~"])
+def test_check_folder_refuses_a_tilde_that_nobody_has_expanded(name):
+    with pytest.raises(UserError, match=r"--run-dir '~.*' would be a folder named '~' here"):
+        check_folder(name)

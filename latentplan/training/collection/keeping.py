@@ -5,17 +5,20 @@ from __future__ import annotations
 import contextlib
 import os
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import gymnasium
 import numpy as np
 
-from latentplan.config import Config, EnvConfig, UserError, make_folder
+from latentplan.config import USER_DOMAIN, Config, EnvConfig, UserError, make_folder
 from latentplan.config.extras import require_extra
 from latentplan.config.files import read_config
 from latentplan.config.run_folder import try_lock
+from latentplan.envs.registry import default_task
 from latentplan.envs.spaces import Actions, Interface
+from latentplan.envs.user import PixelEnv
 from latentplan.envs.vector import read_own_facts
 from latentplan.training.demonstrations.episode_file import write_episode
 from latentplan.training.demonstrations.fitting import read_interface
@@ -122,6 +125,10 @@ class KeepingEnv(gymnasium.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarra
         self._lock.enter_context(keep_alone(Path(folder)))
         refuse_used_folder(Path(folder))
         facts = read_own_facts(env)
+        if isinstance(env.unwrapped, PixelEnv) and config.suite == EnvConfig.suite:  # of `wrap_user_env`
+            config = replace(config, domain=USER_DOMAIN)
+        elif config.task is None:
+            config = replace(config, task=default_task(config.domain, config.suite))
         self._keeper = EpisodeKeeper(Path(folder), config, read_interface(facts), tuple(facts["labels"] or ()), 1)
         self._number = 0
 

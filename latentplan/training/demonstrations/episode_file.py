@@ -97,6 +97,7 @@ class EpisodeFile:
             self._pictures: list[str] = json.loads(file.attrs["pictures"])
             self._vectors: list[str] = json.loads(file.attrs["vectors"])
             environment = json.loads(file.attrs["environment"])
+            _refuse_other_files(path, file)
             parts = file["observations"]
             spaces: dict[str, gymnasium.Space[Any]] = {
                 name: gymnasium.spaces.Box(0, 255, parts[name].shape[1:], np.uint8) for name in self._pictures
@@ -128,6 +129,22 @@ class EpisodeFile:
         if lengths != {self.lengths[index]} or episode.actions.ndim != 2:
             raise UserError(f"{self.path} is damaged: its arrays have other lengths than its {self.lengths[0]} actions")
         return episode
+
+
+def _refuse_other_files(path: Path, group: Any) -> None:
+    """Refuses a file of HDF5 that takes its contents from other files, which a stranger could have named.
+
+    Raises:
+        UserError: A part of the file lies elsewhere.
+    """
+    h5py: Any = import_extra("h5py", USER)
+    for name in group:
+        link = group.get(name, getlink=True)
+        part = None if isinstance(link, h5py.ExternalLink | h5py.SoftLink) else group[name]
+        if part is None or (isinstance(part, h5py.Dataset) and (part.external or part.is_virtual)):
+            raise UserError(f"{path} takes {name!r} from elsewhere: an episode file holds all of its data itself")
+        if isinstance(part, h5py.Group):
+            _refuse_other_files(path, part)
 
 
 class _Reading:

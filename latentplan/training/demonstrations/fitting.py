@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from latentplan.config import EnvConfig, EnvironmentFault, UserError
+from latentplan.config import USER_DOMAIN, EnvConfig, EnvironmentFault, UserError
 from latentplan.config.spaces import Spaces
 from latentplan.envs.spaces import ONLY_PICTURE, Actions, Interface, Observations, is_picture
 from latentplan.replay.buffer import Rows
@@ -204,7 +204,7 @@ def fit_all(recordings: Sequence[Recording], target: Target, sequence_length: in
     own = f"{target.env.suite}-{target.env.domain}-{target.env.task}"
     if target.env.objective is not None:
         own += f" with the objective {target.env.objective!r}"
-    others = [each for each in recordings if each.is_own and each.origin != own]
+    others = [each for each in recordings if each.is_own and not _is_same_task(each.origin, own)]
     if others:
         warnings.warn(
             f"{others[0].path} was recorded in {others[0].origin}, and this run learns {own}: its rewards are those of "
@@ -213,6 +213,12 @@ def fit_all(recordings: Sequence[Recording], target: Target, sequence_length: in
             stacklevel=2,
         )
     return fitted
+
+
+def _is_same_task(origin: str, own: str) -> bool:
+    """Whether rewards are those of the same task, or of a user's environment that was wrapped without a name."""
+    by_user = f"{EnvConfig.suite}-{USER_DOMAIN}-"
+    return origin == own or (origin == f"{by_user}{None}" and own.startswith(by_user))
 
 
 def make_target(env: EnvConfig, facts: Mapping[str, object], deter_dim: int) -> Target:

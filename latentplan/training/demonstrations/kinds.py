@@ -42,7 +42,7 @@ def find_recordings(names: Iterable[str]) -> list[Recorded]:
 
 def list_episode_files(folder: Path) -> list[Path]:
     """The episode files of a folder in the order of their names, then those of other workers and processes below it."""
-    return [path for below in BELOW for path in sorted(folder.glob(f"{below}*{SUFFIX}"))]
+    return [path for below in BELOW for path in sorted(folder.glob(f"{below}*{SUFFIX}")) if path.is_file()]
 
 
 def _find(path: Path) -> Recorded:

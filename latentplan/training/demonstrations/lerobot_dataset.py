@@ -8,6 +8,7 @@ says where its rows and its pictures lie; a data file and a video file hold seve
 from __future__ import annotations
 
 import json
+import os
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -107,7 +108,7 @@ class LeRobotDataset:
         """The columns of an episode's rows, in the order of time."""
         parquet: Any = import_extra("pyarrow.parquet", USER)
         place = {"chunk_index": int(episode["data/chunk_index"]), "file_index": int(episode["data/file_index"])}
-        path = self.path / str(self._info["data_path"]).format(**place)
+        path = self._find(str(self._info["data_path"]).format(**place))
         images = [key for key in self._pictures.values() if self._info["features"][key]["dtype"] == "image"]
         columns = ["frame_index", ACTION, REWARD, *self._vectors.values(), *images]
         number = int(episode["episode_index"])
@@ -119,12 +120,24 @@ class LeRobotDataset:
         if key in rows:
             return np.stack([self._decode_image(image) for image in rows[key]])
         place = {name: int(episode[f"videos/{key}/{name}"]) for name in ("chunk_index", "file_index")}
-        path = self.path / str(self._info["video_path"]).format(video_key=key, **place)
+        path = self._find(str(self._info["video_path"]).format(video_key=key, **place))
         start = float(episode[f"videos/{key}/from_timestamp"])
         return np.stack(list(_decode_video(path, start, int(episode["length"]), self._fps)))
 
+    def _find(self, name: str) -> Path:
+        """A file that the dataset names, which lies in its folder.
+
+        Raises:
+            ValueError: The dataset names something else, such as a file of the user.
+        """
+        if os.path.isabs(name) or os.path.normpath(name).split(os.sep)[0] == "..":
+            raise ValueError(f"it names {name}, which is outside of its folder")
+        if not (path := self.path / name).is_file():
+            raise ValueError(f"it names {name}, which is no file")
+        return path
+
     def _decode_image(self, image: dict[str, Any]) -> np.ndarray:
-        content = image["bytes"] if image["bytes"] is not None else (self.path / image["path"]).read_bytes()
+        content = image["bytes"] if image["bytes"] is not None else self._find(image["path"]).read_bytes()
         picture = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_COLOR)
         if picture is None:
             raise ValueError("a picture cannot be decoded")

@@ -64,8 +64,11 @@ def read_space(path: Path) -> Space:
 
 
 def ends_of(space: Space) -> list[Layer]:
-    """For each setting in turn its ends, or all of its choices, as sections."""
-    return [as_layer({key: value}) for key, values in space.items() for value in _ends(values)]
+    """For each setting in turn its ends, or all of its choices, as sections.
+
+    Of whole numbers the one after the lower end comes too: the setting may have gaps, as the sizes of frames.
+    """
+    return [as_layer({key: value}) for key, values in space.items() for value in (*_ends(values), *_inner(values))]
 
 
 def check_space(space: Space, check: Callable[[Layer], object]) -> Layer:
@@ -120,6 +123,11 @@ def _ends(values: Range | tuple[Any, ...]) -> tuple[Any, ...]:
     if not isinstance(values, Range):
         return values
     return tuple(int(end) if values.is_whole else end for end in (values.low, values.high))
+
+
+def _inner(values: Range | tuple[Any, ...]) -> tuple[int, ...]:
+    is_wide = isinstance(values, Range) and values.is_whole and values.high - values.low > 1.0
+    return (int(values.low) + 1,) if isinstance(values, Range) and is_wide else ()
 
 
 def _read_values(value: Any, kinds: tuple[Any, ...]) -> Range | tuple[Any, ...]:

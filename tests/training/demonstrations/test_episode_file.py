@@ -194,3 +194,51 @@ def test_names_that_a_file_cannot_hold_are_refused_before_an_episode(names, tmp_
 def test_used_folder_is_refused(folder):
     with pytest.raises(UserError, match="already holds recorded episodes"):
         KeepingEnv(wrap_user_env(Dot()), folder, CONFIG)
+
+
+@pytest.mark.parametrize("kind", ["storage", "link", "virtual"])
+def test_episode_file_that_takes_its_data_from_another_file_is_refused(folder, tmp_path, kind):
+    """A stranger's file could otherwise put any file of the user into replay, which run folders hold."""
+    secret, path = tmp_path / "secret", folder / "episode-000-000001.hdf5"
+    with h5py.File(secret, "w") as file:
+        file["rewards"] = np.ones(20)
+    with h5py.File(path, "r+") as file:
+        del file["rewards"]
+        if kind == "storage":
+            file.create_dataset("rewards", (20,), np.uint8, external=[(str(secret), 0, 20)])
+        elif kind == "link":
+            file["rewards"] = h5py.ExternalLink(str(secret), "rewards")
+        else:
+            layout = h5py.VirtualLayout((20,), np.float64)
+            layout[:] = h5py.VirtualSource(str(secret), "rewards", (20,))
+            file.create_virtual_dataset("rewards", layout)
+    with pytest.raises(UserError, match="takes 'rewards' from elsewhere"):
+        open_recordings([str(path)])
+
+
+def test_folder_that_holds_a_pipe_among_its_episodes_is_read(folder):
+    os.mkfifo(folder / "episode-000-000000.hdf5")
+    assert len(open_recordings([str(folder)])) == 2
+
+
+@pytest.mark.parametrize("kind", ["suite", "own"])
+def test_episode_that_was_kept_without_the_name_of_a_task_is_of_the_task_that_was_played(tmp_path, kind, recwarn):
+    if kind == "suite":
+        from latentplan.envs import make_env
+
+        config = EnvConfig(domain="cartpole", action_repeat=500)
+        env, fits = make_env(config), None
+    else:
+        config = EnvConfig(action_repeat=1)
+        env, fits = wrap_user_env(Dot()), target()
+    env = KeepingEnv(env, tmp_path, config)
+    env.reset(seed=0)
+    while not any(env.step(np.array([0.5], np.float32))[2:4]):
+        pass
+    env.close()
+    (recording,) = open_recordings([str(tmp_path)])
+    if fits is None:
+        assert recording.origin == "dm_control-cartpole-swingup"
+    else:
+        fit_all([recording], fits, 1)
+        assert not [each for each in recwarn if "was recorded in" in str(each.message)]

@@ -2,6 +2,7 @@
 
 import json
 
+import cv2
 import numpy as np
 import pyarrow
 import pyarrow.parquet
@@ -194,3 +195,23 @@ def test_names_of_no_recording_are_refused(tmp_path):
     }.items():
         with pytest.raises(UserError, match=message):
             open_recordings([str(tmp_path / name)])
+
+
+@pytest.mark.parametrize("place", ["{folder}/../private.png", "../private.png", "a/../../private.png"])
+def test_lerobot_dataset_that_names_a_file_outside_of_its_folder_is_refused(tmp_path, place):
+    cv2.imwrite(str(tmp_path / "private.png"), np.full((64, 64, 3), 77, np.uint8))
+    folder = write_lerobot(tmp_path / "dataset", video=False)
+    path = folder / "data" / "chunk-000" / "file-000.parquet"
+    rows = pyarrow.parquet.read_table(path).to_pylist()
+    for row in rows:
+        row["observation.images.camera"] = {"bytes": None, "path": place.format(folder=folder)}
+    pyarrow.parquet.write_table(pyarrow.Table.from_pylist(rows), path)
+    with pytest.raises(UserError, match="which is outside of its folder"):
+        read(folder, TwoParts)
+
+
+@pytest.mark.parametrize("name", ["data_path", "video_path"])
+def test_lerobot_tables_and_videos_lie_in_its_folder(tmp_path, name):
+    folder = write_lerobot(tmp_path / "dataset", changes={name: "/etc/hostname"})
+    with pytest.raises(UserError, match="names /etc/hostname, which is outside of its folder"):
+        read(folder, TwoParts)

@@ -128,3 +128,8 @@ def test_sweep_refuses_a_mistake_before_its_first_trial(tmp_path, capsys, no_opt
 def test_sweep_refuses_to_keep_the_episodes_of_several_runs_in_one_folder(tmp_path, capsys):
     assert sweep(tmp_path, "--frames", "1000", "--collection.keep_episodes", str(tmp_path / "kept")) == 2
     assert "--collection.keep_episodes is the folder of one run" in capsys.readouterr().err
+
+
+def test_range_over_a_setting_with_gaps_is_refused(tmp_path, capsys):
+    assert sweep(tmp_path, "--frames", "1000", text="env: {frame_size: {low: 64, high: 128}}") == 2
+    assert "env.frame_size must be one of 64, 84, 96, 128, got 65" in capsys.readouterr().err
