@@ -131,6 +131,15 @@ def test_settings_are_those_of_the_program_in_every_page(live, open_page, addres
     assert other.page.locator("#horizon").input_value() == ""
 
 
+def test_controls_show_the_search_in_use_after_a_refusal(live):
+    live.page.locator("#num_samples").fill("17")  # fewer than the actor's own candidates
+    live.page.keyboard.press("Tab")
+    refusal = live.page.locator("#refusal")
+    wait_until(refusal.is_visible)
+    assert "num_samples (17)" in refusal.text_content()
+    assert live.page.locator("#num_samples").input_value() == ""
+
+
 def test_picture_of_the_camera_becomes_a_goal(live):
     live.page.locator("#snapshot").click()
     live.page.locator("#gallery button").first.click()
