@@ -241,3 +241,11 @@ def test_noise_is_independent_of_the_past_when_an_episode_begins(model, film):
 def test_act_takes_flipped_views_of_frames(make, model, film):
     flipped = film[0, 0][::-1]
     assert np.array_equal(make(model, seed=3).act(flipped), make(model, seed=3).act(flipped.copy()))
+
+
+@pytest.mark.parametrize("make", AGENTS)
+@pytest.mark.filterwarnings("error")
+def test_act_takes_frames_in_memory_that_may_not_be_written(make, model, film):
+    """Cameras give such memory, for which torch would warn of undefined behaviour."""
+    frame = np.frombuffer(film[0, 0].tobytes(), np.uint8).reshape(64, 64, 3)
+    assert np.array_equal(make(model).act(frame), make(model).act(film[0, 0]))
