@@ -117,7 +117,7 @@ class BackgroundAgent(ModelAgent):
         return None if remaining is None else remaining[:1]
 
     def wait_until_ready(self, seconds: float = 60.0) -> bool:
-        """Waits until the worker is ready or has failed, at most `seconds`; returns whether it is ready or has failed."""
+        """Waits until the worker is ready or has failed, at most `seconds`; returns whether either is so."""
         executor = self.scheduler.executor
         return not isinstance(executor, BackgroundPlanner) or executor.wait_until_ready(seconds)
 
