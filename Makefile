@@ -113,7 +113,8 @@ elif [ "$$(id -u)" = 0 ] && command -v apt-get >/dev/null; then \
 	for package in $$missing; do \
 		apt-get install -y --no-install-recommends $$package || echo "could not install $$package" >&2; \
 	done; \
-else echo "headless rendering needs GL libraries; run: sudo apt-get install -y$$missing" >&2; fi
+else echo "headless rendering needs GL libraries, as many as there are;" \
+	"run: for package in$$missing; do sudo apt-get install -y \$$package; done" >&2; fi
 endef
 
 # Debian has Chromium as a package; elsewhere playwright downloads its own.

@@ -47,12 +47,12 @@ def main(out: str = ".") -> None:
     model = ModelConfig(deter_dim=32, hidden_dim=32, encoder_channels=(8, 8, 8))
     learning = LearningConfig(batch_size=8, sequence_length=8, model_learning_rate=3e-3, behaviour_learning_rate=1e-3)
     collection = CollectionConfig(prefill_decisions=200, round_decisions=100, updates_per_decision=1.0, overlap=False)
-    run = RunConfig(frames=2000, threads=1, run_dir=f"{out}/dot")
+    run = RunConfig(frames=2000, threads=1, run_dir=f"{out}/two_cameras")
     config = Config(env=env, model=model, learning=learning, collection=collection, run=run)
     train(config, make_env=lambda: gymnasium.wrappers.TimeLimit(Dot(), 20))
     for mode in ("planner", "random"):
         inner = wrap_user_env(gymnasium.wrappers.TimeLimit(Dot(), 20), 2, config=env)
-        played = evaluate_agent(load_agent(f"{out}/dot", mode), inner, seed=0, episodes=10)
+        played = evaluate_agent(load_agent(f"{out}/two_cameras", mode), inner, seed=0, episodes=10)
         print(f"{mode}: mean return {played['mean_return']:.1f}")
 
 

@@ -339,7 +339,7 @@ class ModelAgent:
         if not size or vectors.shape != (len(frames), size):
             wanted = f'act((frame, info["vectors"])) with {size} numbers' if size else "act(frame) without vectors"
             raise ValueError(f"this agent takes {wanted}, got vectors of shape {vectors.shape}")
-        return Observation(frames, torch.from_numpy(np.require(vectors, requirements="CW")).to(self.generator.device))
+        return Observation(frames, torch.from_numpy(np.require(vectors, requirements=("C", "W"))).to(self.generator.device))
 
     def _encode_frames(self, frames: Tensor | Observation) -> Tensor:
         """Latents of frames (batch, 64, 64, 3) at the first moment of an episode, (batch, latent)."""
@@ -381,7 +381,7 @@ class ModelAgent:
         shape = self.model.spaces.frame_shape
         if frames.dtype != np.uint8 or frames.shape[1:] != shape:
             raise ValueError(f"frames must be uint8 {shape}, got {frames.dtype} {frames.shape[1:]}")
-        return torch.from_numpy(np.require(frames, requirements="CW")).to(self.generator.device)
+        return torch.from_numpy(np.require(frames, requirements=("C", "W"))).to(self.generator.device)
 
 
 def copy_tensor(value: Tensor | None) -> Tensor | None:

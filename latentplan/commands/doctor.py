@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.metadata
 import platform
+import re
 import shutil
 import sys
 import tempfile
@@ -14,6 +15,7 @@ from typing import TYPE_CHECKING
 
 from latentplan.config import RENDER_QUALITIES, EnvConfig, UserError
 from latentplan.config.estimates import count_cores
+from latentplan.config.extras import DM_CONTROL
 from latentplan.config.origin import processor_name
 
 if TYPE_CHECKING:
@@ -112,10 +114,22 @@ def _versions() -> Iterator[Finding]:
         try:
             version = importlib.metadata.version(name)
         except importlib.metadata.PackageNotFoundError:
-            yield Finding(name, "missing", f"pip install {name}")
+            yield Finding(name, "missing", f"pip install {_to_install(name)}")
             continue
         bad, remedy = _BAD_VERSIONS.get(name, ((), ""))
         yield Finding(name, version, remedy if version.startswith(bad) and bad else None)
+
+
+def _to_install(name: str) -> str:
+    """What pip has to install for a package that is missing: the range of versions that this one allows."""
+    if name == "dm-control" and sys.version_info >= (3, 13):
+        return DM_CONTROL
+    try:
+        requirements = importlib.metadata.requires("latentplan") or []
+    except importlib.metadata.PackageNotFoundError:  # a checkout that is not installed
+        requirements = []
+    found = next((text for text in requirements if re.split(r"[^\w.-]", text)[0] == name), name)
+    return f"'{found.partition(';')[0].strip()}'"
 
 
 def _device() -> Iterator[Finding]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from importlib import import_module, util
 from types import ModuleType
 
@@ -27,6 +28,10 @@ EXTRAS = {
     "ray": ("ray", "optuna"),
 }
 """By extra, the modules that it installs and the package without extras does not."""
+
+
+DM_CONTROL = "--no-deps 'dm-control>=1.0.50,<1.1'"
+"""What pip installs of dm_control from Python 3.13 on, where no extra can list it: pip cannot build labmaze there."""
 
 
 class MissingExtra(UserError, ImportError):
@@ -80,4 +85,6 @@ def describe_missing(module: str, user: str) -> str:
     """One line that says which module a part lacks, and how to install it."""
     extra = extra_of(module)
     what = f"'latentplan[{extra}]'" if extra else module
+    if module.partition(".")[0] == "dm_control" and sys.version_info >= (3, 13):
+        what = DM_CONTROL
     return f"{user} needs {module}, which is not installed; run: pip install {what}"

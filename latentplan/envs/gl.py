@@ -16,11 +16,15 @@ from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
 from latentplan.config import UserError
+from latentplan.config.extras import describe_missing
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-REMEDY = "install software rendering (apt-get install -y libosmesa6 libegl1 libgl1) or set MUJOCO_GL=egl|osmesa|glfw"
+REMEDY = (
+    "install software rendering (apt-get install -y libegl1 libgl1, and libosmesa6 where there is one) or set "
+    "MUJOCO_GL=egl|osmesa|glfw"
+)
 _SOFTWARE_RENDERERS = ("llvmpipe", "softpipe", "swrast", "software")
 _PROBE_TIMEOUT_S = 30.0
 _PROBE_PROGRAM = (
@@ -62,7 +66,7 @@ def require_backend() -> str:
 
 @contextmanager
 def explain_gl_errors() -> Iterator[None]:
-    """Turns any error of an OpenGL library into a `UserError` of one line with the remedy.
+    """Turns any error of an OpenGL library, or a library that is missing, into a `UserError` with its remedy.
 
     Raises:
         UserError: The body of the `with` block raised while it imported a backend or made a context.
@@ -71,6 +75,8 @@ def explain_gl_errors() -> Iterator[None]:
         yield
     except UserError:
         raise
+    except ModuleNotFoundError as error:
+        raise UserError(describe_missing(str(error.name), "rendering")) from error
     except Exception as error:  # each backend raises other types
         backend = os.environ.get("MUJOCO_GL")
         reason = str(error).strip().splitlines()[0] if str(error).strip() else type(error).__name__

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import inspect
 import time
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
@@ -246,6 +247,11 @@ class ModelPredictiveController:
             **given,
         )
         return plan.executed(torch.zeros_like(plan.elapsed))
+
+
+# Tools that show signatures would take that of `__new__`.
+_own = inspect.signature(ModelPredictiveController.__init__)
+ModelPredictiveController.__signature__ = _own.replace(parameters=list(_own.parameters.values())[1:])  # type: ignore[attr-defined]
 
 
 @contextlib.contextmanager

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import sys
 import time
+from pathlib import Path
 from typing import Any
 
 from rich.console import Console
@@ -16,6 +17,11 @@ from latentplan.training.state import RunState
 
 SECONDS_ON_A_TERMINAL = 0.5
 SECONDS_IN_A_LOG = 30.0
+
+
+def own_command(name: str) -> str:
+    """How to call a command again: by the script that was called, else by the module, which works in every folder."""
+    return f"python {sys.argv[0]}" if Path(sys.argv[0]).name == f"{name}.py" else f"python -m latentplan {name}"
 
 
 class SteadyConsole(Console):

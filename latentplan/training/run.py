@@ -42,7 +42,7 @@ from latentplan.training.collection.crew import Worker, check_memory, make_worke
 from latentplan.training.collection.episodes import Stopped, to_arrays
 from latentplan.training.collection.keeping import check_kept, keep_alone, refuse_used_folder
 from latentplan.training.collection.process import WorkerEnded
-from latentplan.training.console import Progress
+from latentplan.training.console import Progress, own_command
 from latentplan.training.demonstrations.seeding import count_rows, read_demonstrations, seed_replay
 from latentplan.training.estimates import count_replay_rows
 from latentplan.training.facts import agent_facts, describe_change, describe_run, meet_ranks, write_report
@@ -79,7 +79,8 @@ class Result:
 
     Attributes:
         run_dir: Folder of the run.
-        exit_code: 0; when a signal interrupted the run, 128 and its number: 130 for Ctrl-C, 143 for SIGTERM.
+        exit_code: 0; when a signal interrupted the run, 128 and its number: 130 for Ctrl-C, 143 for SIGTERM,
+            129 for a terminal that was closed.
         summary: Mean return of the final evaluation per mode; empty when interrupted.
     """
 
@@ -93,8 +94,8 @@ def train(config: Config, make_env: EnvFactory | None = None) -> Result:
 
     Args:
         config: Settings of the run.
-        make_env: Makes the user's own `gymnasium.Env` with image observations and a bounded Box of actions; None makes
-            the suite's task that `config.env` names.
+        make_env: Makes the user's own `gymnasium.Env`, with spaces that `latentplan.envs.accept_spaces` accepts; None
+            makes the suite's task that `config.env` names.
 
     Returns:
         The folder, exit code and summary of the run. Where several processes learn together, each runs the calling
@@ -392,7 +393,7 @@ class _Run:
         except (WorkerEnded, UserError) as error:
             save.save(trainer, self.learner)
             raise name_save(error, self.folder) from None
-        command = f"python scripts/train.py --resume {self.folder}{repeat_flag(config.env)}"
+        command = f"{own_command('train')} --resume {self.folder}{repeat_flag(config.env)}"
         if config.env.domain == USER_DOMAIN:
             command = f'latentplan.training.resume("{self.folder}", make_env=...)'
         self.console.console.print(f"stopped; to resume: {command}", soft_wrap=True)

@@ -1,6 +1,7 @@
 """Libraries of extras: the error that names the extra, and what works without any extra."""
 
 import json
+import shlex
 import subprocess
 import sys
 import tomllib
@@ -10,7 +11,15 @@ import pytest
 from packaging.requirements import Requirement
 
 from latentplan.config import UserError
-from latentplan.config.extras import EXTRAS, MissingExtra, extra_of, import_extra, require_extra
+from latentplan.config.extras import (
+    DM_CONTROL,
+    EXTRAS,
+    MissingExtra,
+    describe_missing,
+    extra_of,
+    import_extra,
+    require_extra,
+)
 
 ROOT = Path(__file__).resolve().parents[2]
 WITHOUT_EXTRAS = f"""
@@ -87,3 +96,24 @@ def test_command_that_needs_the_extra_is_refused_in_one_line(command):
     result = run_without_extras(code, *command.split())
     assert result.returncode == 2
     assert result.stderr.count("\n") == 1 and "pip install 'latentplan[train]'" in result.stderr
+
+
+@pytest.mark.parametrize(("version", "what"), [((3, 12), "'latentplan[train]'"), ((3, 13), DM_CONTROL)])
+def test_missing_dm_control_has_the_remedy_of_the_python_version(monkeypatch, version, what):
+    monkeypatch.setattr(sys, "version_info", version)
+    assert describe_missing("dm_control.suite", "rendering").endswith(f"; run: pip install {what}")
+    command = shlex.split(f"pip install {DM_CONTROL}")
+    listed = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]["train"]
+    assert str(Requirement(command[-1]).specifier) in {str(Requirement(text).specifier) for text in listed}
+
+
+def test_rendering_without_dm_control_names_the_package_and_not_the_renderer():
+    code = """
+import sys
+sys.modules["dm_control"] = None
+from latentplan.commands.main import main
+raise SystemExit(main(["eval", "--checkpoint", "checkpoints/cartpole-swingup", "--episodes", "1"]))
+"""
+    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True)
+    assert done.returncode == 2 and "MUJOCO_GL" not in done.stderr, done.stderr
+    assert "needs dm_control, which is not installed; run: pip install" in done.stderr

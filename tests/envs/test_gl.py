@@ -54,7 +54,7 @@ def test_find_backend_prefers_hardware_then_osmesa_then_mesa(monkeypatch, librar
 def test_require_backend_names_the_remedy_without_opengl(monkeypatch):
     monkeypatch.delenv("MUJOCO_GL")
     monkeypatch.setattr(gl, "_find_backend", lambda: None)
-    with pytest.raises(UserError, match="apt-get install -y libosmesa6"):
+    with pytest.raises(UserError, match="apt-get install -y libegl1 libgl1, and libosmesa6"):
         gl.require_backend()
 
 

@@ -1,6 +1,7 @@
 """Receding-horizon control: the plan that the controller keeps between steps, and the calls that drop it."""
 
 import dataclasses
+import inspect
 import itertools
 
 import pytest
@@ -306,3 +307,8 @@ def test_controller_names_masks_of_another_shape(states, make_controller):
     with pytest.raises(ValueError, match=r"where must have shape \(5,\), got \(2,\)"):
         controller.act_where(states, torch.tensor([True, False]))
     assert controller.plan.is_warm.all()
+
+
+def test_signature_of_the_controller_is_that_of_its_constructor():
+    names = list(inspect.signature(ModelPredictiveController).parameters)
+    assert names[:3] == ["planner", "model", "objective"] and "replan_every" in names and "args" not in names

@@ -38,7 +38,7 @@ from latentplan.evaluation.statistics import confidence_interval
 from latentplan.models import Gaussian, State
 from latentplan.models.heads import Actor
 from latentplan.training.collection.collector import EnvFactory
-from latentplan.training.console import StatusLine
+from latentplan.training.console import StatusLine, own_command
 from latentplan.training.distillation.labels import Demonstrations, plan_actions, read_first_actions
 from latentplan.training.distillation.saves import KIND, open_saves, read_resumed
 from latentplan.training.distillation.student import Student
@@ -261,7 +261,7 @@ class _Distillation:
                     self._save()
                 return Result(self.folder, 0, self._finish())
         except KeyboardInterrupt:
-            command = f"python scripts/distill.py --resume {self.folder}{repeat_flag(self.config.env)}"
+            command = f"{own_command('distill')} --resume {self.folder}{repeat_flag(self.config.env)}"
             if self.config.env.domain == USER_DOMAIN:
                 command = f'latentplan.training.resume_distillation("{self.folder}", make_env=...)'
             self.line.print(f"stopped; to resume: {command}")

@@ -23,7 +23,7 @@ from latentplan.replay.dealing import DealtRows, count_ranks
 from latentplan.replay.disk import FORMAT as REPLAY_FORMAT
 from latentplan.replay.disk import ReplayFiles, count_saved, save_replay
 from latentplan.training.collection.collector import Collector
-from latentplan.training.console import StatusLine
+from latentplan.training.console import StatusLine, own_command
 from latentplan.training.goal_conditioning.learner import BoxSource, GoalLearner, GoalLearnerState
 from latentplan.training.run import Result
 from latentplan.training.signals import Signals, exit_code, raise_interrupt
@@ -230,7 +230,7 @@ def _learn(run: Path, folder: Path, settings: GoalsConfig, device: str, saved: d
                 last_save = time.monotonic()
         save()
         if signals.received:
-            line.print(f"stopped; to resume: python scripts/goals.py --resume {folder}")
+            line.print(f"stopped; to resume: {own_command('goals')} --resume {folder}")
             return Result(folder, exit_code(signals.received), {})
         line.print(f"agent: {folder}")
     return Result(folder, 0, {"worth": worth})
