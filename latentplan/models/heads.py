@@ -203,14 +203,17 @@ class MixedActor(nn.Module):
     def score(self, features: Tensor, actions: Tensor) -> tuple[Tensor, Tensor]:
         """Log-probability of actions (..., action), and entropy of the distribution in nats, (...) each.
 
-        The density of a clamped continuous number is that of the number it was clamped to.
+        A continuous number at a bound has the probability of all samples that the clamp moves there, which makes the
+        mean of the score's gradient 0 as for any distribution. The entropy is that of the Gaussian.
         """
         mean, std, logits = self._distribution(features)
         log_probs = logits.log_softmax(-1)
         taken = log_probs.gather(-1, self.code.find(actions)[..., None])[..., 0].sum(-1)
         entropy = -(log_probs.exp() * log_probs.masked_fill(~self.code.exists, 0.0)).sum((-2, -1))
-        error = (actions[..., self.code.continuous] - mean) / std
-        density = (-0.5 * error.square() - std.log() + 0.5 - HALF_LOG_2_PI_E).sum(-1)
+        numbers = actions[..., self.code.continuous]
+        density = -0.5 * ((numbers - mean) / std).square() - std.log() + 0.5 - HALF_LOG_2_PI_E
+        beyond = torch.special.log_ndtr((numbers.sign() * mean - 1.0) / std)
+        density = torch.where(numbers.abs() < 1.0, density, beyond).sum(-1)
         return taken + density, entropy + (std.log() + HALF_LOG_2_PI_E).sum(-1)
 
     def _values(self, categories: Tensor, logits: Tensor) -> Tensor:
