@@ -339,7 +339,9 @@ class ModelAgent:
         if not size or vectors.shape != (len(frames), size):
             wanted = f'act((frame, info["vectors"])) with {size} numbers' if size else "act(frame) without vectors"
             raise ValueError(f"this agent takes {wanted}, got vectors of shape {vectors.shape}")
-        return Observation(frames, torch.from_numpy(np.require(vectors, requirements=("C", "W"))).to(self.generator.device))
+        return Observation(
+            frames, torch.from_numpy(np.require(vectors, requirements=("C", "W"))).to(self.generator.device)
+        )
 
     def _encode_frames(self, frames: Tensor | Observation) -> Tensor:
         """Latents of frames (batch, 64, 64, 3) at the first moment of an episode, (batch, latent)."""

@@ -78,8 +78,9 @@ def run(request: Request) -> int:
         section, _, name = key.partition(".")
         if name in given.get(section, {}):
             raise UserError(f"--{key} is a setting that {request.space} varies: leave out the flag")
-    if request.jobs >= count_cores() and "threads" not in given.get("run", {}):
-        given["run"] = {**given.get("run", {}), "threads": 1}
+    if "threads" not in given.get("run", {}):  # trials share the cores of their machine, which for Ray have one each
+        threads = 1 if request.ray_address else max(1, (count_cores() // request.jobs - 1) // 2)
+        given["run"] = {**given.get("run", {}), "threads": threads}
     from latentplan.training.sweep.trials import Sweep, best_of, run_sweep
 
     file = read_layer(request.config) if request.config else {}

@@ -9,7 +9,7 @@ from typing import Any
 from latentplan.commands.flags import overrides
 from latentplan.config import Config, UserError
 from latentplan.config.env_id import FLAG, import_named, lay_env
-from latentplan.config.files import BUDGETS, Preset, compose, read_layer
+from latentplan.config.files import BUDGETS, Preset, compose, has_cuda, read_layer
 from latentplan.config.parsing import option
 from latentplan.config.run_folder import read_run_config
 
@@ -67,7 +67,7 @@ class Request:
 
 def run(request: Request) -> int:
     """Train or resume, and return the exit code."""
-    config = resolve(request)
+    config = _without_cuda(request, resolve(request))
     if request.env_id is not None:
         import_named(request.env_id)
     from latentplan.training.checks import check_settings
@@ -81,6 +81,18 @@ def run(request: Request) -> int:
     if request.resume is None:
         return train(config).exit_code
     return resume(request.resume, **request.settings.get("run", {})).exit_code
+
+
+def _without_cuda(request: Request, config: Config) -> Config:
+    """The settings; those of the CPU where the preset was chosen for a graphics processor that torch cannot use."""
+    if request.resume is not None or request.preset != "auto" or config.run.device != "auto" or not has_cuda():
+        return config
+    import torch
+
+    if torch.cuda.is_available():
+        return config
+    print("torch cannot use this machine's graphics processor: the settings are those of the CPU", flush=True)
+    return resolve(replace(request, preset="cpu"))
 
 
 def resolve(request: Request) -> Config:

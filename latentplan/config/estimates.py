@@ -6,9 +6,11 @@ are therefore lower bounds: what they refuse is impossible, and what they let pa
 
 from __future__ import annotations
 
+import math
 import os
 from dataclasses import dataclass
 from itertools import pairwise
+from pathlib import Path
 
 from latentplan.config.checks import UserError
 from latentplan.config.planner import SearchOptions
@@ -18,6 +20,7 @@ FLOATS_PER_S = 2e11  # operations of one fast core in a second
 DEVICE_FLOATS_PER_S = 2e15  # operations of a graphics processor in a second
 STEP_S = 1e-6  # one step of a rollout of any size
 LONGEST_DECISION_S = 60.0
+CONTROL_GROUP = Path("/sys/fs/cgroup")
 MEMORY_SHARE = 0.9
 _FLOAT = 4  # bytes
 
@@ -115,8 +118,21 @@ def check_parts(parts: list[Part], free: float, place: str = "main memory") -> N
 
 
 def count_cores() -> int:
-    """Processor cores that this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    """Processor cores that this process may use, within the quota of a container (control groups 1 and 2)."""
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    return min(cores, _read_quota() or cores)
+
+
+def _read_quota() -> int | None:
+    """Cores that a container's quota allows, rounded up; None without a quota."""
+    try:
+        if (path := CONTROL_GROUP / "cpu.max").exists():
+            quota, period = path.read_text().split()
+        else:
+            quota, period = ((CONTROL_GROUP / "cpu" / f"cpu.cfs_{name}_us").read_text() for name in ("quota", "period"))
+        return max(1, math.ceil(int(quota) / int(period))) if quota.strip() not in ("max", "-1") else None
+    except (OSError, ValueError, ZeroDivisionError):
+        return None
 
 
 def _gib(num_bytes: float) -> str:

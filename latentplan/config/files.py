@@ -26,6 +26,7 @@ Layer = dict[str, dict[str, Any]]
 
 SECTIONS: dict[str, Any] = {field.name: field.default_factory for field in dataclasses.fields(Config)}
 Preset = Literal["auto", "cpu", "gpu"]
+NODES, WSL_LIBRARIES = Path("/dev"), Path("/usr/lib/wsl/lib")
 BUDGETS = ("frames", "minutes", "updates")  # of the section `run`
 DOMAINS = tuple(SUITES[DEFAULT_SUITE].tasks)
 
@@ -129,12 +130,16 @@ def config_folder() -> Path:
 
 
 def has_cuda() -> bool:
-    """Whether an NVIDIA device and a torch build for it are there, found without importing torch."""
-    if os.environ.get("CUDA_VISIBLE_DEVICES") in ("", "-1"):
+    """Whether an NVIDIA device and a torch build for it are there, found without importing torch.
+
+    Torch alone knows whether the device can be used; `train` asks it again.
+    """
+    if os.environ.get("CUDA_VISIBLE_DEVICES") in ("", "-1", "NoDevFiles"):  # the last is Slurm's
         return False
-    nodes = ("/dev/nvidiactl", "/dev/dxg", "/proc/driver/nvidia/version")
+    has_device = any(NODES.glob("nvidia[0-9]*"))  # the driver's own files are also seen by containers without a device
+    has_wsl = (NODES / "dxg").exists() and any(WSL_LIBRARIES.glob("libcuda.so*"))
     try:
-        return any(Path(node).exists() for node in nodes) and "+cpu" not in importlib.metadata.version("torch")
+        return (has_device or has_wsl) and "+cpu" not in importlib.metadata.version("torch")
     except importlib.metadata.PackageNotFoundError:
         return False
 

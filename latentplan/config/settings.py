@@ -292,6 +292,13 @@ class Config:
         """Environments that collect for one learning process, over all its workers."""
         return self.env.num_envs * self.collection.workers
 
+    @property
+    def local_collectors(self) -> int:
+        """Collection processes beside each learning process on its machine; those of a Ray cluster are elsewhere."""
+        if not self.collection.overlap:
+            return 0
+        return self.collection.workers if self.run.ray_address is None else 1
+
     def _check_workers(self) -> None:
         """Refuses settings of collection processes that have no effect."""
         collection = self.collection

@@ -65,11 +65,12 @@ def _machine_memory() -> int:
 
 
 def _cgroup_memory() -> int:
-    """Bytes that a container's control group (version 2) leaves; inactive file pages count as free."""
+    """Bytes that a container's control group (version 2) leaves; pages of files, which it can drop, count as free."""
     try:
         limit = (LIMIT_FACTS / "memory.max").read_text().strip()
         used = int((LIMIT_FACTS / "memory.current").read_text())
         pages = dict(line.split() for line in (LIMIT_FACTS / "memory.stat").read_text().splitlines())
     except OSError:
         return sys.maxsize  # the process is in no limited control group of version 2
-    return sys.maxsize if limit == "max" else max(0, int(limit) - used + int(pages.get("inactive_file", 0)))
+    files = sum(int(pages.get(f"{kind}_file", 0)) for kind in ("inactive", "active"))
+    return sys.maxsize if limit == "max" else max(0, int(limit) - used + files)

@@ -92,7 +92,7 @@ def _estimate_update(config: Config) -> Part:
 
 
 def _estimate_environments(config: Config) -> Part:
-    num_envs = config.num_lanes
+    num_envs = config.env.num_envs * max(1, config.local_collectors)
     num_bytes = num_envs * PROCESS_BYTES if num_envs > 1 else 0
     return Part("the environments", num_bytes, config.env.action_repeat * CONTROL_STEP_S, "--env.num_envs")
 

@@ -79,8 +79,7 @@ class Result:
 
     Attributes:
         run_dir: Folder of the run.
-        exit_code: 0; when a signal interrupted the run, 128 and its number: 130 for Ctrl-C, 143 for SIGTERM,
-            129 for a terminal that was closed.
+        exit_code: 0; 128 and the number of a signal that interrupted the run (130 Ctrl-C, 143 SIGTERM, 129 SIGHUP).
         summary: Mean return of the final evaluation per mode; empty when interrupted.
     """
 
@@ -230,6 +229,7 @@ def _run_until_end(
 ) -> Result:
     failed_at = -1
     while True:
+        signals.forget_listener()  # a run that was given up, whose replay would stay in memory
         try:
             with keep_threads():
                 return _Run(config, folder, make_env, signals, ranks, resume=resume).execute()
@@ -273,8 +273,8 @@ class _Run:
         self.demonstrations = [] if resume else read_demonstrations(config, make_env)
         self.device = choose_device(config.run, ranks.device)
         self.console = Progress(config.run, is_quiet=not ranks.is_first)
-        collectors = config.collection.workers if config.collection.overlap else 0
-        set_up_torch(config.run.threads or choose_threads(collectors, config.run.devices), self.device)
+        threads = config.run.threads or choose_threads(config.local_collectors, config.run.devices)
+        set_up_torch(threads, self.device)
         own = ranks.own_config(config)
         self.worker: Worker = make_worker(own, make_env, self.device, lambda: signals.received > 0)
         try:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import gc
 import os
 import signal
 import sys
@@ -52,6 +53,11 @@ class Signals:
                     self._previous[number] = signal.getsignal(number)
             self.install()
         return self
+
+    def forget_listener(self) -> None:
+        """Calls nothing at a signal any more, and frees what only the object that was called kept in memory."""
+        self.receive = lambda number: None
+        gc.collect()
 
     def install(self) -> None:
         """Take the signals back from a library that has set handlers of its own."""

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import pytest
 
+from latentplan.commands import train
 from latentplan.commands.flags import read_request
 from latentplan.commands.train import SHORT_FLAGS, Request, resolve
 from latentplan.config import CollectionConfig, Config, ReplayConfig, RunConfig, UserError
@@ -138,3 +139,18 @@ def test_resume_refuses_null_which_would_keep_the_saved_value(flag, assert_refus
 def test_resume_refuses_bad_changes(assert_refused, tmp_path):
     save_settings(Config(), tmp_path)
     assert_refused(["train", "--resume", tmp_path, "--frames", "0"], "run.frames must be above 0, got 0")
+
+
+def test_preset_of_the_cpu_is_taken_where_torch_cannot_use_the_card(monkeypatch, capsys):
+    monkeypatch.setattr("latentplan.config.files.has_cuda", lambda: True)
+    monkeypatch.setattr(train, "has_cuda", lambda: True)
+    monkeypatch.setattr("torch.cuda.is_available", lambda: False)
+    for flags, preset, is_said in (
+        ([], "cpu", True),
+        (["--preset", "gpu"], "gpu", False),
+        (["--device", "cpu"], "cpu", False),
+    ):
+        request = read_request(Request, flags)
+        config = train._without_cuda(request, resolve(request))
+        assert config.learning == compose({}, {}, preset).learning
+        assert ("those of the CPU" in capsys.readouterr().out) == is_said

@@ -96,6 +96,30 @@ def test_compose_auto_takes_preset_of_the_machine(monkeypatch):
     assert compose({}, {}).learning == cpu
 
 
+@pytest.mark.parametrize(
+    ("nodes", "visible", "expected"),
+    [
+        (["nvidia0", "nvidiactl"], None, True),
+        (["nvidia0", "nvidiactl"], "NoDevFiles", False),
+        (["nvidia0"], "", False),
+        (["nvidiactl"], None, False),  # a driver without a device
+        (["dxg"], None, False),  # Windows with a card of another maker
+        (["dxg", "libcuda.so.1"], None, True),
+    ],
+)
+def test_has_cuda_needs_a_device_that_this_process_may_use(nodes, visible, expected, tmp_path, monkeypatch):
+    for name in nodes:
+        (tmp_path / name).touch()
+    monkeypatch.setattr(files, "NODES", tmp_path)
+    monkeypatch.setattr(files, "WSL_LIBRARIES", tmp_path)
+    monkeypatch.setattr(files.importlib.metadata, "version", lambda name: "2.11.0+cu130")
+    if visible is None:
+        monkeypatch.delenv("CUDA_VISIBLE_DEVICES", raising=False)
+    else:
+        monkeypatch.setenv("CUDA_VISIBLE_DEVICES", visible)
+    assert files.has_cuda() is expected
+
+
 def test_presets_differ_only_in_sizes_budget_and_where_learning_lives():
     allowed = {
         "model": {"deter_dim", "hidden_dim", "encoder_channels", "decoder_channels"},

@@ -161,9 +161,13 @@ def test_free_memory_is_known_or_unlimited_without_proc(monkeypatch):
     assert memory.free_memory() > 2**28
 
 
-@pytest.mark.parametrize(("limit", "left"), [("4096", 4096 - 3000 + 500), ("2000", 0)])
+@pytest.mark.parametrize(("limit", "left"), [("4096", 4096 - 3000 + 500 + 300), ("2000", 0)])
 def test_free_memory_is_the_rest_of_a_containers_limit(tmp_path, monkeypatch, limit, left):
-    for name, text in {"max": limit, "current": "3000", "stat": "anon 2000\ninactive_file 500"}.items():
+    for name, text in {
+        "max": limit,
+        "current": "3000",
+        "stat": "anon 2000\ninactive_file 500\nactive_file 300",
+    }.items():
         (tmp_path / f"memory.{name}").write_text(f"{text}\n")
     monkeypatch.setattr(memory, "LIMIT_FACTS", tmp_path)
     assert memory.free_memory() == left

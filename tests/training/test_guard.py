@@ -1,10 +1,12 @@
 """Steps that are not finite: skipped, counted, kept; ten in a row go back to the last save or stop the run."""
 
 import warnings
+import weakref
 
 import pytest
 import torch
 
+from latentplan.replay.buffer import Replay
 from latentplan.training import resume, saving, train
 from latentplan.training.learner.curriculum import Curriculum
 from latentplan.training.learner.skips import NotFiniteError
@@ -45,8 +47,17 @@ def test_run_goes_back_to_its_last_save_after_ten_skipped_steps(tiny, dot, tmp_p
     whole = train(tiny(tmp_path / "whole", collection=more), dot)
     count = poison(monkeypatch, lambda count: 15 <= count < 25)  # not again when the batches are drawn again
     monkeypatch.setattr(saving, "SAVE_MINUTES", 0.0)
+    made, alive, make = [], [], Replay.__init__
+
+    def watch(replay, *sizes, **more):
+        alive.append(sum(each() is not None for each in made))
+        made.append(weakref.ref(replay))
+        make(replay, *sizes, **more)
+
+    monkeypatch.setattr(Replay, "__init__", watch)
     with pytest.warns(RuntimeWarning, match=r"in 10 steps in a row, up to update 25.*goes back to its last save"):
         run = train(tiny(tmp_path / "run", collection=more), dot)
+    assert alive == [0, 0]  # two replays at once may not fit into the memory
     assert run.exit_code == 0 and count[0] == 60 + 10
     weights = [read_state(folder)["learner"]["weights"] for folder in (whole.run_dir, run.run_dir)]
     assert all(torch.equal(value, weights[1][name]) for name, value in weights[0].items())
@@ -66,8 +77,6 @@ def test_run_stops_with_the_reason_when_the_same_steps_are_skipped_again(tiny, d
 
 
 def test_run_learns_from_the_rest_when_one_row_of_replay_is_not_finite(tiny, dot, tmp_path, monkeypatch):
-    from latentplan.replay.buffer import Replay
-
     add = Replay.add
 
     def add_poisoned(replay, lane, rows):

@@ -210,10 +210,11 @@ def _learn(run: Path, folder: Path, settings: GoalsConfig, device: str, saved: d
 
     def save() -> None:
         facts = {"updates": learner.updates, "minutes": round(minutes(), 1), "settings": to_dict(settings)}
-        save_checkpoint(folder, model, config, info | {"goals": facts | {"from_sha256": info["sha256"]}})
         about = {"run": str(run.resolve()), "source": str(source.resolve()), "sha256": info["sha256"]}
         state = {"settings": to_dict(settings), "minutes": minutes(), "learner": learner.state_dict()}
         save_values(saves, about | state, {"updates": learner.updates, "minutes": round(minutes(), 1)})
+        # Last, because a folder that holds an agent and no save could be neither resumed nor begun again.
+        save_checkpoint(folder, model, config, info | {"goals": facts | {"from_sha256": info["sha256"]}})
 
     with line, signals:
         remove_leftovers(folder)

@@ -124,6 +124,19 @@ def test_resume_goals_ends_with_the_agent_of_an_uninterrupted_learning(run, fini
     assert all(torch.equal(value, weights[1][name]) for name, value in weights[0].items())
 
 
+def test_goals_that_were_killed_while_their_first_save_was_written_go_on(run, finished, tmp_path, monkeypatch):
+    def kill(*arguments):
+        raise KeyError("killed")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(goal_run, "save_checkpoint", kill)
+        with pytest.raises(KeyError, match="killed"):
+            learn_goals(run, tmp_path / "part", SETTINGS)
+    resumed = resume_goals(tmp_path / "part")
+    weights = [load_model(folder)[0].state_dict() for folder in (finished.run_dir, resumed.run_dir)]
+    assert all(torch.equal(value, weights[1][name]) for name, value in weights[0].items())
+
+
 def test_read_resumed_takes_saved_settings_with_a_new_budget(finished):
     assert read_resumed(finished.run_dir)[1] == SETTINGS
     assert read_resumed(finished.run_dir, updates=99, minutes=2.0)[1] == replace(SETTINGS, updates=99, minutes=2.0)
