@@ -64,7 +64,7 @@ def run(request: Request) -> int:
     Raises:
         UserError: The space or a setting is wrong, Ray is missing, or the folder holds another sweep.
     """
-    from latentplan.config.estimates import count_cores
+    from latentplan.config.estimates import choose_threads
     from latentplan.config.extras import require_extra
     from latentplan.training.checks import check_settings
     from latentplan.training.sweep.space import check_space, read_space
@@ -79,7 +79,7 @@ def run(request: Request) -> int:
         if name in given.get(section, {}):
             raise UserError(f"--{key} is a setting that {request.space} varies: leave out the flag")
     if "threads" not in given.get("run", {}):  # trials share the cores of their machine, which for Ray have one each
-        threads = 1 if request.ray_address else max(1, (count_cores() // request.jobs - 1) // 2)
+        threads = 1 if request.ray_address else choose_threads(1, request.jobs)
         given["run"] = {**given.get("run", {}), "threads": threads}
     from latentplan.training.sweep.trials import Sweep, best_of, run_sweep
 

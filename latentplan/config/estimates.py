@@ -123,6 +123,15 @@ def count_cores() -> int:
     return min(cores, _read_quota() or cores)
 
 
+def choose_threads(collectors: int, processes: int = 1) -> int:
+    """CPU threads of each half of an update: of the world model, and of the behaviour, which learn at the same time.
+
+    No two busy threads share a core, as far as the cores suffice for as many learning processes. One core is left to
+    each of the `collectors`, the collection processes of a learning process.
+    """
+    return max(1, (count_cores() // processes - collectors) // 2)
+
+
 def _read_quota() -> int | None:
     """Cores that a container's quota allows, rounded up; None without a quota."""
     try:

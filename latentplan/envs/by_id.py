@@ -70,8 +70,8 @@ def _check_kwargs(kwargs: dict[str, Any]) -> None:
     for name in ("id", "disable_env_checker"):
         if name in kwargs:
             raise UserError(f"--env-kwargs cannot hold {name!r}, which this program sets: leave it out")
-    limit = kwargs.get("max_episode_steps", -1)
-    if type(limit) is not int or limit == 0 or limit < -1:
+    limit = kwargs.get("max_episode_steps")
+    if limit is not None and (type(limit) is not int or limit == 0 or limit < -1):
         allowed = "a whole number of at least 1, or -1 for no limit"
         raise UserError(f"--env-kwargs: max_episode_steps must be {allowed}, got {shown(limit)}")
 

@@ -35,15 +35,6 @@ def choose_device(run: RunConfig, number: int = 0) -> torch.device:
     return torch.device("cuda", number) if run.devices > 1 else torch.device("cuda")
 
 
-def choose_threads(collectors: int, processes: int = 1) -> int:
-    """CPU threads of each half of an update: of the world model, and of the behaviour, which learn at the same time.
-
-    No two busy threads share a core, as far as the cores suffice for as many learning processes. One core is left to
-    each of the `collectors`, the collection processes of a learning process.
-    """
-    return max(1, (count_cores() // processes - collectors) // 2)
-
-
 def choose_collector_threads(device: torch.device, collectors: int = 1) -> int:
     """CPU threads of each collection process: one if the learner uses the CPU, up to 4 if the learner uses a GPU."""
     return 1 if device.type == "cpu" else min(max(1, count_cores() // (4 * collectors)), COLLECTOR_THREADS)

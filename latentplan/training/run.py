@@ -24,6 +24,7 @@ from latentplan.agents.files import is_checkpoint
 from latentplan.config import USER_DOMAIN, Config, Device, Strategy, UserError, derive_seed
 from latentplan.config.commit import Save
 from latentplan.config.env_id import as_file_name, repeat_flag
+from latentplan.config.estimates import choose_threads
 from latentplan.config.files import dump_config, read_config
 from latentplan.config.origin import present_facts
 from latentplan.config.run_folder import CHECKPOINTS, RUN_FILE, SAVES_FOLDER, lock_folder, read_run_config, run_saves
@@ -51,7 +52,7 @@ from latentplan.training.learner.curriculum import Curriculum
 from latentplan.training.learner.graphed import make_learner
 from latentplan.training.learner.skips import NotFiniteError
 from latentplan.training.ranks import Ranks, join_ranks, place_ranks
-from latentplan.training.resources import choose_device, choose_threads, keep_threads, make_trainer, set_up_torch
+from latentplan.training.resources import choose_device, keep_threads, make_trainer, set_up_torch
 from latentplan.training.saving import Guard, Restore, Stop, name_save
 from latentplan.training.saving import Save as SaveRun
 from latentplan.training.signals import Signals, exit_code
@@ -273,8 +274,7 @@ class _Run:
         self.demonstrations = [] if resume else read_demonstrations(config, make_env)
         self.device = choose_device(config.run, ranks.device)
         self.console = Progress(config.run, is_quiet=not ranks.is_first)
-        threads = config.run.threads or choose_threads(config.local_collectors, config.run.devices)
-        set_up_torch(threads, self.device)
+        set_up_torch(config.run.threads or choose_threads(config.local_collectors, config.run.devices), self.device)
         own = ranks.own_config(config)
         self.worker: Worker = make_worker(own, make_env, self.device, lambda: signals.received > 0)
         try:

@@ -113,6 +113,8 @@ def test_make_env_makes_the_environment_with_its_arguments():
     assert bright.reset()[0].max() == 255 and dim.reset()[0].max() == 100
     assert bright.decisions_per_episode == 10
     assert make_env(config_of("Slider", kwargs='{"max_episode_steps": 8}')).decisions_per_episode == 4
+    own = make_env(config_of("Slider")).decisions_per_episode
+    assert make_env(config_of("Slider", kwargs='{"max_episode_steps": null}')).decisions_per_episode == own
 
 
 def test_rendered_pictures_are_squeezed_whole_and_drawn_once_per_decision():

@@ -121,9 +121,10 @@ class KeepingEnv(gymnasium.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarra
 
     def __init__(self, env: gymnasium.Env[np.ndarray, np.ndarray], folder: Path | str, config: EnvConfig) -> None:
         super().__init__(env)
-        self._lock = contextlib.ExitStack()
-        self._lock.enter_context(keep_alone(Path(folder)))
-        refuse_used_folder(Path(folder))
+        with contextlib.ExitStack() as lock:
+            lock.enter_context(keep_alone(Path(folder)))
+            refuse_used_folder(Path(folder))
+            self._lock = lock.pop_all()
         facts = read_own_facts(env)
         if isinstance(env.unwrapped, PixelEnv) and config.suite == EnvConfig.suite:  # of `wrap_user_env`
             config = replace(config, domain=USER_DOMAIN)
