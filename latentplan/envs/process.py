@@ -127,7 +127,8 @@ class ProcessLane:
         self._fault: EnvironmentFault | None = None
         try:
             self._await_start()
-            self._connection.send((method, arguments, named))
+            self._num_asked += 1
+            self._connection.send((self._num_asked, method, arguments, named))
         except OSError:
             pass  # a process that ended is noticed by `answer`
         except EnvironmentFault as fault:
@@ -137,7 +138,7 @@ class ProcessLane:
         """See `Lane.answer`."""
         if self._fault is not None:
             raise self._fault
-        return self._receive(self._timeout_s)
+        return self._receive(self._num_asked, self._timeout_s)
 
     def restart(self) -> None:
         """See `Lane.restart`."""
@@ -149,7 +150,7 @@ class ProcessLane:
     def ask_to_close(self) -> None:
         """See `Lane.ask_to_close`."""
         with contextlib.suppress(OSError):
-            self._connection.send(("close", (), {}))
+            self._connection.send((self._num_asked + 1, "close", (), {}))
 
     def close(self, timeout: float = CLOSING_SECONDS) -> None:
         """See `Lane.close`."""
@@ -167,21 +168,25 @@ class ProcessLane:
             self._process.start()
         child_end.close()
         self._is_started = self._has_answered = False
+        self._num_asked = 0
 
     def _await_start(self) -> None:
         if not self._is_started:
-            self._facts = self._receive(max(START_SECONDS, self._timeout_s))()
+            self._facts = self._receive(0, max(START_SECONDS, self._timeout_s))()
             self._is_started = True
 
-    def _receive(self, timeout_s: float) -> Any:
+    def _receive(self, number: int, timeout_s: float) -> Any:
+        """The answer to a request with a number; 0 is the start. Answers that an interrupted caller left are dropped."""
         self._has_answered = False
         try:
-            if not self._connection.poll(timeout_s):
-                raise EnvironmentFault(
-                    f"the environment has not answered for {timeout_s:g} s: make it faster, or allow more with "
-                    "--collection.step_timeout_s"
-                )
-            kind, value = self._connection.recv()
+            answered = -1
+            while answered != number:
+                if not self._connection.poll(timeout_s):
+                    raise EnvironmentFault(
+                        f"the environment has not answered for {timeout_s:g} s: make it faster, or allow more with "
+                        "--collection.step_timeout_s"
+                    )
+                answered, (kind, value) = self._connection.recv()
         except (EOFError, OSError):
             self._process.join(CLOSING_SECONDS)
             code = self._process.exitcode
@@ -216,6 +221,7 @@ def _serve(connection: Connection, factory: CloudpickleWrapper) -> None:
     # Python refuses children to a process that ends with its parent, but a simulator may be one.
     multiprocessing.current_process()._config["daemon"] = False  # type: ignore[attr-defined]
     env: Any = None
+    number = 0
     answer: tuple[str, Any]
     try:
         env = factory()
@@ -225,8 +231,8 @@ def _serve(connection: Connection, factory: CloudpickleWrapper) -> None:
         answer = "failed", describe_failure(error)
     while True:
         try:
-            _send(connection, answer)
-            request = connection.recv()
+            _send(connection, number, answer)
+            number, *request = connection.recv()
         except (EOFError, OSError):
             os._exit(0)
         try:
@@ -237,14 +243,14 @@ def _serve(connection: Connection, factory: CloudpickleWrapper) -> None:
             return
 
 
-def _send(connection: Connection, answer: tuple[str, Any]) -> None:
+def _send(connection: Connection, number: int, answer: tuple[str, Any]) -> None:
     """Sends an answer; one that cannot be sent, such as an info that holds a lambda, is a fault of the environment."""
     try:
-        connection.send(answer)
+        connection.send((number, answer))
     except (OSError, EnvironmentFault):
         raise
     except Exception as error:
-        connection.send(("failed", describe_failure(error)))
+        connection.send((number, ("failed", describe_failure(error))))
 
 
 def end_with_parent() -> None:

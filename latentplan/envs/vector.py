@@ -8,6 +8,7 @@ import time
 import warnings
 from dataclasses import dataclass, field
 from functools import partial
+from numbers import Integral
 from typing import TYPE_CHECKING, Any
 
 import gymnasium
@@ -58,7 +59,10 @@ def make_vector_env(
 
     Raises:
         UserError: The environment cannot be built.
+        ValueError: There is no environment.
     """
+    if num_envs < 1:
+        raise ValueError(f"num_envs must be at least 1, got {num_envs}")
     lanes: list[Lane] = []
     for index in range(num_envs):
         factory = EnvMaker(config, _derive_env_seed(seed, index), make_env)
@@ -173,21 +177,32 @@ class GuardedVectorEnv(VectorEnv[np.ndarray, np.ndarray, Any]):
 
         Raises:
             EnvironmentFault: An environment failed more often than the budget of restarts allows.
+            ValueError: There is not one seed, or not one value of the mask, for each environment.
         """
-        seeds = [seed + index for index in range(self.num_envs)] if isinstance(seed, int) else seed
+        seeds = [int(seed) + index for index in range(self.num_envs)] if isinstance(seed, Integral) else seed
         mask = (options or {}).get("reset_mask", np.ones(self.num_envs, dtype=bool))
+        self._check_number("reset_mask", mask)
+        if seeds is not None:
+            self._check_number("seed", seeds)
         begun = np.flatnonzero(mask).tolist()
         for index in begun:
             self._ask_for_reset(index, seeds)
-        for index in begun:
+        given_up: EnvironmentFault | None = None
+        for index in begun:  # every answer is taken, also after a fault of another environment
             for attempt in itertools.count(1):  # the budget of restarts ends it
                 try:
                     frame, info = self.lanes[index].answer()
                     self._keep(index, frame, info)
                     break
                 except EnvironmentFault as fault:
-                    self._restart(index, fault)
+                    try:
+                        self._restart(index, fault)
+                    except EnvironmentFault as last:
+                        given_up = last
+                        break
                     self._ask_for_reset(index, seeds, attempt)
+        if given_up is not None:
+            raise given_up
         return self._frames.copy(), self._info(np.zeros(self.num_envs, np.int64), np.zeros(self.num_envs, bool))
 
     def step(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
@@ -195,7 +210,9 @@ class GuardedVectorEnv(VectorEnv[np.ndarray, np.ndarray, Any]):
 
         Raises:
             EnvironmentFault: An environment failed more often than the budget of restarts allows.
+            ValueError: There is not one action for each environment.
         """
+        self._check_number("actions", actions)
         rewards, env_frames = np.zeros(self.num_envs), np.zeros(self.num_envs, np.int64)
         terminated, truncated, failed = (np.zeros(self.num_envs, dtype=bool) for _ in range(3))
         for lane, action in zip(self.lanes, actions, strict=True):
@@ -223,6 +240,12 @@ class GuardedVectorEnv(VectorEnv[np.ndarray, np.ndarray, Any]):
             lane.ask_to_close()
         for lane in self.lanes:
             lane.close(max(0.0, end - time.monotonic()))
+
+    def _check_number(self, name: str, values: Any) -> None:
+        """Raises ValueError, before any environment is asked, unless there is one value for each environment."""
+        count = len(values) if hasattr(values, "__len__") and np.ndim(values) > 0 else 0
+        if count != self.num_envs:
+            raise ValueError(f"{name} must have one entry for each of {self.num_envs} environments, got {count}")
 
     def _ask_for_reset(self, index: int, seeds: Sequence[int | None] | None, attempt: int = 0) -> None:
         seed = None if seeds is None else seeds[index]

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from latentplan.config import EnvConfig
+from latentplan.config.checks import EnvironmentFault
 from latentplan.envs import make_env, make_vector_env
 
 CONFIG = EnvConfig(domain="cartpole", render_quality="fastest", action_repeat=250)  # four decisions an episode
@@ -88,3 +89,71 @@ def test_vector_env_calls_a_users_factory_in_every_process():
     assert np.array_equal(pictures[0], alone.reset()[0][0])  # the same seed and index give the same stream
     assert not np.array_equal(pictures[0], pictures[1])  # each environment has another stream
     assert np.array_equal(rewards, [4.0, 2.0])  # action repeat 2
+
+
+@pytest.mark.parametrize(
+    ("call", "arguments"),
+    [
+        ("step", {"actions": ACTIONS[0][:1]}),
+        ("step", {"actions": np.zeros((3, 1), np.float32)}),
+        ("step", {"actions": np.float32(0.5)}),
+        ("reset", {"seed": [1]}),
+        ("reset", {"options": {"reset_mask": np.ones(3, bool)}}),
+    ],
+)
+def test_refused_call_leaves_no_answer_behind(pair, call, arguments):
+    expected = begin_and_step(pair)
+    pair.reset(seed=[3, 4])
+    with pytest.raises(ValueError, match="one entry for each of 2 environments"):
+        getattr(pair, call)(**arguments)
+    assert np.array_equal(pair.step(ACTIONS[0])[0], expected)
+
+
+def test_answer_that_an_interrupted_step_leaves_is_dropped(pair, monkeypatch):
+    expected = begin_and_step(pair)
+    pair.reset(seed=[3, 4])
+
+    def interrupt():
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(pair.lanes[0], "answer", interrupt)
+        with pytest.raises(KeyboardInterrupt):
+            pair.step(ACTIONS[1])
+    pair.reset(seed=[3, 4])
+    assert np.array_equal(pair.step(ACTIONS[0])[0], expected)
+
+
+def begin_and_step(pair):
+    pair.reset(seed=np.int64(3))  # the second environment has the seed 4
+    return pair.step(ACTIONS[0])[0]
+
+
+def test_reset_takes_the_answers_of_all_environments_before_it_fails():
+    import gymnasium
+    from gymnasium.spaces import Box
+
+    class Moody(gymnasium.Env):
+        observation_space = Box(0, 255, (8, 8, 3), np.uint8)
+        action_space = Box(-1.0, 1.0, (1,), np.float32)
+
+        def reset(self, *, seed=None, options=None):
+            if seed == 13:
+                raise RuntimeError("no start")
+            return np.full((8, 8, 3), seed, np.uint8), {}
+
+        def step(self, action):
+            return np.zeros((8, 8, 3), np.uint8), 0.0, False, False, {}
+
+    envs = make_vector_env(EnvConfig(action_repeat=1), 2, 0, make_env=lambda: gymnasium.wrappers.TimeLimit(Moody(), 5))
+    with pytest.raises(EnvironmentFault, match="no start"):
+        envs.reset(seed=[13, 5])
+    frames, _ = envs.reset(seed=[7, 9])
+    assert frames[0].max() == 7
+    assert frames[1].max() == 9
+    envs.close()
+
+
+def test_vector_environment_has_an_environment():
+    with pytest.raises(ValueError, match="num_envs must be at least 1"):
+        make_vector_env(CONFIG, 0, seed=0)
