@@ -19,7 +19,7 @@ ON_CPU = ("is_warm", "elapsed", "is_followed")
 TENSORS = ("actions", "mean", "var", "expected_return", "elites", *ON_CPU)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Iteration:
     """One iteration of a search: what a callback receives, and what a plan keeps of its candidates.
 
@@ -51,15 +51,20 @@ class Iteration:
 
     def take(self, rows: Tensor) -> Iteration:
         """Returns the iteration of the environments at rows (chosen,) int."""
+        return self._map(lambda tensor: tensor[rows.to(tensor.device)])
 
-        def select(value: Any) -> Any:
-            return value[rows.to(value.device)] if isinstance(value, Tensor) else value
+    def copied(self) -> Iteration:
+        """Returns this iteration with tensors of its own."""
+        return self._map(torch.clone)
 
-        values = {field.name: tree_map(select, getattr(self, field.name)) for field in fields(self)}
-        return Iteration(**values)
+    def _map(self, change: Callable[[Tensor], Tensor]) -> Iteration:
+        def apply(value: Any) -> Any:
+            return change(value) if isinstance(value, Tensor) else value
+
+        return Iteration(**{field.name: tree_map(apply, getattr(self, field.name)) for field in fields(self)})
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Plan:
     """The result of a search, for every environment in the call.
 
@@ -160,7 +165,7 @@ class Plan:
         index = (self.elapsed.clamp(1, self.actions.shape[1]) - 1).to(self.actions.device)
         action = torch.take_along_dim(self.actions, index[:, None, None], dim=1)[:, 0]
         assert self.is_followed is not None
-        is_known = self.is_warm & self.is_followed & (self.elapsed > 0) & (self.elapsed <= self.actions.shape[1])
+        is_known = self.is_followed & (self.elapsed > 0) & (self.elapsed <= self.actions.shape[1])
         return action.masked_fill(~is_known.to(action.device)[:, None], torch.nan)
 
     def action_distribution(self, min_std: float) -> tuple[Tensor, Tensor]:
@@ -200,14 +205,15 @@ class Plan:
             )
 
     def forget(self, mask: Tensor) -> Plan:
-        """Returns this plan, except that the environments in mask (batch,) bool start their next search cold.
+        """Returns this plan, except that the environments in mask (batch,) bool start cold, with no action before.
 
         Raises:
             TypeError: The mask is not a tensor.
             ValueError: The mask does not have one value for each environment.
         """
         check_shape("mask", mask, self.is_warm.shape)
-        return replace(self, is_warm=self.is_warm & ~mask.to("cpu", torch.bool))
+        is_left = ~mask.to("cpu", torch.bool)
+        return replace(self, is_warm=self.is_warm & is_left, is_followed=self.is_followed & is_left)
 
     def executed(self, elapsed: Tensor) -> Plan:
         """Returns this plan with `elapsed` (batch,) as the number of executed actions."""

@@ -9,6 +9,7 @@ import torch
 from latentplan.agents.actor import ActorAgent
 from latentplan.agents.planning import PlanningAgent
 from latentplan.models import State
+from latentplan.planning import rate_limit
 from tests.agents.small_agents import CONFIG, make_model
 
 
@@ -108,3 +109,17 @@ def test_failed_search_of_any_environment_is_warned_of(model, frames, broken):
     agent.state = state
     with pytest.warns(RuntimeWarning, match="a search found nothing finite"):
         agent.act(frames)
+
+
+@pytest.mark.parametrize("settings", [{"surprise_limit": 1e-6}, {"noise_std": 0.5}])
+def test_rate_limit_counts_from_the_executed_action_whoever_chose_it(model, frames, settings):
+    noise = settings.pop("noise_std", 0.0)
+    agent = make_planner(model, **settings)
+    agent.noise_std = noise
+    agent.act(frames)
+    before = agent.act(frames)
+    agent.noise_std = 0.0
+    agent.set_objective(None, [rate_limit(0.05)])
+    assert np.abs(agent.act(frames) - before).max() <= 0.05 + 1e-5
+    agent.reset(np.array([True, False]))
+    assert np.abs(agent.act(frames) - before)[1].max() <= 0.1 + 1e-5

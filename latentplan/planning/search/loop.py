@@ -255,7 +255,7 @@ class Search:
                 error.add_note("check_model(model, state, planner=planner) lists everything that a planner needs")
             raise
         if watch is not None:
-            watch.check(self.model)
+            watch.check(self.model, rollout.last_state, len(rollout.actions))
             self.problem.first_searches.add(self.problem.model)
         return scores, self.scorer.arrange_states(rollout) if with_states else None
 
@@ -283,8 +283,8 @@ class Search:
         )
         if self.view.keep is not None:
             kept.append(described)
-        if self.view.callback is not None:
-            self.view.callback(described)
+        if self.view.callback is not None:  # which may write into what it is given
+            self.view.callback(described.copied())
 
     def _add_excess(self, violation: Tensor | None, actions: Tensor) -> Tensor | None:
         """Returns the violation of all constraints, given that of those other than rate limits; None without any."""
@@ -425,6 +425,9 @@ class Search:
     def _check_previous(self) -> None:
         if self.previous is None:
             return
+        if not isinstance(self.previous, Plan):
+            kind = type(self.previous).__name__
+            raise TypeError(f"previous must be a Plan, got {kind}; Plan.around(actions) makes one of a trajectory")
         batch, _, dim = self.previous.mean.shape
         if (batch, dim) != (self.batch, self.bounds.action_dim):
             sizes = f"{self.batch} environments and actions of {self.bounds.action_dim}"

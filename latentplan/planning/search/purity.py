@@ -49,12 +49,23 @@ class Watch:
         self._given = start, actions
         self._copies = tree_map(torch.clone, self._given)
 
-    def check(self, model: object) -> None:
-        """Refuses a model that has changed the tensors.
+    def check(self, model: object, last_state: State, num_rows: int) -> None:
+        """Refuses a model that has changed the tensors, or that returned states of another number of rows.
+
+        Args:
+            model: The model.
+            last_state: The states that it returned after the last action of the candidates.
+            num_rows: Rows of the candidates, with those of particles.
 
         Raises:
-            ValueError: A tensor differs from its copy.
+            ValueError: A tensor differs from its copy, or a state has another number of rows than the actions.
         """
+        for leaf in tree_leaves(last_state):
+            if isinstance(leaf, Tensor) and leaf.shape[:1] != (num_rows,):
+                raise ValueError(
+                    f"{type(model).__name__} returned a state of shape {tuple(leaf.shape)} for {num_rows} rows of actions; "
+                    "dim 0 of a state is its rows"
+                )
         for name, given, copy in zip(("state", "action"), self._given, self._copies, strict=True):
             pairs = zip(tree_leaves(given), tree_leaves(copy), strict=True)
             if not all(bool(((left == right) | ((left != left) & (right != right))).all()) for left, right in pairs):

@@ -166,8 +166,7 @@ class Scorer:
         chosen: list[Tensor] = []
 
         def choose(step: int, rows: State) -> Tensor:
-            action = _policy_actions(self.model, split_rows(rows, batch), num, generators)
-            check_shape("policy()", action, (batch * num, bounds.action_dim))
+            action = _policy_actions(self.model, split_rows(rows, batch), num, generators, bounds.action_dim)
             chosen.append(bounds.fit_step(action, step, num))
             return chosen[-1]
 
@@ -281,7 +280,9 @@ def _per_candidate(values: Tensor, rollout: Rollout, over_particles: str, name: 
     return reduce(values.to(rollout.rewards.dtype), pattern, over_particles, **sizes)
 
 
-def _policy_actions(model: Model, state: State, num: int, generators: Sequence[torch.Generator]) -> Tensor:
+def _policy_actions(
+    model: Model, state: State, num: int, generators: Sequence[torch.Generator], action_dim: int
+) -> Tensor:
     """Returns the policy's mode for the first row of each environment and samples for the others, (rows, action).
 
     Args:
@@ -289,13 +290,21 @@ def _policy_actions(model: Model, state: State, num: int, generators: Sequence[t
         state: States, (batch, num, ...).
         num: Number of rows per environment.
         generators: One stream per environment.
+        action_dim: Size of an action.
+
+    Raises:
+        TypeError: The policy returns no tensor.
+        ValueError: The policy returns actions of another shape.
     """
     mode = model.policy(tree_map(lambda leaf: leaf[:, 0], state), None)  # type: ignore[attr-defined]
+    check_shape("policy()", mode, (len(generators), action_dim))
     if num == 1:
         return mode
     sampled = [
         model.policy(tree_map(lambda leaf, index=index: leaf[index, 1:], state), generator)  # type: ignore[attr-defined]
         for index, generator in enumerate(generators)
     ]
+    for actions in sampled:
+        check_shape("policy()", actions, (num - 1, action_dim))
     both = torch.cat([mode[:, None], torch.stack(sampled)], dim=1)
     return rearrange(both, "batch num action -> (batch num) action")

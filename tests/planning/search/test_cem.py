@@ -7,6 +7,7 @@ import torch
 
 from latentplan.config import PlannerConfig
 from latentplan.planning import CEMPlanner, FunctionModel, ModelPredictiveController, SearchOptions
+from latentplan.planning.search.sampling import Streams
 
 RICH = {"num_policy_samples": 6, "keep_elite_fraction": 0.3, "noise_beta": 1.0, "tail": "policy"}
 
@@ -335,3 +336,12 @@ def test_from_config_takes_every_option_of_a_configuration():
 def test_plan_names_an_argument_of_a_wrong_kind(point, states, make_planner, arguments, message):
     with pytest.raises((TypeError, ValueError), match=message):
         make_planner().plan(point, states, **arguments)
+
+
+@pytest.mark.parametrize("horizon", range(2, 12))
+def test_coloured_noise_is_smoother_than_white_over_any_horizon(horizon):
+    streams = Streams(torch.Generator().manual_seed(0), 1, torch.device("cpu"))
+    noise, _ = streams.noise(20_000, horizon, 1, 2.0, 0.0, torch.float64)
+    steps = noise[0, :, :, 0]
+    assert (steps[:, 1:] * steps[:, :-1]).mean() > 0.25
+    torch.testing.assert_close(steps.var(0), torch.ones(horizon, dtype=torch.float64), atol=0.05, rtol=0.0)

@@ -63,7 +63,7 @@ def test_model_that_writes_into_its_inputs_is_named_at_the_first_call(make_plann
 
 def test_models_are_watched_once_per_planner(point, states, make_planner, monkeypatch):
     copies = []
-    monkeypatch.setattr("latentplan.planning.search.loop.Watch.check", lambda watch, model: copies.append(model))
+    monkeypatch.setattr("latentplan.planning.search.loop.Watch.check", lambda watch, model, *_: copies.append(model))
     planner = make_planner()
     for _ in range(3):
         planner.plan(point, states)
@@ -272,3 +272,37 @@ def test_errors_of_a_first_search_say_what_to_do(make_planner):
         with pytest.raises((ValueError, TypeError, IndexError), match=message) as caught:
             make_planner().plan(model, torch.zeros(2, 4))
         assert "check_model" in caught.value.__notes__[0]
+
+
+@pytest.mark.parametrize("has_rollout", [False, True])
+def test_states_of_another_number_of_rows_are_refused(point, states, make_planner, has_rollout):
+    model = FunctionModel(lambda state, action: point.dynamics(state, action)[:1], point.reward)
+    if has_rollout:
+        model.rollout = lambda state, actions: (torch.zeros(actions.shape[:2]), state[:1])
+    with pytest.raises(ValueError, match="returned a state of shape"):
+        make_planner().plan(model, states)
+
+
+@pytest.mark.parametrize(
+    ("policy", "error", "message"),
+    [
+        (lambda state, generator: torch.zeros(len(state)), ValueError, r"policy\(\) must have shape"),
+        (lambda state, generator: torch.zeros(len(state), 1, 2), ValueError, r"policy\(\) must have shape"),
+        (lambda state, generator: (torch.zeros(len(state), 2),) * 2, TypeError, r"policy\(\) must be a tensor"),
+        (
+            lambda state, generator: torch.zeros(len(state), 2 if generator is None else 3),
+            ValueError,
+            r"policy\(\) must have shape",
+        ),
+    ],
+)
+def test_policy_of_another_shape_or_type_is_named(point, states, make_planner, policy, error, message):
+    model = FunctionModel(point.dynamics, point.reward, policy=policy)
+    with pytest.raises(error, match=message):
+        make_planner(num_policy_samples=4).plan(model, states)
+
+
+def test_previous_plan_that_is_no_plan_is_refused_with_the_remedy(point, states, make_planner):
+    planner = make_planner()
+    with pytest.raises(TypeError, match=r"must be a Plan, got Tensor; Plan.around\(actions\) makes one"):
+        planner.plan(point, states, planner.plan(point, states).actions)

@@ -14,7 +14,9 @@ def test_keep_returns_every_iteration_and_changes_no_plan(point, states, make_pl
     plain = planner.plan(point, states, generator=seeded())
     kept = planner.plan(point, states, generator=seeded(), keep="candidates", callback=seen.append)
     assert torch.equal(plain.actions, kept.actions) and plain.candidates == ()
-    assert [iteration.index for iteration in kept.candidates] == [0, 1, 2] and list(kept.candidates) == seen
+    assert [iteration.index for iteration in kept.candidates] == [0, 1, 2] == [iteration.index for iteration in seen]
+    for iteration, shown in zip(kept.candidates, seen, strict=True):
+        assert torch.equal(iteration.actions, shown.actions) and torch.equal(iteration.elites, shown.elites)
     for iteration, elite_return in zip(kept.candidates, kept.info["elite_return"].unbind(dim=1), strict=True):
         batch, num = iteration.returns.shape
         assert iteration.actions.shape == (batch, num, 6, 2) and iteration.is_feasible.all()
@@ -108,3 +110,20 @@ def test_controller_keeps_candidates_and_calls_back(point, states, make_planner,
 def test_keep_is_refused_when_unknown(point, states, make_planner):
     with pytest.raises(ValueError, match="keep must be candidates, states or None, got 'elites'"):
         make_planner().plan(point, states, keep="elites")
+
+
+def test_callback_may_write_into_what_it_is_given(point, states, make_planner, seeded):
+    def normalise(iteration):
+        for tensor in (iteration.returns, iteration.actions, iteration.mean, iteration.elites, iteration.elite_return):
+            tensor.zero_()
+
+    plain = make_planner().plan(point, states, generator=seeded())
+    shown = make_planner().plan(point, states, generator=seeded(), callback=normalise)
+    assert torch.equal(plain.actions, shown.actions)
+    assert torch.equal(plain.expected_return, shown.expected_return)
+
+
+def test_plans_and_iterations_are_compared_by_identity(point, states, make_planner, seeded):
+    plan = make_planner().plan(point, states, generator=seeded(), keep="candidates")
+    assert plan in [plan] and plan != plan.take(torch.arange(5))
+    assert len({plan, *plan.candidates}) == 1 + len(plan.candidates)
