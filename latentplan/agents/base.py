@@ -381,6 +381,8 @@ class ModelAgent:
             ValueError: The frames have another shape or dtype.
         """
         shape = self.model.spaces.frame_shape
+        if not isinstance(frames, np.ndarray):
+            raise ValueError(f"frames must be a NumPy array, got {type(frames).__name__}")
         if frames.dtype != np.uint8 or frames.shape[1:] != shape:
             raise ValueError(f"frames must be uint8 {shape}, got {frames.dtype} {frames.shape[1:]}")
         return torch.from_numpy(np.require(frames, requirements=("C", "W"))).to(self.generator.device)

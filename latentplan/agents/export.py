@@ -17,6 +17,7 @@ import copy
 import importlib.util
 import io
 import json
+import os
 from pathlib import Path
 from typing import Any
 
@@ -99,8 +100,10 @@ def export_actor(agent_or_checkpoint: ModelAgent | str | Path, path: str | Path,
     target = output_file(target, "the program's path")
     if isinstance(agent_or_checkpoint, ModelAgent):
         model = agent_or_checkpoint.model
-    else:
+    elif isinstance(agent_or_checkpoint, str | os.PathLike):
         model, _, _ = load_model(agent_or_checkpoint)
+    else:
+        raise UserError(f"a trained agent or its folder is exported, got {type(agent_or_checkpoint).__name__}")
     if model.spaces.vector_dim:
         raise UserError(
             "only agents that see pictures alone can be exported, and this one was trained with env.vectors"

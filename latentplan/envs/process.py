@@ -176,7 +176,7 @@ class ProcessLane:
             self._is_started = True
 
     def _receive(self, number: int, timeout_s: float) -> Any:
-        """The answer to a request with a number; 0 is the start. Answers that an interrupted caller left are dropped."""
+        """The answer to a request with a number; 0 is the start. Answers that an interrupt left behind are dropped."""
         self._has_answered = False
         try:
             answered = -1

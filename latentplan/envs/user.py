@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import warnings
 import weakref
+from numbers import Integral
 from typing import TYPE_CHECKING, Any
 
 import gymnasium
@@ -122,8 +123,8 @@ class PixelEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         config: EnvConfig | None = None,
     ) -> None:
         """Checks the spaces; see `wrap_user_env`."""
-        if action_repeat < 1:
-            raise UserError(f"action_repeat must be at least 1, got {action_repeat}")
+        if not isinstance(action_repeat, Integral) or action_repeat < 1:
+            raise UserError(f"action_repeat must be a whole number of at least 1, got {action_repeat}")
         accepted = accept_spaces(env.observation_space, env.action_space, config)
         self._observations, self._actions, self.spaces = accepted.observations, accepted.actions, accepted.spaces
         self.interface = Interface(self._observations.pictures, self._observations.vectors, env.action_space)

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from latentplan.agents.base import Agent, Seen
 from latentplan.config import UserError, derive_seed
+from latentplan.config.checks import shown
 from latentplan.evaluation.statistics import Episode, EpisodeRecord, summarize
 
 if TYPE_CHECKING:
@@ -87,8 +88,13 @@ def evaluate_agent(
 
     Raises:
         ValueError: `episodes` is below 1, `seed` is below 0, or the agent refuses the environment's frames.
-        UserError: The environment gave a reward that is not finite.
+        UserError: The environment gave a reward that is not a finite number, or is a vector environment.
     """
+    if hasattr(env, "single_observation_space"):
+        raise UserError(
+            "evaluate_agent plays one environment, not a vector environment: give it one that make() returns"
+        )
+    seed = int(seed)
     seeds = [episode_seed(seed, index) for index in range(episodes)]
     return {"seed": seed, **summarize(run_episodes(env, agent, seeds, on_step=on_step))}
 
@@ -207,7 +213,10 @@ def see(frame: Frame, info: dict[str, Any]) -> Seen:
 
 def _check_reward(reward: SupportsFloat) -> float:
     """The reward as a number; refused if it is not finite, because a mean over episodes would hide the episode."""
-    value = float(reward)
+    try:
+        value = float(reward)
+    except (TypeError, ValueError):
+        raise UserError(f"the environment gave a reward that is no number: {shown(reward)}") from None
     if not math.isfinite(value):
         raise UserError(f"the environment gave a reward that is not finite: {value}")
     return value

@@ -62,7 +62,8 @@ class EpisodeRecord:
     def add_decision(self, agent: Any, decision_ms: float) -> None:
         """Counts a decision that the agent has just made, and the origin that the agent gives for its action."""
         self._decision_ms.append(decision_ms)
-        self._sources[getattr(agent, "last_source", "actor")] += 1
+        source = getattr(agent, "last_source", "actor")
+        self._sources[source if source in SOURCES else "actor"] += 1
         self._surprised += getattr(agent, "was_surprised", False)
 
     def add_step(self, reward: float, env_frames: int) -> None:

@@ -217,7 +217,8 @@ class _Parser:
             token = _Token(str(match and match.lastgroup), match[0] if match else self.text[position], position)
             if match is None:
                 is_goal = token.text == ":" and tokens and tokens[-1].text == "goal"
-                self._fail(token, 'write goal:FILE or goal:"FILE"' if is_goal else f"unexpected {token.text!r}")
+                reason = 'write goal:FILE or goal:"FILE"' if is_goal else f"unexpected {token.text!r}"
+                self._fail(token, f"{reason}; clauses compare by <, > and ->" if token.text == "=" else reason)
             if len(tokens) == _MAX_TOKENS:
                 self._fail(token, f"an expression has at most {_MAX_TOKENS} numbers, names and signs")
             tokens.append(token)

@@ -85,6 +85,9 @@ class CEMTrajectoryOptimizer:
             initial_state: Passed to `rollout_fn` unchanged.
             rollout_fn: `rollout_fn(initial_state, sequence (horizon, action)) -> return`, maximised.
             warm_start_mean: Mean at the start of the search, (horizon, action); None takes the middle of the bounds.
+
+        Raises:
+            ValueError: The mean at the start has another number of dimensions, or is not finite.
         """
         model = _RolloutModel(initial_state, rollout_fn)
         previous = None if warm_start_mean is None else _make_plan(warm_start_mean)
@@ -165,5 +168,7 @@ class _RolloutModel:
 def _make_plan(mean: np.ndarray) -> Plan:
     """Returns a plan with this mean (horizon, action), of which no action has been executed."""
     sequence = torch.as_tensor(mean, dtype=torch.float64, device="cpu")[None]
+    if sequence.ndim != 3 or not bool(torch.isfinite(sequence).all()):
+        raise ValueError(f"warm_start_mean must be finite numbers (horizon, action), got shape {np.shape(mean)}")
     zero = torch.zeros(1, dtype=torch.long, device="cpu")
     return Plan(sequence, sequence, torch.ones_like(sequence), zero.float(), {}, None, zero == 0, zero)

@@ -14,6 +14,7 @@ import operator
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
+from numbers import Integral
 from typing import Any
 
 import torch
@@ -234,7 +235,7 @@ def rate_limit(
         limits.append(torch.as_tensor(per_step, dtype=torch.float64, device="cpu"))
     if per_second is not None and step_seconds is not None:
         limits.append(torch.as_tensor(per_second, dtype=torch.float64, device="cpu") * step_seconds)
-    if not limits or any(limit.ndim > 1 or not bool((limit > 0).all()) for limit in limits):
+    if not limits or any(limit.ndim > 1 or limit.numel() == 0 or not bool((limit > 0).all()) for limit in limits):
         raise ValueError(f"a rate limit must be above 0, got per_step {per_step} and per_second {per_second}")
     sizes = {len(limit) for limit in limits if limit.ndim == 1} - {1}
     if len(sizes) > 1:
@@ -266,9 +267,9 @@ def risk(objective: Term, *, measure: str = "cvar", num_particles: int = 8, wors
     """
     if measure not in ("mean", "worst", "cvar"):
         raise ValueError(f"measure must be mean, worst or cvar, got {measure!r}")
-    if num_particles < 1 or not 0.0 < worst_share <= 1.0:
+    if not isinstance(num_particles, Integral) or num_particles < 1 or not 0.0 < worst_share <= 1.0:
         given = f"got {num_particles} and {worst_share}"
-        raise ValueError(f"num_particles must be at least 1 and worst_share must lie in (0, 1], {given}")
+        raise ValueError(f"num_particles must be a whole number from 1 on and worst_share lie in (0, 1], {given}")
     inner, share = as_objective(objective), {"mean": 1.0, "worst": 0.0, "cvar": worst_share}[measure]
     return Objective(partial(_worst, inner, share), inner.needs_states, num_particles, inner.needs)
 

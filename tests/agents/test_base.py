@@ -175,6 +175,13 @@ def test_act_and_encode_refuse_arrays_that_are_no_frames(make, model, frame):
         agent.encode(frame)
 
 
+def test_act_and_encode_say_that_frames_are_numpy_arrays(model):
+    agent, frame = ActorAgent(model, CONFIG), torch.zeros(64, 64, 3, dtype=torch.uint8)
+    for method in (agent.act, agent.encode):
+        with pytest.raises(ValueError, match="frames must be a NumPy array, got Tensor"):
+            method(frame)
+
+
 @pytest.mark.parametrize("make", AGENTS)
 def test_act_refuses_another_batch_size_without_a_reset(make, model, film):
     agent = make(model)

@@ -11,6 +11,7 @@ import torch
 from latentplan.agents.actor import ActorAgent
 from latentplan.agents.checkpoint import load_agent, save_checkpoint
 from latentplan.agents.export import export_actor
+from latentplan.agents.random import RandomAgent
 from latentplan.commands.main import main
 from latentplan.config import Config, UserError
 from latentplan.models import WorldModel
@@ -106,6 +107,11 @@ def test_export_actor_takes_an_agent_in_memory(tmp_path, module):
     )
     assert np.allclose(ours.detach().numpy(), agent.act(frame), atol=1e-4)
     assert not torch.allclose(ours, other)
+
+
+def test_export_actor_refuses_what_was_not_trained(tmp_path):
+    with pytest.raises(UserError, match="a trained agent or its folder is exported, got RandomAgent"):
+        export_actor(RandomAgent(2), tmp_path / "a.pt2")
 
 
 @pytest.mark.parametrize(

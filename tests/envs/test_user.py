@@ -227,9 +227,10 @@ def test_wrap_user_env_refuses_an_environment_without_a_space(name):
         wrap_user_env(TimeLimit(clock, 5))
 
 
-def test_wrap_user_env_refuses_an_action_repeat_below_1():
-    with pytest.raises(UserError, match="action_repeat must be at least 1"):
-        wrap_user_env(Clock(), 0)
+@pytest.mark.parametrize("action_repeat", [0, 2.5])
+def test_wrap_user_env_refuses_an_action_repeat_that_counts_no_steps(action_repeat):
+    with pytest.raises(UserError, match="action_repeat must be a whole number of at least 1"):
+        wrap_user_env(Clock(), action_repeat)
 
 
 def test_make_from_seeds_the_first_reset_only():

@@ -1,5 +1,6 @@
 """Closed-loop episodes: starts depend on the seed alone; rewards, frames and decision times are counted."""
 
+import json
 import math
 import time
 
@@ -114,6 +115,25 @@ def test_run_episodes_ends_an_episode_when_the_environment_does(terminates):
 def test_run_episodes_refuses_rewards_that_are_not_finite(value):
     with pytest.raises(UserError, match="not finite"):
         run_episodes(ClockEnv(), NoisyAgent(value), [0])
+
+
+@pytest.mark.parametrize("reward", [None, "high", np.zeros(2)])
+def test_reward_that_is_no_number_is_named(monkeypatch, reward):
+    monkeypatch.setattr(ClockEnv, "step", lambda env, action: (env._frame(), reward, False, True, {}))
+    with pytest.raises(UserError, match="reward that is no number"):
+        run_episodes(ClockEnv(), NoisyAgent(), [0])
+
+
+def test_evaluate_agent_refuses_vector_environments_before_it_plays():
+    with pytest.raises(UserError, match="one environment, not a vector environment"):
+        evaluate_agent(NoisyAgent(), gymnasium.vector.SyncVectorEnv([ClockEnv]), seed=0, episodes=1)
+
+
+def test_evaluate_agent_gives_plain_values_for_any_seed_and_agent():
+    agent = NoisyAgent()
+    agent.last_source = "policy"  # a word of the user's own
+    result = evaluate_agent(agent, ClockEnv(length=4), seed=np.int64(3), episodes=1)
+    assert json.loads(json.dumps(result))["action_source"] == {"plan": 0, "tail": 0, "actor": 4}
 
 
 def test_evaluate_agent_summarizes_the_episodes_of_its_seeds():

@@ -138,6 +138,12 @@ def test_optimizer_names_a_bad_setting():
         CEMTrajectoryOptimizer(3, 1, num_candidates=5)
 
 
+@pytest.mark.parametrize("start", [np.full((3, 1), np.nan), np.zeros(3), np.zeros((1, 3, 1))])
+def test_optimizer_refuses_a_start_that_is_no_finite_sequence(start):
+    with pytest.raises(ValueError, match="warm_start_mean must be finite numbers"):
+        CEMTrajectoryOptimizer(3, 1).plan(np.zeros(2), rollout, start)
+
+
 def test_rollout_fn_may_write_to_its_sequence():
     def written(state, sequence):
         sequence += state

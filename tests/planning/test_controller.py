@@ -72,6 +72,12 @@ def test_reset_with_mask_forgets_only_masked_environments(states, make_controlle
     assert controller.plan.info["iterations"].tolist() == [1] * 5
 
 
+@pytest.mark.parametrize("replan_every", [0, 7, 2.5])
+def test_controller_refuses_a_replan_every_that_counts_no_actions(make_controller, replan_every):
+    with pytest.raises(ValueError, match=r"replan_every \(.*\) must be a whole number in 1 to the horizon"):
+        make_controller(replan_every=replan_every)
+
+
 def test_controller_executes_replan_every_actions_of_a_plan(point, states, make_controller):
     controller = make_controller(replan_every=3)
     actions = [controller.act(states) for _ in range(3)]

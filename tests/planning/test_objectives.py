@@ -270,6 +270,10 @@ def test_at_every_state_sums_the_excess_over_the_steps(walk, actions):
 def test_goal_term_and_risk_name_a_bad_argument():
     with pytest.raises(ValueError, match="metric"):
         goal_term(torch.zeros(2), metric="l1")
+    with pytest.raises(ValueError, match="num_particles must be a whole number"):
+        risk(learned_return(), num_particles=2.5)
+    with pytest.raises(ValueError, match="a rate limit must be above 0"):
+        rate_limit([])
     with pytest.raises(ValueError, match="measure"):
         risk(learned_return(), measure="best")
     with pytest.raises(ValueError, match="goal"):
