@@ -221,7 +221,7 @@ def _serve(connection: Connection, factory: CloudpickleWrapper) -> None:
     # Python refuses children to a process that ends with its parent, but a simulator may be one.
     multiprocessing.current_process()._config["daemon"] = False  # type: ignore[attr-defined]
     env: Any = None
-    number = 0
+    asked = 0
     answer: tuple[str, Any]
     try:
         env = factory()
@@ -231,8 +231,8 @@ def _serve(connection: Connection, factory: CloudpickleWrapper) -> None:
         answer = "failed", describe_failure(error)
     while True:
         try:
-            _send(connection, number, answer)
-            number, *request = connection.recv()
+            _send(connection, asked, answer)
+            asked, *request = connection.recv()
         except (EOFError, OSError):
             os._exit(0)
         try:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 import warnings
 import weakref
-from numbers import Integral
 from typing import TYPE_CHECKING, Any
 
 import gymnasium
@@ -123,7 +122,7 @@ class PixelEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         config: EnvConfig | None = None,
     ) -> None:
         """Checks the spaces; see `wrap_user_env`."""
-        if not isinstance(action_repeat, Integral) or action_repeat < 1:
+        if action_repeat % 1 or action_repeat < 1:
             raise UserError(f"action_repeat must be a whole number of at least 1, got {action_repeat}")
         accepted = accept_spaces(env.observation_space, env.action_space, config)
         self._observations, self._actions, self.spaces = accepted.observations, accepted.actions, accepted.spaces

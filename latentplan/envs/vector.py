@@ -8,7 +8,6 @@ import time
 import warnings
 from dataclasses import dataclass, field
 from functools import partial
-from numbers import Integral
 from typing import TYPE_CHECKING, Any
 
 import gymnasium
@@ -179,7 +178,7 @@ class GuardedVectorEnv(VectorEnv[np.ndarray, np.ndarray, Any]):
             EnvironmentFault: An environment failed more often than the budget of restarts allows.
             ValueError: There is not one seed, or not one value of the mask, for each environment.
         """
-        seeds = [int(seed) + index for index in range(self.num_envs)] if isinstance(seed, Integral) else seed
+        seeds = [int(seed) + index for index in range(self.num_envs)] if isinstance(seed, int | np.integer) else seed
         mask = (options or {}).get("reset_mask", np.ones(self.num_envs, dtype=bool))
         self._check_number("reset_mask", mask)
         if seeds is not None:

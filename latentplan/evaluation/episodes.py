@@ -91,9 +91,7 @@ def evaluate_agent(
         UserError: The environment gave a reward that is not a finite number, or is a vector environment.
     """
     if hasattr(env, "single_observation_space"):
-        raise UserError(
-            "evaluate_agent plays one environment, not a vector environment: give it one that make() returns"
-        )
+        raise UserError("evaluate_agent plays one environment, not a vector environment: make it with gymnasium.make")
     seed = int(seed)
     seeds = [episode_seed(seed, index) for index in range(episodes)]
     return {"seed": seed, **summarize(run_episodes(env, agent, seeds, on_step=on_step))}

@@ -169,6 +169,8 @@ def _make_plan(mean: np.ndarray) -> Plan:
     """Returns a plan with this mean (horizon, action), of which no action has been executed."""
     sequence = torch.as_tensor(mean, dtype=torch.float64, device="cpu")[None]
     if sequence.ndim != 3 or not bool(torch.isfinite(sequence).all()):
-        raise ValueError(f"warm_start_mean must be finite numbers (horizon, action), got shape {np.shape(mean)}")
+        raise ValueError(
+            f"warm_start_mean must be finite numbers (horizon, action), got shape {tuple(sequence.shape[1:])}"
+        )
     zero = torch.zeros(1, dtype=torch.long, device="cpu")
     return Plan(sequence, sequence, torch.ones_like(sequence), zero.float(), {}, None, zero == 0, zero)

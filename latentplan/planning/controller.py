@@ -7,7 +7,6 @@ import inspect
 import time
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
-from numbers import Integral
 from typing import Any
 
 import torch
@@ -64,7 +63,7 @@ class ModelPredictiveController:
         callback: Callable[[Iteration], Any] | None = None,
     ) -> None:
         horizon = min(planner.horizon, planner.goal_horizon or planner.horizon)
-        if not isinstance(replan_every, Integral) or not 1 <= replan_every <= horizon:
+        if replan_every % 1 or not 1 <= replan_every <= horizon:
             raise ValueError(f"replan_every ({replan_every}) must be a whole number in 1 to the horizon ({horizon})")
         self.planner = planner
         self.model = model

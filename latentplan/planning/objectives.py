@@ -14,7 +14,6 @@ import operator
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
-from numbers import Integral
 from typing import Any
 
 import torch
@@ -267,7 +266,7 @@ def risk(objective: Term, *, measure: str = "cvar", num_particles: int = 8, wors
     """
     if measure not in ("mean", "worst", "cvar"):
         raise ValueError(f"measure must be mean, worst or cvar, got {measure!r}")
-    if not isinstance(num_particles, Integral) or num_particles < 1 or not 0.0 < worst_share <= 1.0:
+    if num_particles % 1 or num_particles < 1 or not 0.0 < worst_share <= 1.0:
         given = f"got {num_particles} and {worst_share}"
         raise ValueError(f"num_particles must be a whole number from 1 on and worst_share lie in (0, 1], {given}")
     inner, share = as_objective(objective), {"mean": 1.0, "worst": 0.0, "cvar": worst_share}[measure]

@@ -212,6 +212,7 @@ class Plan:
             ValueError: The mask does not have one value for each environment.
         """
         check_shape("mask", mask, self.is_warm.shape)
+        assert self.is_followed is not None
         is_left = ~mask.to("cpu", torch.bool)
         return replace(self, is_warm=self.is_warm & is_left, is_followed=self.is_followed & is_left)
 

@@ -63,8 +63,8 @@ class Watch:
         for leaf in tree_leaves(last_state):
             if isinstance(leaf, Tensor) and leaf.shape[:1] != (num_rows,):
                 raise ValueError(
-                    f"{type(model).__name__} returned a state of shape {tuple(leaf.shape)} for {num_rows} rows of actions; "
-                    "dim 0 of a state is its rows"
+                    f"{type(model).__name__} returned a state of shape {tuple(leaf.shape)} for {num_rows} rows of "
+                    "actions; dim 0 of a state is its rows"
                 )
         for name, given, copy in zip(("state", "action"), self._given, self._copies, strict=True):
             pairs = zip(tree_leaves(given), tree_leaves(copy), strict=True)

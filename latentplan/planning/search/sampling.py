@@ -108,9 +108,10 @@ def _colour_factor(horizon: int, noise_beta: float) -> list[list[float]]:
     """Returns the Cholesky factor of the covariance over steps of noise with power 1 / frequency**noise_beta.
 
     The noise has unit variance. The spectrum covers twice the horizon: over the horizon alone the noise would be
-    periodic, and the last step correlated with the first. It covers eight steps at least, since noise without a
-    constant part changes its sign within the window, which would make two steps rougher than white noise. Coloured noise for CEM is from Pinneri et al. 2020,
-    "Sample-efficient cross-entropy method for real-time planning", section 3.1.
+    periodic, and the last step correlated with the first. It covers eight steps at least: noise without a constant part
+    changes its sign within the window, so that over a window of four steps it would be rougher than white noise.
+    Coloured noise for CEM is from Pinneri et al. 2020, "Sample-efficient cross-entropy method for real-time planning",
+    section 3.1.
     """
     window = max(2 * horizon, 8)
     frequency = torch.arange(1, window // 2 + 1, dtype=torch.float64, device="cpu") / window
