@@ -13,7 +13,7 @@ import math
 import re
 import types
 import typing
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -108,9 +108,7 @@ def read_values(
     """
     names = names or {}
     known = [setting.key for setting in settings]
-    for key in values:
-        if key not in known:
-            raise_unknown("setting", key, known)
+    require_known("setting", values, known)
     texts = {setting.key: values[setting.key] for setting in settings if _is_text(setting, values)}
     for setting in settings:
         if setting.key in texts and setting.choices and texts[setting.key] not in setting.choices:
@@ -132,8 +130,7 @@ def take_values(settings: Sequence[Setting], values: Mapping[str, Any]) -> dict[
     """
     known, taken = {setting.key: setting for setting in settings}, {}
     for key in values:
-        if key not in known:
-            raise_unknown("setting", key, known)
+        require_known("setting", (key,), known)
         setting = known[key]
         value, kinds = _spell_numbers(setting, values[key]), alternatives(setting.hint)
         if isinstance(value, list):
@@ -175,6 +172,13 @@ def fits(value: Any, hint: Any) -> bool:
 def alternatives(hint: Any) -> tuple[Any, ...]:
     """The types that a hint allows: `int | None` as (int, NoneType), any other hint alone."""
     return typing.get_args(hint) if typing.get_origin(hint) in (typing.Union, types.UnionType) else (hint,)
+
+
+def require_known(kind: str, names: Iterable[str], known: Collection[str]) -> None:
+    """Refuses names that are not known; arguments and error are those of `raise_unknown`."""
+    for name in names:
+        if name not in known:
+            raise_unknown(kind, name, known)
 
 
 def raise_unknown(kind: str, name: str, known: Iterable[str]) -> typing.NoReturn:

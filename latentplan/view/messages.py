@@ -18,7 +18,7 @@ from typing import Any
 from latentplan.agents.modes import MODES
 from latentplan.config import PlannerConfig, UserError
 from latentplan.config.checks import shown
-from latentplan.config.parsing import list_settings, raise_unknown, read_values
+from latentplan.config.parsing import list_settings, raise_unknown, read_values, require_known
 from latentplan.config.quantities import QUANTITIES
 from latentplan.reporting.page import data_address, encode_png
 from latentplan.view.pace import Pace
@@ -39,9 +39,7 @@ def obey(session: Session, text: str) -> list[dict[str, Any]]:
         UserError: The request cannot be followed; the session goes on as before.
     """
     request = _read_object(text)
-    for name in request:
-        if name not in (*TEXTS, *SEARCH, "push", "reset", "picture"):
-            raise_unknown("request", name, (*TEXTS, *SEARCH, "push", "reset", "picture"))
+    require_known("request", request, (*TEXTS, *SEARCH, "push", "reset", "picture"))
     force = _read_number("push", request["push"]) if "push" in request else None
     if force is not None:
         session.check_push(force)

@@ -22,7 +22,7 @@ from latentplan.config import UserError
 from latentplan.config.checks import above_zero, at_least
 from latentplan.config.extras import require_extra
 from latentplan.config.learning import COLLECTION_BACKENDS, MAX_WORKERS, CollectionBackend
-from latentplan.config.parsing import option, raise_unknown
+from latentplan.config.parsing import option, require_known
 from latentplan.config.settings import RenderQuality
 
 if TYPE_CHECKING:
@@ -76,9 +76,7 @@ class Request(ComposeRequest):
         if len(set(self.workers)) < 3:
             raise UserError("--workers must name at least three numbers, from which the model is fitted")
         above_zero(self, "update_ms", "link_gbit")
-        for backend in self.backends:
-            if backend not in COLLECTION_BACKENDS:
-                raise_unknown("backend", backend, COLLECTION_BACKENDS)
+        require_known("backend", self.backends, COLLECTION_BACKENDS)
         if self.ray_address is not None and "ray" not in self.backends:
             raise UserError("--ray-address has no effect here: name ray in --backends too")
 

@@ -15,7 +15,7 @@ from bench.report import format_interval, format_number, format_table, write_jso
 from latentplan.commands.shell import ComputeRequest
 from latentplan.config import UserError, to_dict
 from latentplan.config.checks import at_least
-from latentplan.config.parsing import option, raise_unknown
+from latentplan.config.parsing import option, require_known
 
 if TYPE_CHECKING:
     from bench.realtime_measurements import Row, Trial
@@ -50,9 +50,7 @@ class Request(ComputeRequest):
     def __post_init__(self) -> None:
         super().__post_init__()
         at_least(self, episodes=1, seed=0)
-        for part in self.parts:
-            if part not in PARTS:
-                raise_unknown("part", part, PARTS)
+        require_known("part", self.parts, PARTS)
         if min(self.rates) <= 0.0:
             raise UserError(f"--rates must be above 0, got {min(self.rates):g}")
 

@@ -15,7 +15,7 @@ from bench.report import format_number, format_table, write_json
 from latentplan.config import RENDER_QUALITIES, EnvConfig
 from latentplan.config.checks import at_least
 from latentplan.config.files import DOMAINS, compose
-from latentplan.config.parsing import option, raise_unknown
+from latentplan.config.parsing import option, require_known
 
 if TYPE_CHECKING:
     import numpy as np
@@ -39,9 +39,7 @@ class Request:
 
     def __post_init__(self) -> None:
         at_least(self, frames=1)
-        for domain in self.domains:
-            if domain not in DOMAINS:
-                raise_unknown("domain", domain, DOMAINS)
+        require_known("domain", self.domains, DOMAINS)
 
 
 def run(request: Request) -> int:

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 from bench.report import format_number, format_table, write_json
 from latentplan.commands.shell import ComputeRequest
 from latentplan.config.checks import above_zero, at_least
-from latentplan.config.parsing import option, raise_unknown
+from latentplan.config.parsing import option, require_known
 
 if TYPE_CHECKING:
     from latentplan.agents.base import Agent, Seen
@@ -81,9 +81,7 @@ class Request(ComputeRequest):
         super().__post_init__()
         above_zero(self, "control_hz")
         at_least(self, decisions=1, block=1)
-        for mode in self.mode:
-            if mode not in MODES:
-                raise_unknown("mode", mode, MODES)
+        require_known("mode", self.mode, MODES)
 
 
 def run(request: Request) -> int:

@@ -20,7 +20,7 @@ from latentplan.commands.flags import overrides
 from latentplan.commands.shell import ComputeRequest, check_search, search_settings
 from latentplan.config import EnvConfig, PlannerConfig, UserError, to_dict
 from latentplan.config.checks import above_zero, at_least
-from latentplan.config.parsing import option, raise_unknown
+from latentplan.config.parsing import option, require_known
 from latentplan.objectives.parser import split_outside_quotes
 
 if TYPE_CHECKING:
@@ -163,9 +163,7 @@ def list_jobs(request: Request) -> list[Job]:
         raise UserError("give --objectives 'height > 1.2 | speed -> 2.0' or --constraints 'cart < 0.5', or both")
     known = (*OBJECTIVE_PLAYERS, "unconstrained")
     wanted = request.players
-    for name in wanted:
-        if name not in known:
-            raise_unknown("player", name, known)
+    require_known("player", wanted, known)
     trained = TRAINED_PLAYERS if request.trained is not None else ()
     asked = [name for name in (*OBJECTIVE_PLAYERS, *trained) if name in (*wanted, *trained)]
     jobs = [
