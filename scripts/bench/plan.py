@@ -6,19 +6,18 @@ alone.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from bench.options import ComposeRequest, SearchRequest
-from bench.peers.install import FOLDER, PEERS, PeerError
+from bench.peers.install import FOLDER, PEERS, choose_peers, left_out_on_error
 from bench.report import format_number, format_table, write_json
 from latentplan.commands.flags import overrides
 from latentplan.config import ModelConfig, to_dict
 from latentplan.config.checks import at_least
-from latentplan.config.parsing import option, raise_unknown
+from latentplan.config.parsing import option
 
 if TYPE_CHECKING:
     from bench.peers.client import PeerProcess
@@ -78,15 +77,7 @@ class Request(SearchRequest, ComposeRequest):
     def __post_init__(self) -> None:
         super().__post_init__()
         at_least(self, plans=1)
-        if self.peers != ("none",):
-            for name in self.peers:
-                if name not in PEERS:
-                    raise_unknown("peer", name, [*PEERS, "none"])
-
-    @property
-    def peer_names(self) -> list[str]:
-        """The peers that take part."""
-        return [] if self.peers == ("none",) else list(self.peers)
+        choose_peers(self.peers)
 
 
 def run(request: Request) -> int:
@@ -108,7 +99,7 @@ def run(request: Request) -> int:
         threads=torch.get_num_threads(),
     )
     machine = describe_machine(device)
-    measured = compare(problem, request.peer_names, plans)
+    measured = compare(problem, choose_peers(request.peers), plans)
     result = {
         **summarise(measured.times, problem.threads),
         "peers": measured.versions,
@@ -145,7 +136,7 @@ def compare(problem: Problem, peers: Sequence[str], plans: int, folder: Path = F
     processes: list[PeerProcess] = []
     try:
         for name in peers:
-            with _left_out_on_error(name, left_out):
+            with left_out_on_error(name, left_out):
                 processes.append(PeerProcess(name, problem, folder))
         peer_arms = [_peer_arm(process, dtype) for process in processes for dtype in DTYPES]
         times = _take_turns([*own_arms(problem), *peer_arms], plans, left_out)
@@ -235,16 +226,6 @@ def _take_turns(arms: Sequence[Arm], plans: int, left_out: dict[str, str]) -> Ti
     for _ in range(WARM_UP_PLANS + plans):
         for arm in arms:
             if arm.planner not in left_out:
-                with _left_out_on_error(arm.planner, left_out):
+                with left_out_on_error(arm.planner, left_out):
                     times[arm.planner, arm.dtype].append(arm.search_ms())
     return {key: laps[WARM_UP_PLANS:] for key, laps in times.items() if key[0] not in left_out}
-
-
-@contextmanager
-def _left_out_on_error(name: str, left_out: dict[str, str]) -> Iterator[None]:
-    """Records and prints the reason if a library cannot take part; the caller goes on without the library."""
-    try:
-        yield
-    except PeerError as error:
-        left_out[name] = str(error)
-        print(f"{name} left out: {error}", flush=True)

@@ -13,19 +13,27 @@ import math
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack
 from dataclasses import dataclass, field
 from pathlib import Path
 from statistics import fmean, median, stdev
 from typing import TYPE_CHECKING, Any
 
 from bench.options import ComputeRequest
-from bench.peers.install import FOLDER, PEERS, PeerError, install, installed_version
+from bench.peers.install import (
+    FOLDER,
+    PEERS,
+    PeerError,
+    choose_peers,
+    install,
+    installed_version,
+    left_out_on_error,
+)
 from bench.report import format_interval, format_number, format_table, write_json
 from latentplan import __version__
 from latentplan.config import UserError
 from latentplan.config.checks import above_zero, at_least
-from latentplan.config.parsing import option, raise_unknown
+from latentplan.config.parsing import option, raise_unknown, require_known
 
 if TYPE_CHECKING:
     from bench.peers.client import JsonProcess
@@ -77,15 +85,9 @@ class Request(ComputeRequest):
         super().__post_init__()
         at_least(self, seeds=2, tuning_seeds=1, samples=2, iterations=1, timed=1, jobs=1)
         above_zero(self, "budget_ms")
-        for name in self.problems:
-            if name not in PROBLEM_NAMES:
-                raise_unknown("problem", name, PROBLEM_NAMES)
-        for name in self.budgets:
-            if name not in BUDGETS:
-                raise_unknown("budget", name, BUDGETS)
-        for name in () if self.peers == ("none",) else self.peers:
-            if name not in PEERS:
-                raise_unknown("peer", name, [*PEERS, "none"])
+        require_known("problem", self.problems, PROBLEM_NAMES)
+        require_known("budget", self.budgets, BUDGETS)
+        choose_peers(self.peers)
         has_budget = self.budget_ms is not None or self.earlier or "milliseconds" not in self.budgets
         if self.planners == ("none",) and not has_budget:
             raise UserError("--planners none has no milliseconds to compare with: give --budget-ms or --earlier")
@@ -203,8 +205,8 @@ def start_libraries(request: Request, stack: ExitStack, left_out: dict[str, str]
     libraries = {OURS: JsonProcess(Path(sys.executable), own, FOLDER.parent / f"{OURS}.log")}
     stack.callback(libraries[OURS].close)
     select_planners(request, libraries[OURS].ask({"do": "list"})["planners"])  # before others are installed
-    for name in () if request.peers == ("none",) else request.peers:
-        with _left_out_on_error(name, left_out):
+    for name in choose_peers(request.peers):
+        with left_out_on_error(name, left_out):
             python = install(name, FOLDER)
             process = JsonProcess(python, ["-m", PEERS[name].controllers, threads], FOLDER / f"{name}.search.log")
             stack.callback(process.close)
@@ -281,7 +283,7 @@ def compare(
 
         def do_library(library: str) -> None:
             for arm in [arm for arm in among if arm.library == library]:
-                with _left_out_on_error(arm.title, left_out):
+                with left_out_on_error(arm.title, left_out):
                     results[id(arm)] = task(arm)
 
         with ThreadPoolExecutor(request.jobs) as pool:
@@ -362,7 +364,7 @@ def take_turns(
         for arm in arms:
             if arm.title in left_out:
                 continue
-            with _left_out_on_error(arm.title, left_out):
+            with left_out_on_error(arm.title, left_out):
                 laps[id(arm)].append(arm.ask("time", counts[id(arm)], request)["ms"])
     return {id(arm): median(laps[id(arm)][WARM_UP:]) for arm in arms if arm.title not in left_out}
 
@@ -449,13 +451,3 @@ def best_table(best: Sequence[dict[str, Any]]) -> str:
 def _cells(row: dict[str, Any] | None) -> list[str]:
     digits = {"cost_mean": 2, "cost_sd": 2, "evaluations": 0, "ms_p50": 1}
     return [format_number(row[key] if row else None, number) for key, number in digits.items()]
-
-
-@contextmanager
-def _left_out_on_error(name: str, left_out: dict[str, str]) -> Iterator[None]:
-    """Records and prints the reason if a planner cannot take part; the caller goes on without it."""
-    try:
-        yield
-    except PeerError as error:
-        left_out[name] = str(error)
-        print(f"{name} left out: {error}", flush=True)

@@ -6,10 +6,13 @@ import shlex
 import subprocess
 import sys
 import sysconfig
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from importlib import metadata
 from pathlib import Path
 from typing import NamedTuple
+
+from latentplan.config.parsing import raise_unknown
 
 INSTALL_SECONDS = 600
 FOLDER = Path(__file__).resolve().parents[3] / "runs" / ".peers" / f"python{sysconfig.get_python_version()}"
@@ -61,6 +64,29 @@ PEERS = {
     "stable_worldmodel": Peer("bench.peers.stable_cem", "stable-worldmodel", ("loguru",), "bench.controllers.stable"),
     "pytorch_icem": Peer("bench.peers.icem", "pytorch-icem", ("colorednoise", *_UTILITIES), "bench.controllers.icem"),
 }
+
+
+def choose_peers(names: tuple[str, ...]) -> tuple[str, ...]:
+    """The peers that a flag names; `none` alone stands for no peer.
+
+    Raises:
+        UserError: There is no such peer.
+    """
+    chosen = () if names == ("none",) else names
+    for name in chosen:
+        if name not in PEERS:
+            raise_unknown("peer", name, [*PEERS, "none"])
+    return chosen
+
+
+@contextmanager
+def left_out_on_error(name: str, left_out: dict[str, str]) -> Iterator[None]:
+    """Records and prints the reason if a library or planner cannot take part; the caller goes on without it."""
+    try:
+        yield
+    except PeerError as error:
+        left_out[name] = str(error)
+        print(f"{name} left out: {error}", flush=True)
 
 
 def install(name: str, folder: Path) -> Path:
