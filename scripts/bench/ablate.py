@@ -12,7 +12,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from bench.ablation_arms import NAMES, REFERENCE, Outcome, check_checkpoint, parse_arms, play_arm
+from bench.ablation_arms import NAMES, REFERENCE, Outcome, parse_arms, play_arm
 from bench.report import format_interval, format_number, format_table, write_csv, write_json
 from bench.workers import run_in_order
 from latentplan.commands.shell import ComputeRequest
@@ -51,7 +51,9 @@ class Request(ComputeRequest):
 def run(request: Request) -> int:
     """Plays every arm from the same starts and compares the arms with the full planner."""
     episodes, seed, workers, checkpoint = request.episodes, request.seed, request.workers, str(request.checkpoint)
-    info, config = check_checkpoint(request.checkpoint)
+    from latentplan.agents.checkpoint import load_model
+
+    _, config, info = load_model(request.checkpoint)
     planner = config.planner
     arms = parse_arms(request.arms, planner)
     device = request.use_device()

@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any, NamedTuple
 
-from latentplan.config import Config, PlannerConfig, UserError, to_dict
+from latentplan.config import PlannerConfig, UserError, to_dict
 from latentplan.config.files import build_config, field_names
 from latentplan.config.parsing import raise_unknown
 from latentplan.config.planner import override_planner
@@ -119,18 +118,6 @@ def play_arm(arm: Arm, checkpoint: str, seeds: Sequence[int], device: str) -> Ou
         latency_percentiles(np.concatenate([episode.decision_ms for episode in episodes])),
         float(np.mean(differs)) if differs else None,
     )
-
-
-def check_checkpoint(path: Path) -> tuple[dict[str, Any], Config]:
-    """The description of a checkpoint, and the settings of its run.
-
-    Raises:
-        UserError: The checkpoint is missing or damaged.
-    """
-    from latentplan.agents.checkpoint import load_model
-
-    _, config, info = load_model(path)
-    return info, config
 
 
 def _split_arms(text: str) -> list[tuple[str, list[str]]]:

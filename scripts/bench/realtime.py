@@ -61,7 +61,6 @@ def run(request: Request) -> int:
     device = request.use_device()
     import torch
 
-    from bench.ablation_arms import check_checkpoint
     from bench.machine import describe_machine
     from bench.realtime_measurements import Trial
     from latentplan.agents.checkpoint import load_model
@@ -69,7 +68,7 @@ def run(request: Request) -> int:
     from latentplan.envs import make_env
     from latentplan.evaluation.episodes import episode_seed
 
-    info, config = check_checkpoint(request.checkpoint)
+    _, config, info = load_model(request.checkpoint)
     planner = config.planner
     about = {
         "checkpoint": checkpoint,
@@ -81,7 +80,7 @@ def run(request: Request) -> int:
         "machine": describe_machine(torch.device(device)),
     }
     print(f"{about['domain']}-{about['task']}, {episodes} episodes per point", flush=True)
-    env = make_env(load_model(checkpoint)[1].env)
+    env = make_env(config.env)
     seeds = [episode_seed(seed, index) for index in range(episodes)]
     result: dict[str, list[Row]] = {part: [] for part in request.parts}
     try:

@@ -13,7 +13,6 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from bench.ablation_arms import check_checkpoint
 from bench.report import format_interval, format_number, format_table, write_json
 from bench.workers import run_in_order
 from latentplan.commands.flags import overrides
@@ -110,11 +109,13 @@ def run(request: Request) -> int:
     checkpoint, episodes, seed = str(request.checkpoint), request.episodes, request.seed
     workers, push = request.workers, request.push or 0.0
     jobs = list_jobs(request)
-    info, trained = check_checkpoint(request.checkpoint)
+    from latentplan.agents.checkpoint import load_model
+
+    _, trained, info = load_model(request.checkpoint)
     _check_goals(jobs, info["config"]["env"]["domain"])
     trained_for = None if request.trained is None else str(request.trained)
     if trained_for is not None:
-        domain = check_checkpoint(Path(trained_for))[0]["domain"]
+        domain = load_model(trained_for)[2]["domain"]
         if domain != info["domain"]:
             raise UserError(f"--trained {trained_for!r} controls {domain}, --checkpoint {info['domain']}")
     planner = search_settings(trained, request.planner)
