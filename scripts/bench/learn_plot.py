@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
+from bench.report import save_figure
 from latentplan.reporting.published import METHODS, published_returns_of
 
 if TYPE_CHECKING:
@@ -34,8 +35,6 @@ def plot_runs(curves: Sequence[Curve], mode: str, png: Path) -> None:
     """Draws evaluation returns against env frames: one panel per task, two in a row, one line per seed."""
     from matplotlib.figure import Figure
     from matplotlib.ticker import EngFormatter
-
-    from latentplan.reporting.curves import save_figure
 
     tasks = list(dict.fromkeys(curve.task for curve in curves))
     rows, columns = (len(tasks) + 1) // 2, min(2, len(tasks))

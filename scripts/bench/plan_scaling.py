@@ -10,7 +10,7 @@ from typing import Any
 
 from bench.peers.problem import Problem
 from bench.plan_searches import planner_search, timed
-from bench.report import format_number, format_table
+from bench.report import format_number, format_table, save_figure
 
 FACTORS = (0.25, 0.5, 1.0, 2.0, 4.0)  # multiples of the requested samples, horizon and iterations
 BATCHES = (1, 4, 16, 64)
@@ -52,8 +52,6 @@ def scaling_table(rows: Sequence[dict[str, Any]]) -> str:
 def plot_scaling(rows: Sequence[dict[str, Any]], png: Path) -> None:
     """Draws one panel per axis, with a dotted line of linear growth."""
     from matplotlib.figure import Figure
-
-    from latentplan.reporting.curves import save_figure
 
     figure = Figure(figsize=(12, 3.4), layout="constrained")
     for axes, axis in zip(figure.subplots(1, len(AXES), sharey=True), AXES, strict=True):

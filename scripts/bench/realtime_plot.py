@@ -6,6 +6,8 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from bench.report import save_figure
+
 Rows = Sequence[Mapping[str, Any]]
 BLUE, ORANGE = "#1f6fb4", "#d9730d"
 AGENT_STYLES = {
@@ -25,8 +27,6 @@ def plot_realtime(result: Mapping[str, Rows], png: Path) -> None:
         png: Path of the figure.
     """
     from matplotlib.figure import Figure
-
-    from latentplan.reporting.curves import save_figure
 
     panels: dict[str, Callable[[Any, Rows], None]] = {
         "rates": _draw_rates,

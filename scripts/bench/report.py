@@ -1,4 +1,4 @@
-"""Results as text tables, JSON and CSV."""
+"""Results as text tables, JSON, CSV and figures."""
 
 from __future__ import annotations
 
@@ -8,10 +8,13 @@ import json
 import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from latentplan.config import UserError
-from latentplan.config.writing import write_whole
+from latentplan.config.writing import replaced_whole, write_whole
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 
 def format_table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
@@ -58,6 +61,12 @@ def write_text(path: Path, text: str) -> None:
         write_whole(path, text)
     except OSError as error:
         raise UserError(f"{path} could not be written: {error}") from error
+
+
+def save_figure(figure: Figure, png: Path) -> None:
+    """Writes a figure as PNG in place of a file."""
+    with replaced_whole(png) as part:
+        figure.savefig(part, dpi=120, format="png")
 
 
 def _aligned(line: Sequence[str], widths: Sequence[int]) -> str:

@@ -9,15 +9,16 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from bench.learn_plot import mark_published
+from bench.report import save_figure
 from bench.suite_rows import Row
 from bench.suite_scores import LARGEST_RETURN, TOLERANCE, Curves, Scores, profile
-from latentplan.reporting.curves import CURVES, save_figure
 from latentplan.reporting.published import METHODS_AT_REPEAT_2
 
 if TYPE_CHECKING:
     from matplotlib.artist import Artist
     from matplotlib.axes import Axes
 
+STYLES = {"planner": ("#1f6fb4", "-"), "actor": ("#d9791a", "--")}
 COLUMNS = 3
 NUM_THRESHOLDS = 201
 COLORS = dict(
@@ -75,9 +76,9 @@ def plot_profile(own: Mapping[str, Scores], published: Mapping[str, Scores], png
         share, *_ = profile(scores, thresholds)
         axes.step(LARGEST_RETURN * thresholds, share, where="post", color=COLORS[name], linewidth=1.0, label=name)
     for mode, scores in own.items():
-        label, color, style = CURVES[f"{mode}_return"]
+        color, style = STYLES[mode]
         share, low, high = profile(scores, thresholds)
-        axes.step(LARGEST_RETURN * thresholds, share, style, where="post", color=color, linewidth=2.0, label=label)
+        axes.step(LARGEST_RETURN * thresholds, share, style, where="post", color=color, linewidth=2.0, label=mode)
         if low is not None and high is not None:
             axes.fill_between(LARGEST_RETURN * thresholds, low, high, step="post", color=color, alpha=0.15)
     axes.set(xlabel="return", ylabel="share of runs with a higher return", xlim=(0.0, LARGEST_RETURN), ylim=(0.0, 1.02))
@@ -90,7 +91,7 @@ def _draw_runs(axes: Axes, runs: Sequence[Sequence[Row]]) -> None:
     """Draws planner and actor of each run; the first run alone names them in the legend."""
     for number, rows in enumerate(runs):
         frames = [row.env_frames for row in rows]
-        for column, (label, color, style) in CURVES.items():
-            returns = [getattr(row, column.removesuffix("_return")) for row in rows]
-            shown = label if number == 0 else None
+        for mode, (color, style) in STYLES.items():
+            returns = [getattr(row, mode) for row in rows]
+            shown = mode if number == 0 else None
             axes.plot(frames, returns, style, color=color, marker="o", markersize=2.5, linewidth=1.2, label=shown)
