@@ -18,6 +18,8 @@ import tempfile
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
+from latentplan.config.manifest import sync
+
 SUM = ".sha256"
 LOCK = ".lock"
 _OTHERS = 0o077
@@ -88,9 +90,9 @@ def _build_into(folder: Path, name: str, build: Callable[[Path], None]) -> None:
         noted.write_text(hashlib.sha256(fresh.read_bytes()).hexdigest() + "\n")
         for path in (fresh, noted):
             path.chmod(0o600)
-            _flush(path)
+            sync(path)
             path.replace(folder / path.name)
-    _flush(folder)
+    sync(folder)
 
 
 def _read_own(path: Path) -> bytes:
@@ -105,14 +107,6 @@ def _read_own(path: Path) -> bytes:
         if not stat.S_ISREG(facts.st_mode) or facts.st_uid != os.geteuid() or facts.st_mode & _OTHERS_WRITE:
             raise PermissionError(f"{path} is not this user's own")
         return file.read()
-
-
-def _flush(path: Path) -> None:
-    opened = os.open(path, os.O_RDONLY)
-    try:
-        os.fsync(opened)
-    finally:
-        os.close(opened)
 
 
 @contextlib.contextmanager
