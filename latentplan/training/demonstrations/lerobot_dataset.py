@@ -20,7 +20,7 @@ import numpy as np
 from latentplan.config import UserError
 from latentplan.config.extras import import_extra, require_extra
 from latentplan.training.demonstrations.kinds import INFO
-from latentplan.training.demonstrations.recording import RecordedEpisode, name_space
+from latentplan.training.demonstrations.recording import RecordedEpisode, describe_damage, name_space
 
 REWARD, ACTION = "next.reward", "action"
 USER = "a LeRobot dataset"
@@ -71,7 +71,7 @@ class LeRobotDataset:
         except UserError:
             raise
         except Exception as error:  # the readers of tables and films raise many kinds for damaged files
-            raise self._damage(error) from None
+            raise describe_damage(path, USER, error) from None
 
     def read(self, index: int) -> RecordedEpisode:
         """An episode, without its last action."""
@@ -87,7 +87,7 @@ class LeRobotDataset:
         except UserError:
             raise
         except Exception as error:
-            raise self._damage(error) from None
+            raise describe_damage(self.path, USER, error) from None
         counts = {len(values) for values in (frames | vectors).values()} | {len(rows[ACTION]), len(rows[REWARD])}
         if counts != {int(episode["length"])}:
             raise UserError(f"{self.path} is damaged: episode {index} must have {episode['length']} rows and pictures")
@@ -142,12 +142,6 @@ class LeRobotDataset:
         if picture is None:
             raise ValueError("a picture cannot be decoded")
         return np.ascontiguousarray(picture[..., ::-1])
-
-    def _damage(self, error: Exception) -> UserError:
-        if isinstance(error, UserError):
-            return error
-        reason = " ".join(str(error).split())[:200] or type(error).__name__
-        return UserError(f"{self.path} cannot be read as a LeRobot dataset: {reason}")
 
 
 def _short(key: str) -> str:

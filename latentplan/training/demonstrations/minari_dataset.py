@@ -13,8 +13,9 @@ from latentplan.config import UserError
 from latentplan.config.extras import require_extra
 from latentplan.envs.spaces import ONLY_PICTURE, Actions
 from latentplan.training.demonstrations.kinds import METADATA
-from latentplan.training.demonstrations.recording import RecordedEpisode, name_space
+from latentplan.training.demonstrations.recording import RecordedEpisode, describe_damage, name_space
 
+USER = "a Minari dataset"
 KEYS = ("observation_space", "action_space", "minari_version")
 
 
@@ -36,7 +37,7 @@ class MinariDataset:
 
     def __init__(self, path: Path, data: Path) -> None:
         self.path = path
-        require_extra("a Minari dataset", "minari", "h5py")
+        require_extra(USER, "minari", "h5py")
         import minari
         from minari.dataset.minari_storage import MinariStorage
 
@@ -51,7 +52,7 @@ class MinariDataset:
             steps = self._storage.get_episode_metadata(range(self._storage.total_episodes))
             self.lengths = [int(entry["total_steps"]) for entry in steps]
         except Exception as error:  # files of others, read by another package, may raise anything
-            raise self._damage(error) from None
+            raise describe_damage(path, USER, error) from None
         self._is_single = not isinstance(self._storage.observation_space, gymnasium.spaces.Dict)
         named = name_space(path, self._storage.observation_space).spaces
         nested = gymnasium.spaces.Dict, gymnasium.spaces.Tuple  # of which nothing can be learned
@@ -71,7 +72,7 @@ class MinariDataset:
             (found,) = self._storage.get_episodes([index])
             actions = _flatten(self._action_space, found["actions"])
         except Exception as error:
-            raise self._damage(error) from None
+            raise describe_damage(self.path, USER, error) from None
         seen = {ONLY_PICTURE: found["observations"]} if self._is_single else found["observations"]
         seen = {name: values for name, values in seen.items() if name in self.space.spaces}
         rewards = np.asarray(found["rewards"], np.float64)
@@ -82,10 +83,6 @@ class MinariDataset:
                 "more"
             )
         return RecordedEpisode(seen, actions, rewards, bool(found["terminations"][-1]))
-
-    def _damage(self, error: Exception) -> UserError:
-        reason = " ".join(str(error).split())[:200] or type(error).__name__
-        return UserError(f"{self.path} cannot be read as a Minari dataset: {reason}")
 
 
 def _flatten(space: Any, values: Any) -> np.ndarray:

@@ -66,6 +66,12 @@ class Recording(Protocol):
         """
 
 
+def describe_damage(path: Path, kind: str, error: Exception) -> UserError:
+    """One line for a dataset that raised an error when it was read as its kind, such as `a Minari dataset`."""
+    reason = " ".join(str(error).split())[:200] or type(error).__name__
+    return UserError(f"{path} cannot be read as {kind}: {reason}")
+
+
 def name_space(path: Path, space: gymnasium.Space[Any]) -> gymnasium.spaces.Dict:
     """An observation space as a Dict; a picture alone gets the name that it has in an environment.
 
