@@ -32,7 +32,6 @@ from latentplan.objectives.parser import parse_constraints, parse_schedule
 if TYPE_CHECKING:
     from latentplan.envs import SuiteEnv
 
-Floats = NDArray[np.float64]
 MET_DEGREE = 0.9  # degree from which a clause counts as met in films
 PIXEL_MARGIN = 0.1  # root mean square difference to a goal image that counts as one margin; 1 is black to white
 
