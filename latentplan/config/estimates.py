@@ -84,10 +84,10 @@ def estimate_search(search: SearchOptions, model: ModelConfig, on_device: bool =
     return Part("a search", num_bytes, seconds, advice)
 
 
-def estimate_model(model: ModelConfig, copies: int = 1, action_dim: int = 1, frame_size: int = 64) -> Part:
+def estimate_model(model: ModelConfig, copies: int = 1, frame_size: int = 64) -> Part:
     """Memory of a world model and its copies."""
     sizes = "--model.deter_dim, --model.hidden_dim, --model.num_bins, --model.encoder_channels or the decoder's"
-    return Part("the model", _FLOAT * copies * count_parameters(model, action_dim, frame_size), 0.0, sizes)
+    return Part("the model", _FLOAT * copies * count_parameters(model, frame_size=frame_size), 0.0, sizes)
 
 
 def check_parts(parts: list[Part], free: float, place: str = "main memory") -> None:

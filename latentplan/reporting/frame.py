@@ -74,7 +74,7 @@ def compose_frame(
     return canvas
 
 
-def draw_goal_strip(scores: Sequence[float], clauses: Sequence[tuple[str, bool]], width: int = STRIP_WIDTH) -> Frame:
+def draw_goal_strip(scores: Sequence[float], clauses: Sequence[tuple[str, bool]]) -> Frame:
     """A strip with the goals: the scores of the objective as a line on the left, the clauses on the right.
 
     Args:
@@ -82,13 +82,12 @@ def draw_goal_strip(scores: Sequence[float], clauses: Sequence[tuple[str, bool]]
             1. Without scores the clauses begin on the left.
         clauses: Text of every clause, and whether the clause is met; the last of four rows counts clauses without a
             row of their own.
-        width: Width in pixels, even.
 
     Returns:
-        RGB uint8 (96, width, 3).
+        RGB uint8 (96, 520, 3).
     """
-    strip: Frame = np.full((STRIP_HEIGHT, width, 3), _PANEL, np.uint8)
-    half = width // 2
+    strip: Frame = np.full((STRIP_HEIGHT, STRIP_WIDTH, 3), _PANEL, np.uint8)
+    half = STRIP_WIDTH // 2
     if scores:
         _draw_trace(strip, list(scores)[-_WINDOW:], half - 2 * GAP)
     _draw_clauses(strip, clauses, half if scores else 0)

@@ -45,7 +45,7 @@ def interquartile_mean(values: Sequence[float]) -> float:
     return float(_trimmed_mean(np.asarray(values, float)))
 
 
-def interquartile_estimate(groups: Sequence[Sequence[float]], seed: int = 0) -> Estimate:
+def interquartile_estimate(groups: Sequence[Sequence[float]]) -> Estimate:
     """The interquartile mean over all groups with its 95 % interval.
 
     The interval is a stratified bootstrap (Agarwal et al. 2021) for groups of at least five returns. A bootstrap of two
@@ -54,7 +54,6 @@ def interquartile_estimate(groups: Sequence[Sequence[float]], seed: int = 0) -> 
 
     Args:
         groups: Returns by task, one per seed; each resample draws anew within every group.
-        seed: Seed of the resampling.
     """
     mean = interquartile_mean([value for group in groups for value in group])
     if any(len(group) == 1 for group in groups):  # one return has no spread
@@ -67,7 +66,7 @@ def interquartile_estimate(groups: Sequence[Sequence[float]], seed: int = 0) -> 
     def statistic(*resampled: NDArray[np.float64], axis: int = -1) -> NDArray[np.float64]:
         return _trimmed_mean(np.concatenate(resampled, axis), axis)
 
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(0)
     samples = [np.asarray(group, float) for group in groups]
     options = {"n_resamples": NUM_RESAMPLES, "method": "percentile", "vectorized": True, "random_state": rng}
     low, high = bootstrap(samples, statistic, **options).confidence_interval

@@ -12,6 +12,7 @@ from latentplan.config.origin import processor_name
 PRODUCT_SIZES = {"cpu": 2048, "cuda": 8192}
 SMALLEST_PRODUCT = 256
 SLOW_SECONDS = 0.1
+REPEATS = 4  # timed products, after one for warm-up
 PRECISIONS = {"bfloat16": torch.bfloat16, "float32": torch.float32}
 
 
@@ -27,26 +28,25 @@ def describe_machine(device: torch.device) -> dict[str, Any]:
     }
 
 
-def product_limits(device: torch.device, size: int | None = None, repeats: int = 4) -> dict[str, float]:
+def product_limits(device: torch.device, size: int | None = None) -> dict[str, float]:
     """Peak FLOP/s by precision: the fastest of a few large square matrix products.
 
     Args:
         device: Device that computes the products.
         size: Most rows and columns; None takes a size that fills the device.
-        repeats: Number of timed products, after one for warm-up.
     """
     largest = size or PRODUCT_SIZES[device.type]
-    return {name: _product_limit(device, dtype, largest, repeats) for name, dtype in PRECISIONS.items()}
+    return {name: _product_limit(device, dtype, largest) for name, dtype in PRECISIONS.items()}
 
 
-def _product_limit(device: torch.device, dtype: torch.dtype, largest: int, repeats: int) -> float:
+def _product_limit(device: torch.device, dtype: torch.dtype, largest: int) -> float:
     """Peak FLOP/s in one precision; a precision that the device emulates gets smaller products."""
     size = min(largest, SMALLEST_PRODUCT)
     while True:
         left = torch.randn(size, size, device=device, dtype=dtype)
         right = torch.randn(size, size, device=device, dtype=dtype)
         seconds = []
-        for _ in range(repeats + 1):
+        for _ in range(1 + REPEATS):
             started = read_clock(device)
             torch.mm(left, right)
             seconds.append(read_clock(device) - started)

@@ -50,9 +50,9 @@ def planner_search(problem: Problem, dtype: str, batch: int = 1) -> Search:
     return lambda: planner.plan(model, start)
 
 
-def plain_search(problem: Problem, dtype: str = "float32") -> Search:
-    """A cold search by a plain cross-entropy method."""
-    model, start = build_model(problem, dtype), start_state(problem)
+def plain_search(problem: Problem) -> Search:
+    """A cold search by a plain cross-entropy method, in float32."""
+    model, start = build_model(problem, "float32"), start_state(problem)
     shape = (problem.horizon, problem.action_dim)
 
     def search() -> Tensor:

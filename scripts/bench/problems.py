@@ -143,7 +143,7 @@ def navigation() -> ControlProblem:
     return ControlProblem("navigation", 2, -1.0, 1.0, 20, 40, dynamics, cost, draw_start)
 
 
-def linear_quadratic(num_states: int = 60, action_dim: int = 30, num_steps: int = 20) -> ControlProblem:
+def linear_quadratic() -> ControlProblem:
     """Returns a random linear system with a quadratic cost, and many actions.
 
     The system s' = A s + B a is drawn once: A is Gaussian, scaled to the spectral radius 1, and B is Gaussian with a
@@ -151,6 +151,7 @@ def linear_quadratic(num_states: int = 60, action_dim: int = 30, num_steps: int 
     starts in a random direction, so far away that the optimum without bounds on the actions is 36. This optimum, by
     Riccati's recursion, is the lower bound.
     """
+    num_states, action_dim, num_steps = 60, 30, 20
     draw = torch.Generator().manual_seed(0)
     matrix = torch.randn(num_states, num_states, generator=draw)
     transition = matrix / torch.linalg.eigvals(matrix).abs().max()

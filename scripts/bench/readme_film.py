@@ -21,16 +21,16 @@ FIRST, LAST = 80, 190  # decisions of the film, after the walker has stood up an
 QUALITY = 60  # of the WebP encoder, in [0, 100]
 
 
-def draw_film(path: Path, first: int = FIRST, last: int = LAST) -> int:
-    """Writes decisions `first` to `last` as an endless animated WebP in real time; returns the number of pictures."""
+def draw_film(path: Path) -> int:
+    """Writes decisions `FIRST` to `LAST` as an endless animated WebP in real time; returns the number of pictures."""
     agent: Any = load_agent("checkpoints/walker-walk", surprise_limit=None)
     env = make_env(EnvConfig(domain="walker", task="walk", render_quality="exact"))
     frame, _ = env.reset(seed=0)
     agent.seed(0)
     earned, pictures = 0.0, []
-    for decision in range(last):
+    for decision in range(LAST):
         action = agent.act(frame)
-        if decision >= first:
+        if decision >= FIRST:
             camera, imagined = env.render_large(PANEL_SIZE), agent.imagine()
             line = f"return {earned:.0f}    step {decision}"
             pictures.append(Image.fromarray(compose_frame(camera, imagined, [line], horizon=agent.steps_ahead)))
