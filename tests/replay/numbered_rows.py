@@ -61,3 +61,13 @@ def frame_values(batch):
     """Time, episode and lane, read from each frame, (batch, time + 1) each."""
     assert (batch.frames == batch.frames[:, :, :1, :1]).all()
     return batch.frames[:, :, 0, 0].float().unbind(-1)
+
+
+def assert_aligned(batch):
+    """Each sequence lies within one episode, and what comes with a frame belongs to it."""
+    time, episode, lane = frame_values(batch)
+    assert (time.diff(dim=1) == 1.0).all()
+    assert (episode == episode[:, :1]).all() and (lane == lane[:, :1]).all()
+    assert torch.allclose(batch.actions[..., 0], (time[:, :-1] + 0.5) / 256)
+    assert torch.equal(batch.rewards, time[:, 1:])
+    assert torch.equal(batch.deter[:, 0], time[:, 0])

@@ -1,4 +1,4 @@
-"""The replay keeps rows aligned, complete and in order; frames encode their lane, episode and time."""
+"""Examples of what replay holds, draws and refuses; `test_replay_properties.py` has the laws for any replay."""
 
 from pathlib import Path
 
@@ -8,17 +8,14 @@ import torch
 from latentplan.config import UserError
 from latentplan.replay import memory
 from latentplan.replay.memory import count_replay_bytes
-from tests.replay.numbered_rows import NumberedRows, frame_values, make_filled_replay, make_replay, sample
-
-
-def assert_aligned(batch):
-    time, episode, lane = frame_values(batch)
-    assert (time.diff(dim=1) == 1.0).all()
-    assert (episode == episode[:, :1]).all() and (lane == lane[:, :1]).all()
-    assert torch.allclose(batch.actions[..., 0], (time[:, :-1] + 0.5) / 256)
-    assert torch.equal(batch.rewards, time[:, 1:])
-    assert torch.equal(batch.deter[:, 0], time[:, 0])
-
+from tests.replay.numbered_rows import (
+    NumberedRows,
+    assert_aligned,
+    frame_values,
+    make_filled_replay,
+    make_replay,
+    sample,
+)
 
 RINGS = [
     pytest.param({}, id="one lane"),
@@ -27,15 +24,6 @@ RINGS = [
     pytest.param({"capacity": 40, "lanes": 3, "lengths": (7, 4, 9, 6, 8), "chunk": 11}, id="lanes overwritten"),
     pytest.param({"capacity": 12, "lengths": (7, 4, 9), "chunk": 23}, id="more at once than fits"),
 ]
-
-
-@pytest.mark.parametrize("ring", RINGS)
-@pytest.mark.parametrize("length", [1, 3, 6])
-def test_sample_is_aligned_and_never_crosses_episodes(ring, length):
-    batch = sample(make_filled_replay(**ring), length=length)
-    assert batch.frames.shape == (64, length + 1, 64, 64, 3) and batch.frames.dtype == torch.uint8
-    assert batch.deter.shape == (64, 2) and batch.deter.dtype == torch.float32
-    assert_aligned(batch)
 
 
 @pytest.mark.parametrize("ring", RINGS)
@@ -67,54 +55,6 @@ def test_add_stores_each_frame_once():
     stored = {tuple(frame) for frame in replay.frames[: len(replay), 0, 0].tolist()}
     assert len(stored) == len(replay)
     assert replay.frames.numel() == 60 * 64 * 64 * 3
-
-
-def test_add_keeps_the_newest_rows_when_the_ring_is_full():
-    replay = make_filled_replay(capacity=12, lengths=(7, 4, 9))
-    newest = [entry[2::-1] for entry in NumberedRows(0, (7, 4, 9)).entries[-12:]]
-    assert sorted(map(tuple, replay.frames[:, 0, 0].tolist())) == sorted(newest)
-    assert len(replay) == 12
-
-
-def test_draw_repeats_with_its_random_stream():
-    replay = make_filled_replay()
-    first, again, other = (sample(replay, seed=seed) for seed in (0, 0, 1))
-    assert all(torch.equal(left, right) for left, right in zip(first, again, strict=True))
-    assert not torch.equal(first.rows, other.rows)
-
-
-def test_refresh_writes_beliefs_to_the_rows_of_the_batch():
-    replay = make_filled_replay(capacity=40, lanes=2, lengths=(7, 4, 9, 6))
-    batch = sample(replay)
-    time, episode, lane = frame_values(batch)
-    replay.refresh(
-        batch.rows, torch.stack([time * 2.0, episode + 100.0 * lane], -1), torch.ones_like(batch.rows, dtype=torch.bool)
-    )
-    again = sample(replay, seed=1)
-    time, episode, lane = (part[:, 0] for part in frame_values(again))
-    refreshed = torch.isin(again.rows[:, 0], batch.rows)
-    assert refreshed.any()
-    expected = torch.stack([time * 2.0, episode + 100.0 * lane], -1)
-    untouched = torch.stack([time, time + 1000.0], -1)
-    assert torch.equal(again.deter, torch.where(refreshed[:, None], expected, untouched))
-
-
-def test_refresh_keeps_the_last_belief_of_a_row_that_occurs_twice():
-    replay = make_filled_replay()
-    deter = torch.arange(12.0).reshape(2, 3, 2)
-    replay.refresh(torch.tensor([[4, 5, 4], [6, 4, 5]]), deter, torch.ones(2, 3, dtype=torch.bool))
-    assert replay.deter[4:7].tolist() == [[8.0, 9.0], [10.0, 11.0], [6.0, 7.0]]
-
-
-@pytest.mark.parametrize("chosen", [((1, 1, 1), (0, 0, 0)), ((0, 0, 0), (1, 1, 1)), ((0, 1, 0), (0, 0, 1))])
-def test_refresh_ignores_beliefs_that_are_not_chosen(chosen):
-    replay = make_filled_replay()
-    before = replay.deter.clone()
-    rows, deter = torch.tensor([[4, 5, 6], [5, 6, 7]]), torch.arange(12.0).reshape(2, 3, 2)
-    replay.refresh(rows, deter, torch.tensor(chosen) == 1)
-    for row in range(len(before)):
-        written = [deter[s, t] for s in range(2) for t in range(3) if chosen[s][t] and rows[s, t] == row]
-        assert torch.equal(replay.deter[row].float(), written[-1] if written else before[row].float())
 
 
 @pytest.mark.parametrize("lengths", [(), (2,), (4, 4, 4)])

@@ -11,8 +11,8 @@ from latentplan.config import UserError
 from latentplan.config.commit import DamageError, Saves
 from latentplan.replay.buffer import Replay, write_saved
 from latentplan.replay.disk import FORMAT, ReplayFiles
-from tests.replay.numbered_rows import CPU, NumberedRows, make_filled_replay, make_replay, sample
-from tests.replay.test_buffer import RINGS, assert_aligned
+from tests.replay.numbered_rows import CPU, NumberedRows, assert_aligned, make_filled_replay, make_replay, sample
+from tests.replay.test_buffer import RINGS
 
 
 class Disk:

@@ -6,8 +6,7 @@ import torch
 from latentplan.config.commit import Saves
 from latentplan.replay.buffer import Replay
 from latentplan.replay.disk import FORMAT, ReplayFiles, count_saved
-from tests.replay.numbered_rows import CPU, NumberedRows, frame_values, sample
-from tests.replay.test_buffer import assert_aligned
+from tests.replay.numbered_rows import CPU, NumberedRows, assert_aligned, frame_values, sample
 from tests.replay.test_disk import assert_same
 
 RECORDED = (7, 4)
