@@ -9,11 +9,10 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-import torch
 
 from latentplan.config.commit import Log, Save
-from latentplan.replay.buffer import COLUMNS, Replay
-from latentplan.replay.disk import Counts, check_sizes, log_name, read_frames, read_rows, rows_file
+from latentplan.replay.buffer import Replay
+from latentplan.replay.disk import Counts, check_sizes, copy_rows, log_name, read_rows, rows_file
 
 
 class Piece(NamedTuple):
@@ -82,15 +81,12 @@ class DealtRows:
         if skipped >= piece.length:
             return
         places = replay.places(lane, np.arange(number + skipped, number + piece.length))
-        index = torch.as_tensor(places, device=replay.device)
-        saved, rows = self._saved[piece.rank], slice(piece.offset + skipped, piece.offset + piece.length)
         replay.episode[places] = episode
-        replay.is_end[places] = saved["continues"][rows].numpy() == 0.0
-        for name in COLUMNS:
-            getattr(replay, name)[index] = saved[name][rows].to(replay.device)
         log = Log(self.save.folder.parent, log_name(piece.rank, lane), replay.frames[0].numel())
         log.restore(self.save.logs)
-        read_frames(replay, places, log, np.arange(piece.start + skipped, piece.start + piece.length))
+        rows = slice(piece.offset + skipped, piece.offset + piece.length)
+        numbers = np.arange(piece.start + skipped, piece.start + piece.length)
+        copy_rows(replay, places, self._saved[piece.rank], rows, log, numbers)
 
     def _deal(self, lane: int, size: int) -> list[list[Piece]]:
         """The pieces of a lane for each process, the oldest first: the next one goes to whom has fewest rows so far."""

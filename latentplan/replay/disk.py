@@ -96,15 +96,11 @@ class ReplayFiles:
             rows = slice(offset + end - first - held, offset + end - first)
             offset += end - first
             replay.first[lane], replay.written[lane] = end - held, end
-            index = replay.held_rows(lane)
-            places = index.cpu().numpy()
-            replay.episode[places] = saved["episode"][rows].numpy()
-            replay.is_end[places] = saved["continues"][rows].numpy() == 0.0
-            for name in COLUMNS:
-                getattr(replay, name)[index] = saved[name][rows].to(replay.device)
-            self._logs[lane].restore(save.logs)
             numbers = np.arange(end - held, end)
-            read_frames(replay, replay.places(lane, numbers), self._logs[lane], numbers)
+            places = replay.places(lane, numbers)
+            replay.episode[places] = saved["episode"][rows].numpy()
+            self._logs[lane].restore(save.logs)
+            copy_rows(replay, places, saved, rows, self._logs[lane], numbers)
 
     def _blocks(self, lane: int, start: int, end: int) -> Iterator[bytes]:
         replay = self.replay
@@ -154,26 +150,33 @@ def check_sizes(saved: Mapping[str, Any], replay: Replay, save: Save) -> None:
         )
 
 
-def read_frames(replay: Replay, places: np.ndarray, log: Log, numbers: np.ndarray) -> None:
-    """Reads frames from a log into a replay.
+def copy_rows(
+    replay: Replay, places: np.ndarray, saved: Mapping[str, Any], rows: slice, log: Log, numbers: np.ndarray
+) -> None:
+    """Copies saved rows, and their frames from a log, into a replay.
 
     Args:
         replay: The replay.
-        places: Rows of the replay for the frames, int64 (n,).
+        places: Rows of the replay to copy to, int64 (n,).
+        saved: What `read_rows` returned.
+        rows: Its rows to copy, n of them.
         log: The log.
         numbers: Rows of the log with the frames, ascending, int64 (n,).
 
     Raises:
         UserError: The log lacks frames.
     """
+    index = torch.as_tensor(places, device=replay.device)
+    replay.is_end[places] = saved["continues"][rows].numpy() == 0.0
+    for name in COLUMNS:
+        getattr(replay, name)[index] = saved[name][rows].to(replay.device)
     found = 0
     for first, count, path in log.rows():
         low, high = np.searchsorted(numbers, (first, first + count))
         if low >= high:
             continue
         stored = np.memmap(path, np.uint8, "r", shape=(count, *replay.frames.shape[1:]))
-        rows = torch.as_tensor(places[low:high], device=replay.device)
-        replay.frames[rows] = torch.from_numpy(stored[numbers[low:high] - first]).to(replay.device)
+        replay.frames[index[low:high]] = torch.from_numpy(stored[numbers[low:high] - first]).to(replay.device)
         found += high - low
     if found != len(numbers):
         raise UserError(f"the logs in {log.folder} are damaged: they must hold {len(numbers):,} frames")
