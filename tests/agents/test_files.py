@@ -6,7 +6,6 @@ import math
 import os
 import random
 import shutil
-import signal
 from pathlib import Path
 
 import pytest
@@ -17,34 +16,10 @@ from latentplan.agents.files import read_files, remove_leftovers, write_files
 from latentplan.config import UserError
 from tests.agents.small_agents import make_plain_model
 from tests.agents.test_checkpoint import CONFIG, INFO, assert_refused, unseal
+from tests.killing import die_at, in_child
 
 NAMES = ("first", "second")
-
-
-def in_child(work):
-    child = os.fork()
-    if child == 0:
-        try:
-            work()
-            os._exit(0)
-        except BaseException:
-            os._exit(1)
-    return os.waitpid(child, 0)[1] == 0
-
-
-def die_at(call):
-    """Kills this process at a call of fsync or at a renaming, counted from 0."""
-    calls = iter(range(10**6))
-
-    def counted(function):
-        def run(*arguments):
-            if next(calls) == call:
-                os.kill(os.getpid(), signal.SIGKILL)
-            return function(*arguments)
-
-        return run
-
-    os.fsync, Path.replace, Path.write_bytes = map(counted, (os.fsync, Path.replace, Path.write_bytes))
+CALLS = ((os, "fsync"), (Path, "replace"), (Path, "write_bytes"))
 
 
 @pytest.mark.parametrize("has_old", [True, False])
@@ -52,7 +27,7 @@ def test_read_files_finds_one_whole_pair_wherever_writing_is_killed(tmp_path, ha
     old, new, third = ({name: f"{name} {age}".encode() for name in NAMES} for age in ("old", "new", "third"))
 
     def write():
-        die_at(call)
+        die_at(call, *CALLS)
         write_files(folder, new)
 
     for call in range(100):
@@ -66,7 +41,7 @@ def test_read_files_finds_one_whole_pair_wherever_writing_is_killed(tmp_path, ha
             own = shutil.copytree(folder, tmp_path / f"{call}-{again}")
 
             def write_third(own=own, again=again):
-                die_at(again)
+                die_at(again, *CALLS)
                 write_files(own, third)
 
             before = read_files(own, NAMES) if (own / "manifest.json").exists() else None
@@ -247,7 +222,7 @@ def test_remove_leftovers_keeps_one_whole_checkpoint_wherever_writing_is_killed(
     old, new = ({name: f"{name} {age}".encode() for name in NAMES} for age in ("old", "new"))
 
     def write():
-        die_at(call)
+        die_at(call, *CALLS)
         write_files(folder, new)
 
     for call in range(100):

@@ -5,15 +5,17 @@ import json
 import os
 import random
 import shutil
-import signal
+from pathlib import Path
 
 import pytest
 
 from latentplan.config import UserError
 from latentplan.config import commit as module
 from latentplan.config.commit import MANIFEST, DamageError, Extent, Log, Saves, read_manifest, write_manifest
+from tests.killing import die_at, in_child
 
 ROW = 32
+CALLS = ((os, "fsync"), (os, "rename"), (os, "truncate"), (shutil, "rmtree"), (Path, "rename"))
 
 
 class Diary:
@@ -48,38 +50,9 @@ def folder(tmp_path):
     return tmp_path / "saves"
 
 
-def die_at(call):
-    """Kills this process at a call of fsync, renaming or removal, counted from 0."""
-    calls = iter(range(10**6))
-
-    def counted(function):
-        def run(*arguments, **more):
-            if next(calls) == call:
-                os.kill(os.getpid(), signal.SIGKILL)
-            return function(*arguments, **more)
-
-        return run
-
-    for target, name in ((os, "fsync"), (os, "rename"), (os, "truncate"), (shutil, "rmtree")):
-        setattr(target, name, counted(getattr(target, name)))
-    module.Path.rename = counted(module.Path.rename)
-
-
-def in_child(work):
-    """Whether a child process does its work to the end."""
-    child = os.fork()
-    if child == 0:
-        try:
-            work()
-            os._exit(0)
-        except BaseException:
-            os._exit(1)
-    return os.waitpid(child, 0)[1] == 0
-
-
 def test_newest_is_whole_wherever_a_commit_is_killed(folder, tmp_path):
     def add():
-        die_at(call)
+        die_at(call, *CALLS)
         diary.add()
 
     for call in range(100):
