@@ -85,13 +85,16 @@ class Encoder(nn.Module):
         flat = rearrange(features, "rows channel height width -> rows (height width channel)")
         return single_or_double(self.linear(flat))
 
+    def scaled_patches(self) -> tuple[Tensor, Tensor]:
+        """Weight and bias that give on pixels what the first layer gives on pixels / 255 - 0.5."""
+        return self.patches.weight / 255.0, self.patches.bias - 0.5 * self.patches.weight.sum(-1)
+
     def _project(self, patches: Tensor) -> Tensor:
         """The first layer on pixels / 255 - 0.5; the scale and the shift are applied to the weights instead.
 
         Whole numbers up to 255 are exact in bfloat16, so the pixels need one conversion and no arithmetic.
         """
-        weight = self.patches.weight / 255.0
-        shift = self.patches.bias - 0.5 * self.patches.weight.sum(-1)
+        weight, shift = self.scaled_patches()
         kind = patches.device.type
         dtype = torch.get_autocast_dtype(kind) if torch.is_autocast_enabled(kind) else weight.dtype
         return functional.linear(patches.to(dtype), weight, shift)

@@ -81,9 +81,7 @@ class _DecoderGradients(ctypes.Structure):
 def encode(encoder: Encoder, frames: Tensor) -> Tensor:
     """Embeddings (rows, embedding) of uint8 frames (rows, 64, 64, 3); gradients reach the weights."""
     _check_frames(frames, len(frames))
-    weight = encoder.patches.weight / 255.0
-    shift = encoder.patches.bias - 0.5 * encoder.patches.weight.sum(-1)  # see `Encoder._project`
-    layers = [weight, shift, encoder.linear.weight, encoder.linear.bias]
+    layers = [*encoder.scaled_patches(), encoder.linear.weight, encoder.linear.bias]
     for part in encoder.convolutions:
         kernel, bias = part.parameters()
         layers += [kernel.permute(0, 2, 3, 1), bias]
