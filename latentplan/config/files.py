@@ -18,7 +18,7 @@ from latentplan.config.checks import UserError, shown
 from latentplan.config.earlier import as_saved, drop_removed
 from latentplan.config.parsing import Setting, list_settings, raise_unknown, read_values
 from latentplan.config.reading import read_yaml
-from latentplan.config.settings import Config
+from latentplan.config.settings import Config, by_key
 from latentplan.config.suites import DEFAULT_SUITE, SUITES, check_task, find_suite
 from latentplan.config.writing import write_whole
 
@@ -65,7 +65,7 @@ def build_config(layer: Layer) -> Config:
         UserError: A value has the wrong type or is not allowed; the message names the setting.
     """
     kept = {section: drop_removed(section, fields) for section, fields in layer.items()}
-    given = {f"{section}.{name}": value for section, fields in kept.items() for name, value in fields.items()}
+    given = by_key(kept)
     typed: Layer = {section: {} for section in kept}
     for key, value in read_values(_all_settings(), given).items():
         section, _, name = key.partition(".")

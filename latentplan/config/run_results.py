@@ -16,7 +16,7 @@ from latentplan.config.checks import UserError, cut
 from latentplan.config.files import read_config
 from latentplan.config.reading import LARGEST_DATA, read_text
 from latentplan.config.run_folder import LOCK_FILE, RUN_FILE, run_saves
-from latentplan.config.settings import Config, RunConfig, to_dict
+from latentplan.config.settings import Config, RunConfig, by_key, to_dict
 from latentplan.config.suites import check_task
 from latentplan.config.writing import write_whole
 
@@ -109,9 +109,7 @@ def comparable_settings(config: Config) -> dict[str, Any]:
     """The settings by name, with the default task filled in and without the budget and folder of the run."""
     task = config.env.task or check_task(config.env.suite, config.env.domain)[0]
     settings = replace(config, env=replace(config.env, task=task), run=RunConfig(seed=config.run.seed))
-    return {
-        f"{section}.{name}": value for section, fields in to_dict(settings).items() for name, value in fields.items()
-    }
+    return by_key(to_dict(settings))
 
 
 def note_state(folder: Path, state: StateName, **facts: Any) -> None:

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, Literal, get_args
 
@@ -349,6 +350,11 @@ def to_dict(config: Any) -> dict[str, Any]:
         name: to_dict(value) if dataclasses.is_dataclass(value) else list(value) if isinstance(value, tuple) else value
         for name, value in ((f.name, getattr(config, f.name)) for f in dataclasses.fields(config))
     }
+
+
+def by_key(sections: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
+    """The settings of all sections by `section.name`."""
+    return {f"{section}.{name}": value for section, fields in sections.items() for name, value in fields.items()}
 
 
 def from_dict(values: dict[str, Any]) -> Config:

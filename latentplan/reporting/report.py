@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from latentplan import __version__
 from latentplan.config import Config, to_dict
 from latentplan.config.run_results import Evaluation
+from latentplan.config.settings import by_key
 from latentplan.reporting.compare import CLOCKS, OFFLINE_CLOCKS, published_rows
 from latentplan.reporting.frame import Frame
 from latentplan.reporting.page import Section, figure, film, picture, render_page, scrubber, table
@@ -291,10 +292,8 @@ def _goals(recording: Recording) -> list[str]:
 def _provenance(data: ReportData) -> list[str]:
     facts = {"latentplan": __version__, **data.facts}
     rows = [["fact", "value"], *([name, _shown(value)] for name, value in facts.items())]
-    sections = to_dict(data.config)
-    settings = [["setting", "value"]]
-    for section, fields in sections.items():
-        settings += [[f"{section}.{name}", _shown(value)] for name, value in fields.items()]
+    by_name = by_key(to_dict(data.config))
+    settings = [["setting", "value"], *([name, _shown(value)] for name, value in by_name.items())]
     folded = (
         f'<details class="wide"><summary>{len(settings) - 1} settings of the agent</summary>{table(settings)}</details>'
     )

@@ -16,6 +16,7 @@ from lightning.pytorch.loggers import CSVLogger, Logger, MLFlowLogger, TensorBoa
 from latentplan.config import Config, to_dict
 from latentplan.config.extras import import_extra
 from latentplan.config.reading import read_text
+from latentplan.config.settings import by_key
 from latentplan.config.writing import write_whole
 from latentplan.reporting.frame import Frame
 from latentplan.reporting.report import tile
@@ -116,11 +117,7 @@ class Trackers:
 
     def _make(self, name: str) -> Logger:
         folder, run = self._folder, self._folder.resolve().name
-        settings = {
-            f"{section}.{field}": value
-            for section, fields in to_dict(self._config).items()
-            for field, value in fields.items()
-        }
+        settings = by_key(to_dict(self._config))
         if name == "csv":
             return CSVLogger(folder, name="csv", flush_logs_every_n_steps=1)  # a new version at every start
         if name == "wandb":
