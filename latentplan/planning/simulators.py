@@ -6,7 +6,8 @@ MuJoCo and jax are imported when a model is made, so that `latentplan.planning` 
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
@@ -49,10 +50,11 @@ class MuJoCoModel:
 
     A state is a row of MuJoCo's full physics state; `state(data)` makes one. Bodies that are moved by hand (mocap) and
     applied forces keep the values that the model starts with. A simulation that becomes unstable gets the reward NaN
-    from then on, so that its candidate is never chosen. The model passes no gradients.
+    from then on, so that its candidate is never chosen; MuJoCo's warnings of it are not printed, since a search may
+    have hundreds of such candidates. The model passes no gradients.
 
     Args:
-        mjmodel: The model; it is copied.
+        mjmodel: The model, or the one of a `dm_control` physics (`physics.model`); it is copied.
         cost: `cost(physics, action) -> (rows,)`, minimised, of the state before each step and the action (rows,
             action) of the step. The sensors are those of that state under that action.
         terminal_cost: `terminal_cost(physics) -> (rows,)`, of the last state of a plan; None adds nothing.
@@ -80,6 +82,7 @@ class MuJoCoModel:
         library = import_extra("mujoco", "MuJoCoModel")
         if substeps < 1:
             raise ValueError(f"substeps must be at least 1, got {substeps}")
+        mjmodel = _unwrap(mjmodel)
         if mjmodel.nu == 0:
             raise ValueError("the MuJoCo model has no actuator, so there is no action to plan")
         self.mjmodel = mjmodel.__copy__()
@@ -96,12 +99,16 @@ class MuJoCoModel:
             self.value = self._value
 
     def state(self, data: mujoco.MjData) -> Tensor:
-        """Returns the physics state of MuJoCo data as one row, float64 (1, size)."""
+        """Returns the physics state of MuJoCo data as one row, float64 (1, size).
+
+        Args:
+            data: The data, or those of a `dm_control` physics (`physics.data`).
+        """
         import mujoco
 
         kind = mujoco.mjtState.mjSTATE_FULLPHYSICS
         row = torch.empty(1, mujoco.mj_stateSize(self.mjmodel, kind), dtype=torch.float64, device="cpu")
-        mujoco.mj_getState(self.mjmodel, data, row[0].numpy(), kind)
+        mujoco.mj_getState(self.mjmodel, _unwrap(data), row[0].numpy(), kind)
         return row
 
     def physics(self, state: Tensor) -> Physics:
@@ -146,7 +153,8 @@ class MuJoCoModel:
         """
         pool, data = self._workers
         substeps = controls.repeat_interleave(self.substeps, dim=1).contiguous()
-        states, sensordata = pool.rollout(self.mjmodel, data, start.contiguous().numpy(), substeps.numpy())
+        with _muted_warnings():
+            states, sensordata = pool.rollout(self.mjmodel, data, start.contiguous().numpy(), substeps.numpy())
         after = torch.from_numpy(states)[:, self.substeps - 1 :: self.substeps]
         before = torch.cat([start[:, None], after[:, :-1]], dim=1)
         # The time of an unstable simulation stops.
@@ -185,6 +193,38 @@ class MuJoCoModel:
 
     def __getstate__(self) -> dict[str, Any]:
         return {name: value for name, value in self.__dict__.items() if name != "_local"}
+
+
+class _Mute:
+    """Discards MuJoCo's warnings, whose handler belongs to the whole process, while any thread simulates candidates."""
+
+    def __init__(self) -> None:
+        self._lock, self._num_threads, self._handler = threading.Lock(), 0, None
+
+    @contextmanager
+    def __call__(self) -> Iterator[None]:
+        import mujoco
+
+        with self._lock:
+            if self._num_threads == 0:
+                self._handler = mujoco.get_mju_user_warning()
+                mujoco.set_mju_user_warning(lambda text: None)
+            self._num_threads += 1
+        try:
+            yield
+        finally:
+            with self._lock:
+                self._num_threads -= 1
+                if self._num_threads == 0:
+                    mujoco.set_mju_user_warning(self._handler)
+
+
+_muted_warnings = _Mute()
+
+
+def _unwrap(part: Any) -> Any:
+    """The model or the data of MuJoCo that dm_control wraps."""
+    return getattr(part, "ptr", part)
 
 
 class JaxModel:

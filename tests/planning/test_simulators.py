@@ -2,6 +2,7 @@
 
 import pickle
 import sys
+from types import SimpleNamespace
 from typing import NamedTuple
 
 import mujoco
@@ -106,6 +107,33 @@ def test_mujoco_unstable_candidate_has_no_finite_return_and_is_never_chosen(mjmo
     rewards, _ = model.rollout(torch.cat([start, broken]), torch.zeros(2, 3, 2, dtype=torch.float64))
     assert torch.isfinite(rewards[0]).all()
     assert torch.isnan(rewards[1]).all()
+
+
+@pytest.mark.parametrize("threads", [1, 2])
+def test_unstable_candidates_print_nothing_and_leave_the_handler_of_warnings(
+    mjmodel, start, threads, capfd, tmp_path, monkeypatch
+):
+    monkeypatch.chdir(tmp_path)  # where MuJoCo writes its log
+    stiff = mujoco.MjModel.from_xml_string(SLIDER.replace('axis="1 0 0"', 'axis="1 0 0" stiffness="1e8"'))
+    seen = []
+    mujoco.set_mju_user_warning(seen.append)
+    try:
+        rewards, _ = MuJoCoModel(stiff, cost, threads=threads).rollout(start.repeat(4, 1), torch.ones(4, 30, 2))
+        assert rewards.isnan().any(1).all()
+        assert seen == [] and capfd.readouterr() == ("", "") and not list(tmp_path.iterdir())
+        data = mujoco.MjData(stiff)
+        data.qpos[0] = 0.5
+        mujoco.mj_step(stiff, data, 30)
+        assert seen  # the caller's own simulation still warns
+    finally:
+        mujoco.set_mju_user_warning(None)
+
+
+def test_models_and_data_of_dm_control_are_unwrapped(mjmodel):
+    data = mujoco.MjData(mjmodel)
+    data.qpos[0] = 0.5
+    model = MuJoCoModel(SimpleNamespace(ptr=mjmodel), cost)  # as `physics.model` and `physics.data` have it
+    assert model.physics(model.state(SimpleNamespace(ptr=data))).qpos.tolist() == [[0.5]]
 
 
 def test_mujoco_control_drives_the_cart_to_the_origin(mjmodel, start):
