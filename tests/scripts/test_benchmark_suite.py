@@ -236,13 +236,21 @@ def test_run_whose_folder_cannot_be_prepared_stops_no_other(tmp_path, capsys):
     assert "4 of 6 runs finished, 2 failed" in printed
 
 
-def test_run_waits_while_another_process_has_its_folder(tmp_path, capsys):
+def test_run_waits_while_another_process_has_its_folder(tmp_path, capsys, monkeypatch):
     folder = tmp_path / "walker-walk-seed0"
     code = f"import sys; sys.path.insert(0, {str(STUB.parents[2])!r})\n"
-    code += "import time; from pathlib import Path; from latentplan.config.run_folder import lock_folder\n"
-    code += f"with lock_folder(Path({str(folder)!r})): print('held', flush=True); time.sleep(1.0)"
-    with subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True) as other:
+    code += "from pathlib import Path; from latentplan.config.run_folder import lock_folder\n"
+    code += f"with lock_folder(Path({str(folder)!r})): print('held', flush=True); sys.stdin.read()"
+    pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE}
+    with subprocess.Popen([sys.executable, "-c", code], **pipes, text=True) as other:
         assert other.stdout.readline() == "held\n"
+        wait = Board.wait
+
+        def wait_and_release(board, run):
+            wait(board, run)
+            other.stdin.close()
+
+        monkeypatch.setattr(Board, "wait", wait_and_release)
         assert sweep(tmp_path) == 0
     printed = capsys.readouterr().out
     assert printed.count("walker-walk, seed 0: waits") == 1 and "6 of 6 runs finished" in printed
