@@ -165,7 +165,7 @@ def run(request: Request) -> int:
         if request.keep_episodes is not None:
             from latentplan.training.collection.keeping import KeepingEnv
 
-            env = KeepingEnv(env, request.keep_episodes, world)
+            env = KeepingEnv(env, request.keep_episodes, world, "--keep-episodes")
         clock = VirtualClock(request.control_hz, latency)
         agent = load_timed_agent(request.checkpoint, request.mode, clock, device, **changes)
         require_unchanged(request.checkpoint, info)

@@ -131,6 +131,12 @@ def test_eval_keeps_no_episodes_of_another_world_or_aim(assert_refused, checkpoi
     assert not kept.exists()
 
 
+def test_eval_names_its_own_flag_where_a_folder_holds_episodes(assert_refused, checkpoint, tmp_path):
+    (tmp_path / "episode-000-000001.hdf5").touch()
+    flags = ["--mode", "actor", "--device", "cpu", "--keep-episodes", tmp_path]
+    assert_refused(["eval", "--checkpoint", checkpoint, *flags], "choose another folder", "(--keep-episodes)")
+
+
 def test_eval_refuses_a_missing_checkpoint(assert_refused, checkpoint):
     assert_refused(["eval", "--episodes", "1"], "flag --checkpoint is missing; give the folder of a trained agent")
     assert_refused(["eval", "--checkpoint", checkpoint.with_name("bets")], "bets", checkpoint)

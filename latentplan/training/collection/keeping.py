@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import math
 import os
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
@@ -15,15 +16,18 @@ import numpy as np
 from latentplan.config import USER_DOMAIN, Config, EnvConfig, UserError, make_folder
 from latentplan.config.extras import require_extra
 from latentplan.config.files import read_config
-from latentplan.config.run_folder import try_lock
+from latentplan.config.run_folder import LOCK_FILE, RUN_FILE, run_saves, try_lock
 from latentplan.envs.registry import default_task
 from latentplan.envs.spaces import Actions, Interface
 from latentplan.envs.user import PixelEnv
 from latentplan.envs.vector import read_own_facts
+from latentplan.training.checks import check_folder
 from latentplan.training.demonstrations.episode_file import write_episode
 from latentplan.training.demonstrations.fitting import read_interface
 from latentplan.training.demonstrations.kinds import SUFFIX, list_episode_files
 from latentplan.training.demonstrations.recording import RecordedEpisode
+
+SETTING = "collection.keep_episodes"
 
 
 class EpisodeKeeper:
@@ -114,16 +118,19 @@ class KeepingEnv(gymnasium.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarra
         env: An environment of `latentplan.envs.make_env` or `latentplan.envs.wrap_user_env`.
         folder: Folder of the files; made if needed.
         config: Settings of the environment.
+        name: What names the folder, for errors.
 
     Raises:
         UserError: The folder cannot be made, or holds episodes already.
     """
 
-    def __init__(self, env: gymnasium.Env[np.ndarray, np.ndarray], folder: Path | str, config: EnvConfig) -> None:
+    def __init__(
+        self, env: gymnasium.Env[np.ndarray, np.ndarray], folder: Path | str, config: EnvConfig, name: str = "folder"
+    ) -> None:
         super().__init__(env)
         with contextlib.ExitStack() as lock:
             lock.enter_context(keep_alone(Path(folder)))
-            refuse_used_folder(Path(folder))
+            refuse_used_folder(Path(folder), name)
             self._lock = lock.pop_all()
         facts = read_own_facts(env)
         if isinstance(env.unwrapped, PixelEnv) and config.suite == EnvConfig.suite:  # of `wrap_user_env`
@@ -184,17 +191,18 @@ def keep_alone(folder: Path | str | None) -> Iterator[None]:
         os.close(opened)
 
 
-def refuse_used_folder(folder: Path) -> None:
+def refuse_used_folder(folder: Path, name: str = SETTING) -> None:
     """Refuses a folder that holds episodes of another run.
+
+    Args:
+        folder: The folder.
+        name: What names it, for the error.
 
     Raises:
         UserError: The folder holds episodes.
     """
     if folder.is_dir() and list_episode_files(folder):
-        raise UserError(
-            f"{folder} already holds recorded episodes: choose another folder to keep episodes in "
-            "(collection.keep_episodes)"
-        )
+        raise UserError(f"{folder} already holds recorded episodes: choose another folder to keep episodes in ({name})")
 
 
 def _check_names(names: Sequence[Any]) -> None:
@@ -207,14 +215,52 @@ def _check_names(names: Sequence[Any]) -> None:
             raise UserError(f"episodes cannot be kept: the observation {name!r} is named like a folder of others")
 
 
-def check_kept(config: Config, copy: Path | None, *, has_other_ranks: bool) -> None:
-    """Refuses a run that resumes and would replace episodes that are kept.
+def begin_keeping(config: Config) -> Config:
+    """The settings of a new run with the whole path of the folder of its episodes, so that it resumes from anywhere.
 
-    A run that resumes repeats the episodes after its last save, and replaces their files by equal ones. In a folder
-    that it has not used, or with another number of processes, it would replace other episodes.
+    Raises:
+        UserError: The folder holds episodes, or cannot be made.
+    """
+    folder = config.collection.keep_episodes
+    if folder is None:
+        return config
+    check_folder(folder, f"--{SETTING}")
+    refuse_used_folder(Path(folder))
+    return _with_whole_path(config)
+
+
+def go_on_keeping(config: Config, run: Path) -> Config:
+    """The settings of a run that resumes, with the whole path of the folder of its episodes.
+
+    Runs of earlier versions, and edited settings, may name the folder as seen from where the run began. One that holds
+    episodes, but none that is as old as the last save, is seen from elsewhere.
 
     Args:
         config: Settings of the run.
+        run: Folder of the run.
+
+    Raises:
+        UserError: The present folder is another.
+    """
+    folder = config.collection.keep_episodes
+    if folder is None or os.path.isabs(folder):
+        return config
+    copy = run_saves(run).find(RUN_FILE)
+    if not Path(folder).is_dir() or (copy is not None and _oldest(Path(folder), -math.inf) > copy.stat().st_mtime):
+        raise UserError(_ask_where(folder, run))
+    return _with_whole_path(config)
+
+
+def check_kept(config: Config, run: Path, copy: Path | None, *, has_other_ranks: bool) -> None:
+    """Refuses a run that resumes and would replace episodes that are kept.
+
+    A run that resumes repeats the episodes after its last save, and replaces their files by equal ones. In a folder
+    that it has not used, or with another number of processes, it would replace other episodes. Where its last save does
+    not name the whole path, its own episodes are those that are not older than its lock.
+
+    Args:
+        config: Settings of the run, with the whole path of the folder of its episodes.
+        run: Folder of the run.
         copy: File of its settings in its last save; None where there is none.
         has_other_ranks: Whether another number of processes learns than before.
 
@@ -224,8 +270,33 @@ def check_kept(config: Config, copy: Path | None, *, has_other_ranks: bool) -> N
     folder = config.collection.keep_episodes
     if folder is None:
         return
-    if has_other_ranks or copy is None or read_config(copy).collection.keep_episodes != folder:
-        refuse_used_folder(Path(folder))
+    used = None if copy is None else read_config(copy).collection.keep_episodes
+    began = run / LOCK_FILE  # which nothing writes to
+    if used is None or os.path.isabs(used) or has_other_ranks:
+        if used != folder or has_other_ranks:
+            refuse_used_folder(Path(folder))
+    elif not began.exists() or _oldest(Path(folder), math.inf) < began.stat().st_mtime:
+        raise UserError(_ask_where(used, run))
+
+
+def _with_whole_path(config: Config) -> Config:
+    """The settings with the whole path of the folder of episodes, which they name."""
+    folder = os.path.abspath(str(config.collection.keep_episodes))
+    return replace(config, collection=replace(config.collection, keep_episodes=folder))
+
+
+def _oldest(folder: Path, default: float) -> float:
+    """The time at which the first of the episodes in a folder was written; `default` without any."""
+    files = list_episode_files(folder) if folder.is_dir() else []
+    return min((path.stat().st_mtime for path in files), default=default)
+
+
+def _ask_where(folder: str, run: Path) -> str:
+    """The error of a run whose settings name a folder of episodes that is not in the present folder."""
+    return (
+        f"{run / RUN_FILE} names the folder of its episodes as {folder}, which here is not that of this run: resume it "
+        f"in the folder where it was begun, or write the whole path there ({SETTING})"
+    )
 
 
 def _known(info: dict[str, Any]) -> np.ndarray | None:
