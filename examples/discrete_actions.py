@@ -1,6 +1,7 @@
 """Train with discrete actions: a paddle should stay below a lamp that jumps; prints mean returns, 30 at most."""
 
 import sys
+from tempfile import mkdtemp
 
 import gymnasium
 import numpy as np
@@ -30,8 +31,7 @@ class Follow(gymnasium.Env):
         """Moves the paddle, then perhaps the lamp; the reward is 1 where the paddle was below the lamp, else 0."""
         self.steps, self.paddle = self.steps + 1, np.clip(self.paddle + action, 0, COLUMNS - 1)
         reward = float(self.lamp == self.paddle)
-        if self.steps % 6 == 0:
-            self.lamp = self.np_random.integers(COLUMNS)
+        self.lamp = self.lamp if self.steps % 6 else self.np_random.integers(COLUMNS)
         return self.render(), reward, False, self.steps == 30, {}
 
     def render(self) -> np.ndarray:
@@ -47,10 +47,12 @@ def main(out: str = ".", frames: str = "1200", seed: str = "0") -> None:
     rates = {"model_learning_rate": 3e-3, "behaviour_learning_rate": 1e-3, "entropy_scale": 1e-2}
     learning = LearningConfig(batch_size=8, sequence_length=8, imagination_horizon=8, imagination_starts=64, **rates)
     collection = CollectionConfig(prefill_decisions=300, round_decisions=100, updates_per_decision=1.0, overlap=False)
-    run = RunConfig(frames=int(frames), threads=1, seed=int(seed), run_dir=f"{out}/follow")
-    train(Config(env, model, planner, learning, collection, run=run), make_env=Follow)
+    run = RunConfig(frames=int(frames), threads=1, seed=int(seed), run_dir=mkdtemp(prefix="follow-", dir=out))
+    result = train(Config(env, model, planner, learning, collection, run=run), make_env=Follow)
+    if result.exit_code:  # stopped by Ctrl-C or SIGTERM
+        sys.exit(result.exit_code)
     for mode in ("planner", "actor", "random"):
-        agent, inner = load_agent(f"{out}/follow", mode), wrap_user_env(Follow())
+        agent, inner = load_agent(result.run_dir, mode), wrap_user_env(Follow())
         print(f"{mode}: mean return {evaluate_agent(agent, inner, seed=0, episodes=20)['mean_return']:.1f}")
 
 

@@ -1,9 +1,7 @@
-"""Train in a gymnasium environment of your own, from pictures alone.
-
-An action pushes a dot, whose reward is highest in the middle. Prints the mean return of planned and random actions.
-"""
+"""Train in an environment of your own, from pictures alone: push a dot to the middle; prints mean returns."""
 
 import sys
+from tempfile import mkdtemp
 
 import gymnasium
 import numpy as np
@@ -48,10 +46,12 @@ def main(out: str = ".") -> None:
     model = ModelConfig(deter_dim=32, hidden_dim=32, encoder_channels=(8, 8, 8))
     learning = LearningConfig(batch_size=8, sequence_length=8, model_learning_rate=3e-3, behaviour_learning_rate=1e-3)
     collection = CollectionConfig(prefill_decisions=200, round_decisions=100, updates_per_decision=1.0, overlap=False)
-    run = RunConfig(frames=500, threads=1, run_dir=f"{out}/dot")
-    train(Config(model=model, learning=learning, collection=collection, run=run), make_env=make_env)
+    run = RunConfig(frames=500, threads=1, run_dir=mkdtemp(prefix="dot-", dir=out))
+    result = train(Config(model=model, learning=learning, collection=collection, run=run), make_env=make_env)
+    if result.exit_code:  # stopped by Ctrl-C or SIGTERM
+        sys.exit(result.exit_code)
     for mode in ("planner", "random"):
-        agent, env = load_agent(f"{out}/dot", mode), wrap_user_env(make_env(), action_repeat=2)
+        agent, env = load_agent(result.run_dir, mode), wrap_user_env(make_env(), action_repeat=2)
         print(f"{mode}: mean return {evaluate_agent(agent, env, seed=0, episodes=10)['mean_return']:.1f}")
 
 

@@ -1,9 +1,7 @@
-"""Train in an environment whose observations are a dictionary: pictures of two cameras, and numbers beside them.
-
-Each camera shows one coordinate of a dot, which actions push to the middle. Prints returns of planner and random agent.
-"""
+"""Train from pictures of two cameras and numbers beside them: push a dot to the middle; prints mean returns."""
 
 import sys
+from tempfile import mkdtemp
 
 import gymnasium
 import numpy as np
@@ -47,12 +45,14 @@ def main(out: str = ".") -> None:
     model = ModelConfig(deter_dim=32, hidden_dim=32, encoder_channels=(8, 8, 8))
     learning = LearningConfig(batch_size=8, sequence_length=8, model_learning_rate=3e-3, behaviour_learning_rate=1e-3)
     collection = CollectionConfig(prefill_decisions=200, round_decisions=100, updates_per_decision=1.0, overlap=False)
-    run = RunConfig(frames=2000, threads=1, run_dir=f"{out}/two_cameras")
+    run = RunConfig(frames=2000, threads=1, run_dir=mkdtemp(prefix="two_cameras-", dir=out))
     config = Config(env=env, model=model, learning=learning, collection=collection, run=run)
-    train(config, make_env=lambda: gymnasium.wrappers.TimeLimit(Dot(), 20))
+    result = train(config, make_env=lambda: gymnasium.wrappers.TimeLimit(Dot(), 20))
+    if result.exit_code:  # stopped by Ctrl-C or SIGTERM
+        sys.exit(result.exit_code)
     for mode in ("planner", "random"):
         inner = wrap_user_env(gymnasium.wrappers.TimeLimit(Dot(), 20), 2, config=env)
-        played = evaluate_agent(load_agent(f"{out}/two_cameras", mode), inner, seed=0, episodes=10)
+        played = evaluate_agent(load_agent(result.run_dir, mode), inner, seed=0, episodes=10)
         print(f"{mode}: mean return {played['mean_return']:.1f}")
 
 

@@ -16,11 +16,12 @@ from torch import Tensor
 
 from latentplan.agents.files import INFO, WEIGHTS
 from latentplan.agents.files import remove_leftovers as remove_agent_leftovers
-from latentplan.config import UserError
+from latentplan.config import USER_DOMAIN, UserError
 from latentplan.config.commit import Save, Saves
+from latentplan.config.files import read_config
 from latentplan.config.manifest import DamageError, Extent, write_synced
 from latentplan.config.parsing import fits, list_settings, take_values
-from latentplan.config.run_folder import CHECKPOINTS, RUN_FILE, SAVES_FOLDER
+from latentplan.config.run_folder import CHECKPOINTS, RUN, RUN_FILE, SAVES_FOLDER
 from latentplan.config.run_results import FINAL_FILE, METRICS_FILE, STATUS_FILE
 from latentplan.config.writing import remove_parts, replaced_whole
 from latentplan.replay.buffer import read_saved, write_saved
@@ -314,9 +315,21 @@ def refuse_used(folder: Path, kind: str, flag: str) -> None:
     """
     for pattern, content in CONTENTS.items():
         if any(folder.glob(pattern)):
-            can_resume = Saves(folder / SAVES_FOLDER, kind, 0).kinds() == {kind}
-            advice = f"resume it with --resume {folder} (or from Python), or " if can_resume else ""
-            raise UserError(f"{folder} already holds {content}: {advice}choose another {flag}")
+            advice = f"choose another {flag}"
+            if Saves(folder / SAVES_FOLDER, kind, 0).kinds() == {kind}:
+                advice = f"resume it with --resume {folder} (or from Python), or {advice}"
+                if kind == RUN and _is_of_users_environment(folder):
+                    call = f'latentplan.training.resume("{folder}", make_env=...)'
+                    advice = f"resume it with {call}, or choose another run_dir"
+            raise UserError(f"{folder} already holds {content}: {advice}")
+
+
+def _is_of_users_environment(folder: Path) -> bool:
+    """Whether the run in a folder learns in an environment that a function of the user makes."""
+    try:
+        return read_config(folder / RUN_FILE).env.domain == USER_DOMAIN
+    except (OSError, UserError):  # a damaged file, which is no reason to say less
+        return False
 
 
 def _shapes(weights: Mapping[str, Tensor]) -> dict[str, torch.Size]:

@@ -2,9 +2,13 @@
 
 import ast
 import re
+import runpy
+from pathlib import Path
 
 import cv2
 import pytest
+
+from latentplan.training import Result
 
 PUBLIC = {
     "latentplan",
@@ -85,8 +89,8 @@ def test_trained_agent_reaches_a_new_goal(run_example, tmp_path):
 def test_own_environment_is_learned_within_seconds(run_example, tmp_path):
     numbers = run_example("own_environment")
     assert numbers["planner"][0] > 14.0 > 12.0 > numbers["random"][0]
-    assert (tmp_path / "dot" / "checkpoints" / "best").is_dir()
-    assert (tmp_path / "dot" / "metrics.csv").is_file()
+    (run,) = tmp_path.glob("dot-*")
+    assert (run / "checkpoints" / "best").is_dir() and (run / "metrics.csv").is_file()
 
 
 @pytest.mark.slow
@@ -99,6 +103,22 @@ def test_two_cameras_and_a_vector_are_learned_from(run_example):
 def test_discrete_actions_are_learned_far_above_random(run_example):
     numbers = run_example("discrete_actions", timeout=1200)
     assert numbers["planner"][0] > 2.0 * numbers["random"][0]
+
+
+@pytest.mark.parametrize("name", ["discrete_actions", "own_environment", "two_cameras"])
+def test_training_that_is_stopped_ends_an_example_which_can_be_run_again(name, root, tmp_path):
+    folders, main = [], runpy.run_path(str(root / "examples" / f"{name}.py"))["main"]
+
+    def stop(config, make_env):
+        folders.append(Path(config.run.run_dir))
+        return Result(folders[-1], 143, {})
+
+    main.__globals__["train"] = stop
+    for _ in range(2):
+        with pytest.raises(SystemExit) as end:
+            main(str(tmp_path))
+        assert end.value.code == 143
+    assert folders[0] != folders[1] and {folder.parent for folder in folders} == {tmp_path}
 
 
 def test_planning_in_mujoco_lifts_the_hand_to_its_target(run_example, tmp_path):

@@ -101,7 +101,7 @@ def test_train_differs_with_another_seed(finished, tiny, dot, tmp_path):
 
 
 def test_train_refuses_folders_in_use(finished, tiny, dot, tmp_path):
-    with pytest.raises(UserError, match="already holds a run"):
+    with pytest.raises(UserError, match=r"holds a run: resume it with latentplan.training.resume\(.*another run_dir$"):
         train(tiny(finished.run_dir), dot)
     with pytest.raises(UserError, match="--run-dir must name a folder"):
         train(tiny(""), dot)
