@@ -11,7 +11,7 @@ from latentplan.commands.flags import overrides
 from latentplan.commands.shell import refuse
 from latentplan.commands.train import SHORT_FLAGS
 from latentplan.config import CollectionConfig, EnvConfig
-from latentplan.config.checks import above_zero, at_least
+from latentplan.config.checks import above_zero, at_least, shown
 from latentplan.config.env_id import FLAG, import_named, lay_env
 from latentplan.config.files import compose
 from latentplan.config.parsing import option
@@ -52,6 +52,8 @@ class Request:
     def __post_init__(self) -> None:
         at_least(self, decisions=1)
         above_zero(self, "step_timeout_s")
+        if self.out is not None and self.out.suffix.lower() != ".png":
+            raise ValueError(f"out must end in .png, got {shown(str(self.out))}")
         lay_env(self.settings, self.env_id)
 
 

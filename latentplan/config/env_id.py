@@ -22,6 +22,7 @@ from latentplan.config.settings import EnvConfig, Pixels
 from latentplan.config.suites import ID_DOMAIN, ID_SUITE
 
 FLAG = "--env-id"
+_IMPORTERS = (__file__, importlib.__file__, "<frozen importlib")
 ENV_FLAGS = {"id": FLAG, "kwargs": "--env-kwargs", "pixels": "--env.pixels"}
 
 
@@ -104,6 +105,9 @@ def import_named(env_id: str) -> None:
         importlib.import_module(module)
     except ModuleNotFoundError as error:
         if error.name is not None and (module == error.name or module.startswith(f"{error.name}.")):
+            if module.endswith(".py"):
+                right = f"{FLAG} {module.removesuffix('.py')}:{name}"
+                raise UserError(f"{FLAG} {env_id}: name the module without .py, as in {right}") from None
             top = module.partition(".")[0]
             extra = f"pip install 'latentplan[{extra_of(top)}]'" if extra_of(top) else "install its package"
             raise UserError(
@@ -112,13 +116,21 @@ def import_named(env_id: str) -> None:
             ) from None
         raise UserError(describe_missing(str(error.name), f"{FLAG} {env_id}: the module {module}")) from None
     except Exception as error:  # the code of the module may raise anything
-        import traceback
-
         reason = cut(str(error)) or "no reason given"
         raise EnvironmentFault(
             f"{FLAG} {env_id}: importing {module} raised {type(error).__name__}: {reason}; mend the module",
-            traceback.format_exc(),
+            _trace_module(error),
         ) from None
+
+
+def _trace_module(error: Exception) -> str:
+    """The traceback of a module that cannot be imported, without the frames of what imports it."""
+    import traceback
+
+    own = error.__traceback__
+    while own is not None and own.tb_frame.f_code.co_filename.startswith(_IMPORTERS):
+        own = own.tb_next
+    return "".join(traceback.format_exception(type(error), error, own))
 
 
 def imported_modules(env: EnvConfig) -> tuple[str, ...]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Literal, get_args
 
@@ -14,6 +15,8 @@ BEHAVIOURS = get_args(Behaviour)
 COLLECTION_BACKENDS = get_args(CollectionBackend)
 MAX_WORKERS = 256
 MAX_UPDATES = 10**9
+SYMLOG_LIMIT = 9.0  # of the bins of the reward head and the value head
+LARGEST_SCALAR = math.exp(SYMLOG_LIMIT) - 1.0  # about 8,100; larger rewards and returns saturate
 MAX_ROWS = 1_000_000  # of a batch, or of decisions that are kept in memory
 
 

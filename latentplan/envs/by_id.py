@@ -14,10 +14,9 @@ from gymnasium.error import DependencyNotInstalled, UnregisteredEnv
 from latentplan.config import EnvConfig, UserError
 from latentplan.config.checks import nearest, shown
 from latentplan.config.env_id import FLAG, require_imported, split_id
-from latentplan.config.extras import describe_missing
 from latentplan.config.reading import read_kwargs
 from latentplan.config.suites import check_task
-from latentplan.envs.faults import describe_failure
+from latentplan.envs.faults import describe_failure, describe_lack
 from latentplan.envs.rendered import MODE
 from latentplan.envs.user import PixelEnv, make_from
 
@@ -49,10 +48,10 @@ def make_inner(config: EnvConfig) -> gymnasium.Env[Any, Any]:
         with warnings.catch_warnings():
             warnings.filterwarnings("ignore", message=".*render_mode.*")  # `RenderedEnv` refuses a wrong mode
             env = gymnasium.make(name, disable_env_checker=True, **kwargs)
-    except (DependencyNotInstalled, UnregisteredEnv) as error:
+    except UnregisteredEnv as error:
         raise UserError(f"cannot make {name}: {' '.join(str(error).split())}") from None
-    except ModuleNotFoundError as error:
-        raise UserError(describe_missing(str(error.name), f"cannot make {name}: it")) from None
+    except (DependencyNotInstalled, ModuleNotFoundError) as error:
+        raise UserError(describe_lack(error, f"cannot make {name}: it")) from None
     except TypeError as error:
         own = error.__cause__ if RAISED_BY_ENV in str(error) and error.__cause__ is not None else error
         if blame := _blame_arguments(own, config):

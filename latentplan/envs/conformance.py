@@ -19,6 +19,7 @@ from latentplan.envs.by_id import make_inner
 from latentplan.envs.faults import FrameCheck
 from latentplan.envs.process import LocalLane, ProcessLane
 from latentplan.envs.rendered import time_pictures
+from latentplan.envs.rewards import RewardCheck, choose_discount
 from latentplan.envs.spaces import is_picture
 from latentplan.envs.user import MAX_DECISIONS, describe_refusals, wrap_user_env
 from latentplan.envs.vector import make_guarded_env
@@ -173,6 +174,7 @@ def _play(env: Any, config: EnvConfig, decisions: int, report: Report) -> None:
     """Plays random actions, and every tenth decision the lowest and the highest one."""
     dim = (env.action_space.shape or (0,))[0]
     generator, check = np.random.default_rng(0), FrameCheck(1)
+    check_rewards = RewardCheck(1, choose_discount(env.decisions_per_episode))
     rewards: list[float] = []
     frames, lengths, terminations, env_frames = [env.reset(seed=0)[0]], [0], 0, 0
     seconds = 0.0
@@ -184,6 +186,7 @@ def _play(env: Any, config: EnvConfig, decisions: int, report: Report) -> None:
             frame, reward, terminated, truncated, info = env.step(action.astype(np.float32))
             seconds += time.perf_counter() - started
             check(frame[None])
+            check_rewards(np.array([reward], np.float64), np.array([lengths[-1] == 0]))
             frames.append(frame)
             rewards.append(reward)
             env_frames += info["env_frames"]

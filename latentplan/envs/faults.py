@@ -11,13 +11,16 @@ from typing import Any
 
 import gymnasium
 import numpy as np
+from gymnasium.error import DependencyNotInstalled
 
 from latentplan.config import UserError
 from latentplan.config.checks import EnvironmentFault, cut, shown
+from latentplan.config.extras import describe_missing, extra_of
 
 UNCHANGED_FRAMES = 100  # equal frames in a row after which a picture counts as constant
 PLAIN_FRAMES = 10  # frames of one colour in a row after which a picture counts as blank
 _OWN_FOLDERS = tuple(f"{folder}{os.sep}" for folder in (Path(__file__).parents[1], Path(gymnasium.__file__).parent))
+_GYMNASIUM_ENVS = f"{Path(gymnasium.__file__).parent / 'envs'}{os.sep}"
 
 
 def check_picture(picture: Any, shape: tuple[int, ...]) -> np.ndarray:
@@ -189,19 +192,42 @@ def check_step(result: Any, shape: tuple[int, ...]) -> tuple[np.ndarray, float, 
 def describe_failure(error: BaseException) -> UserError:
     """The fault that an exception of an environment stands for, with the traceback of the environment's own code.
 
-    A mistake of the user, such as a missing renderer, is no fault, because no restart mends it: it is a plain
-    `UserError`.
+    A mistake of the user, such as a missing renderer or library, is no fault, because no restart mends it: it is a
+    plain `UserError`. The traceback is empty where the mistake shows outside of the environment's own code only.
     """
     if isinstance(error, EnvironmentFault):
         return error
     if isinstance(error, UserError):
         return UserError(str(error))
+    if isinstance(error, DependencyNotInstalled | ModuleNotFoundError):
+        return UserError(describe_lack(error, "the environment"))
     own = error.__traceback__
-    while own is not None and own.tb_next is not None and own.tb_frame.f_code.co_filename.startswith(_OWN_FOLDERS):
+    while own is not None and not _is_of_environment(own.tb_frame.f_code.co_filename):
         own = own.tb_next
-    origin = "".join(traceback.format_exception(type(error), error, own))
+    origin = "" if own is None else "".join(traceback.format_exception(type(error), error, own))
     reason = cut(str(error)) or "without a message"
     return EnvironmentFault(f"the environment raised {type(error).__name__}: {reason}{_advise(error)}", origin)
+
+
+def _is_of_environment(file: str) -> bool:
+    """Whether a file of code belongs to an environment; some are gymnasium's own, in folders below `envs`."""
+    if file.startswith(_GYMNASIUM_ENVS):
+        return os.sep in file.removeprefix(_GYMNASIUM_ENVS)
+    return not file.startswith(_OWN_FOLDERS)
+
+
+def describe_lack(error: DependencyNotInstalled | ModuleNotFoundError, user: str) -> str:
+    """One line that says which library an environment lacks, and how to install it.
+
+    Args:
+        error: What the environment raised; gymnasium says itself how to install what no extra of this package has.
+        user: The part that needs the library.
+    """
+    missing = error if isinstance(error, ModuleNotFoundError) else error.__cause__
+    name = missing.name if isinstance(missing, ModuleNotFoundError) else None
+    if name is not None and (missing is error or extra_of(name) is not None):
+        return describe_missing(name, user)
+    return f"{user} needs something that is not installed: {' '.join(str(error).split())}"
 
 
 def _advise(error: BaseException) -> str:

@@ -6,7 +6,6 @@ bfloat16 step is larger than the differences that a planner has to distinguish.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from typing import Any
 
@@ -14,12 +13,12 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
+from latentplan.config.learning import SYMLOG_LIMIT
+
 MIN_ACTION_STD = 0.1
 MAX_ACTION_STD = 1.0
 UNIFORM_SHARE = 0.01  # of each categorical distribution (Hafner et al. 2023), so that every category stays possible
-SYMLOG_LIMIT = 9.0
 HALF_LOG_2_PI_E = 1.4189385  # entropy of a Gaussian is log std + this, in nats
-LARGEST_SCALAR = math.exp(SYMLOG_LIMIT) - 1.0  # about 8,100; larger targets saturate
 
 
 class NormedLinear(nn.Module):

@@ -165,6 +165,10 @@ def test_check_env_accepts_and_writes_a_strip(tmp_path, capsys):
     assert strip.shape == (128, 8 * 128, 3) and len(np.unique(strip)) > 1
 
 
+def test_check_env_refuses_a_strip_that_is_no_png(assert_refused):
+    assert_refused(["check-env", STATE, "--out", "strip.jpg"], "--out must end in .png, got 'strip.jpg'")
+
+
 def test_check_env_refuses_with_one_line_per_problem(capsys):
     assert main(["check-env", f"{MODULE}:odd/TwoProblems-v0"]) == 2
     errors = capsys.readouterr().err.splitlines()

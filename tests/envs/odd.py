@@ -6,6 +6,7 @@ import time
 
 import gymnasium
 import numpy as np
+from gymnasium.error import DependencyNotInstalled
 from gymnasium.spaces import Box, Dict, Discrete, Text
 
 PICTURE = Box(0, 255, (16, 16, 3), np.uint8)
@@ -136,6 +137,14 @@ class FloatPicture(State):
         return self.draw(20, 40) / 255.0
 
 
+class NoDrawingLibrary(State):
+    def render(self):
+        try:
+            raise ModuleNotFoundError("No module named 'pygame'", name="pygame")
+        except ModuleNotFoundError as error:
+            raise DependencyNotInstalled("pygame is not installed, run `pip install gymnasium[classic]`") from error
+
+
 class Constant(Slider):
     def observe(self):
         return np.arange(16 * 16 * 3, dtype=np.uint8).reshape(16, 16, 3)
@@ -175,6 +184,7 @@ REFUSED = {
     "TextActions": (with_spaces(actions=Text(8)), {}, ["action", "Text"]),
     "NoSeed": (NoSeed, {}, ["reset must take both: def reset(self, *, seed=None, options=None)"]),
     "NoInfo": (NoInfo, {}, ["reset must return (observation, info)"]),
+    "NoInfoAtAll": (with_step(lambda result: (*result[:4], None)), {}, ["must return a dict as info"]),
     "FourTuple": (
         with_step(lambda result: result[:4]),
         {},
@@ -209,12 +219,18 @@ REFUSED = {
     "NoNumbers": (with_spaces(actions=Box(-1.0, 1.0, (0,), np.float32)), {}, ["leaves a choice"]),
     "NoRenderMode": (Slider, {"pixels": "render", "kwargs": '{"render_mode": null}'}, ["render_mode"]),
     "NoPicture": (NoPicture, {"pixels": "render"}, ["render() must return pictures uint8", "NoneType"]),
+    "NoDrawingLibrary": (
+        NoDrawingLibrary,
+        {"pixels": "render"},
+        ["the environment needs pygame", "run: pip install 'latentplan[gymnasium]'"],
+    ),
     "FloatPicture": (FloatPicture, {"pixels": "render"}, ["render() must return pictures uint8", "float64"]),
 }
 NOTED = {
     "Constant": (Constant, "have not changed"),
     "Unseeded": (Unseeded, "self.np_random"),
     "Short": (Short, "--planner.use_continues"),
+    "LargeRewards": (with_step(lambda result: (result[0], 5000.0 * result[1], *result[2:])), "scale the rewards down"),
 }
 CRASHING = {
     "Exit": (with_step(lambda result: os._exit(7)), ["ended unexpectedly (exit code 7)", "look for os._exit"]),

@@ -1,5 +1,6 @@
 """Environments of gymnasium's registry: named by id, refused in one line, and never imported from a file."""
 
+import re
 import sys
 from dataclasses import replace
 
@@ -49,6 +50,13 @@ def test_check_environment_refuses_odd_environments_in_one_line_with_a_remedy(na
 def test_check_environment_shows_where_the_start_of_an_environment_fails(name):
     report = check_environment(config_of(f"odd/{name}", **odd.REFUSED[name][1]), decisions=1, isolate=False)
     assert "int([size])" in report.origin and "env-kwargs" not in report.problems[0]
+
+
+@pytest.mark.parametrize(("name", "has_own"), [("NoSeed", False), ("NoInfoAtAll", False), ("FailingReset", True)])
+def test_traceback_is_that_of_the_environments_own_code_or_of_none(name, has_own):
+    report = check_environment(config_of(f"odd/{name}"), decisions=5, isolate=False)
+    places = re.findall(r'^  File "([^"]*)"', report.origin, re.MULTILINE)
+    assert places == [odd.__file__] * len(places) and bool(places) == bool(report.origin) == has_own
 
 
 @pytest.mark.parametrize("name", odd.REFUSED)
@@ -225,6 +233,7 @@ def test_import_named_finds_modules_in_the_present_folder_and_explains_failures(
     (tmp_path / "a_robot.py").write_text("LOADED = True\n")
     (tmp_path / "a_broken_robot.py").write_text("1 / 0\n")
     (tmp_path / "a_poor_robot.py").write_text("import a_library_that_nobody_has\n")
+    (tmp_path / "a_cut_robot.py").write_text("def make(:\n")
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "path", [place for place in sys.path if place])
     import_named("a_robot:Reach-v0")
@@ -232,10 +241,14 @@ def test_import_named_finds_modules_in_the_present_folder_and_explains_failures(
     for module, words in {
         "a_broken_robot": "importing a_broken_robot raised ZeroDivisionError",
         "a_poor_robot": "needs a_library_that_nobody_has, which is not installed",
+        "a_cut_robot": "importing a_cut_robot raised SyntaxError",
+        "a_robot.py": "name the module without .py, as in --env-id a_robot:Reach-v0",
         "no_robot": "there is no module no_robot to import",
     }.items():
-        with pytest.raises(UserError, match=words):
+        with pytest.raises(UserError, match=words) as refusal:
             import_named(f"{module}:Reach-v0")
+        origin = getattr(refusal.value, "origin", "")
+        assert set(re.findall(r'^  File "([^"]*)"', origin, re.MULTILINE)) <= {str(tmp_path / f"{module}.py")}
 
 
 def test_choose_env_keeps_what_is_remembered():

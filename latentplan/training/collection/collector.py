@@ -25,12 +25,12 @@ from latentplan.envs import make_vector_env
 from latentplan.envs.faults import FrameCheck
 from latentplan.envs.registry import USERS_RENDERER, describe_renderer
 from latentplan.envs.rendered import time_pictures
+from latentplan.envs.rewards import RewardCheck, choose_discount
 from latentplan.envs.vector import Restarts, make_guarded_env
 from latentplan.evaluation.episodes import OnStep, Step, episode_seed, run_episodes
 from latentplan.evaluation.statistics import Episode
 from latentplan.models import WorldModel
 from latentplan.models.fast import accelerate
-from latentplan.models.heads import LARGEST_SCALAR
 from latentplan.models.symmetry import first_turn
 from latentplan.replay.buffer import Rows
 from latentplan.reporting.film import filming_if_possible
@@ -126,7 +126,7 @@ class Collector:
             raise
         action_dim = int(np.prod(self._eval_env.action_space.shape or ()))
         self._decisions: int | None = facts["decisions_per_episode"]
-        self.discount = discount = config.learning.discount or _choose_discount(self._decisions)
+        self.discount = discount = config.learning.discount or choose_discount(self._decisions)
         self.labels: dict[str, float] = facts["labels"] or {}
         self.spaces: Spaces = facts["spaces"] or Spaces()
         with torch.random.fork_rng(devices=[]):  # the weights come with each round
@@ -430,40 +430,3 @@ class Collector:
             log.finish(int(lane), last_frame, last_labels)
             if not self._episodes.is_short[lane] or self.config.collection.short_share == 1.0:
                 log.returns.append(float(self._returns[lane]))
-
-
-def _choose_discount(decisions: int | None) -> float:
-    """Discount whose horizon is a fifth of an episode: 0.96 at 125 decisions, 0.99 at 500."""
-    return 1.0 - 5.0 / min(max(decisions or 500, 50), 1000)
-
-
-class RewardCheck:
-    """Warns once if discounted sums of rewards exceed the value head's range.
-
-    Args:
-        num_envs: Number of environments.
-        discount: Discount per decision.
-    """
-
-    def __init__(self, num_envs: int, discount: float) -> None:
-        self.discount = discount
-        self._sums = np.zeros(num_envs)
-        self._has_warned = False
-
-    def __call__(self, rewards: np.ndarray, is_first: np.ndarray) -> None:
-        """Check one step's rewards.
-
-        Args:
-            rewards: Rewards of one step, (env,).
-            is_first: Whether the step is the first of an episode, (env,).
-        """
-        self._sums = rewards + self.discount * np.where(is_first, 0.0, self._sums)
-        largest = float(np.abs(self._sums).max())
-        if largest > LARGEST_SCALAR and not self._has_warned:
-            self._has_warned = True
-            warnings.warn(
-                f"discounted rewards add up to {largest:.0f}, but the value head represents returns up to "
-                f"{LARGEST_SCALAR:.0f} only: scale the rewards down",
-                RuntimeWarning,
-                stacklevel=2,
-            )

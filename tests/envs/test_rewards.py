@@ -5,7 +5,7 @@ import warnings
 import numpy as np
 import pytest
 
-from latentplan.training.collection.collector import RewardCheck
+from latentplan.envs.rewards import RewardCheck
 
 NONE = np.array([False])
 
