@@ -39,6 +39,7 @@ from latentplan.training.state import (
 ROUND_DECISIONS = 125
 SAVE_SECONDS = 300.0
 KIND, FORMAT = GOALS, 2
+LoadedAgent = tuple[Path, WorldModel, Config, dict[str, Any]]
 PLAYED_FOLDER = "replay"
 SAVED = {
     "run": str,
@@ -71,8 +72,9 @@ def learn_goals(
     """
     folder = Path(folder)
     refuse_used(folder, KIND, "--out")
+    agent = _load_agent(Path(checkpoint), device)  # before the folder is made
     with lock_folder(folder):
-        return _learn(Path(checkpoint), folder, settings or GoalsConfig(), device, None)
+        return _learn(Path(checkpoint), agent, folder, settings or GoalsConfig(), None)
 
 
 def resume_goals(
@@ -92,7 +94,8 @@ def resume_goals(
     require_saves(Path(folder), KIND)
     with lock_folder(Path(folder)):
         saved, settings = read_resumed(folder, updates=updates, minutes=minutes)
-        return _learn(Path(saved["run"]), Path(folder), settings, device, saved)
+        run = Path(saved["run"])
+        return _learn(run, _load_agent(run, device), Path(folder), settings, saved)
 
 
 def read_resumed(
@@ -176,19 +179,17 @@ def _load_or_play(
     return replay
 
 
-def _learn(run: Path, folder: Path, settings: GoalsConfig, device: str, saved: dict[str, Any] | None) -> Result:
-    """Loads the agent and its replay, and learns until the budget is spent or a signal arrives.
+def _learn(run: Path, agent: LoadedAgent, folder: Path, settings: GoalsConfig, saved: dict[str, Any] | None) -> Result:
+    """Loads the replay of an agent, and learns until the budget is spent or a signal arrives.
 
     Args:
         run: Folder of the run or agent.
+        agent: What `_load_agent` found there.
         folder: Folder for the new agent and the saved state.
         settings: Settings of the learning.
-        device: "cpu" or "cuda".
         saved: State from which the learning is resumed; None starts from the first update.
     """
-    source = resolve_checkpoint(run)
-    model, config, info = load_model(source, device)
-    _refuse_agent(run, model)
+    source, model, config, info = agent
     model.requires_grad_(False)
     line, signals = StatusLine(), Signals(raise_interrupt)
     try:
@@ -253,8 +254,14 @@ def _load(learner: GoalLearner, saved: dict[str, Any], folder: Path) -> float:
     return float(saved["minutes"])
 
 
-def _refuse_agent(run: Path, model: WorldModel) -> None:
-    """Raises UserError for an agent that cannot learn goals."""
+def _load_agent(run: Path, device: str) -> LoadedAgent:
+    """The agent of a folder: its own folder, and what `load_model` returns.
+
+    Raises:
+        UserError: The agent cannot be loaded, or cannot learn goals.
+    """
+    source = resolve_checkpoint(run)
+    model, config, info = load_model(source, device)
     if not model.goal_names:
         raise UserError(f"the agent of {run} was trained without named quantities, so there are no goals to learn")
     if model.has_choices:
@@ -267,6 +274,7 @@ def _refuse_agent(run: Path, model: WorldModel) -> None:
             f"{run} was trained with env.vectors, and goals are learned from pictures alone, without env.vectors: let "
             "the planner pursue them (--objective)"
         )
+    return source, model, config, info
 
 
 def _make_learner(

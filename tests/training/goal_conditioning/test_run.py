@@ -241,6 +241,7 @@ def test_learn_goals_refuses_folders_and_agents_it_cannot_use(run, finished, tin
     refused(lambda: resume_goals(run), "holds a training run, not learned goals", "latentplan train --resume")
     unnamed = make_run(tmp_path / "unnamed", tiny(""), {})
     refused(lambda: learn_goals(unnamed, tmp_path / "b"), "without named quantities")
+    assert not (tmp_path / "b").exists()
     other = make_run(tmp_path / "other", tiny("", env={"domain": "walker"}), LABELS)
     learn_goals(other, tmp_path / "c", GoalsConfig(**vars(SETTINGS) | {"updates": 1}))
     model, config, info = load_model(other)
