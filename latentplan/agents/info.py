@@ -144,7 +144,7 @@ def resolve_checkpoint(path: str | Path) -> Path:
     if folder is not None:
         return folder
     reason = f"expected {WEIGHTS} and {INFO}" if root.exists() else "the folder does not exist"
-    parents = [parent for parent in (root.parent, Path("checkpoints")) if parent.is_dir()]
+    parents = [parent for parent in (root, root.parent, Path("runs"), Path("checkpoints")) if parent.is_dir()]
     siblings = [sibling for parent in parents for sibling in sorted(parent.iterdir())]
     known: dict[str, str] = {}
     for sibling in filter(_find_checkpoint, siblings):

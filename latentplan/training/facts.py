@@ -12,9 +12,10 @@ from typing import TYPE_CHECKING, Any
 import torch
 
 from latentplan import __version__
-from latentplan.config import CollectionConfig, Config, UserError
+from latentplan.config import CollectionConfig, Config, EnvConfig, UserError
 from latentplan.config.run_results import read_evaluations, read_facts
 from latentplan.config.writing import write_whole
+from latentplan.envs.registry import USERS_RENDERER
 from latentplan.evaluation.statistics import confidence_interval
 from latentplan.replay.buffer import Replay
 from latentplan.reporting.report import ReportData, Returns, render_report
@@ -47,7 +48,6 @@ def describe_run(
     budget = [f"{run.frames:,} frames"] if run.frames else []
     budget += [f"{run.minutes:g} minutes"] if run.minutes else []
     budget += [f"{run.updates:,} updates"] if run.updates else []
-    renderer = ", ".join(f"{name} {value}" for name, value in description.renderer.items())
     rows, recorded = int(replay.sizes.sum()), replay.num_recorded
     recorded_note = f", {recorded:,} of them recorded" if recorded else ""
     shares = f"{num_ranks} share each batch of {config.learning.batch_size} ({run.strategy}); the lines are of one"
@@ -57,12 +57,19 @@ def describe_run(
         **({} if num_ranks == 1 else {"processes": shares}),
         **_describe_workers(config.collection),
         "device": f"{learner.model.device}, {torch.get_num_threads()} threads",
-        "renderer": f"{renderer}; {description.render_ms:.1f} ms per frame, quality {env.render_quality}",
+        "renderer": _describe_renderer(env, description),
         "parameters": f"{parameters:,}; discount {description.discount:g}",
         "replay": f"{replay.num_bytes / 2**20:,.0f} MiB for {rows:,} frames{recorded_note}",
         "budget": " or ".join(budget),
         "run folder": str(folder),
     }
+
+
+def _describe_renderer(env: EnvConfig, description: Description) -> str:
+    """The line about the renderer; pictures that another than dm_control draws have no quality to choose."""
+    facts = [value if name == "renderer" else f"{name} {value}" for name, value in description.renderer.items()]
+    quality = f", quality {env.render_quality}" if description.renderer != USERS_RENDERER else ""
+    return f"{', '.join(facts)}; {description.render_ms:.1f} ms per frame{quality}"
 
 
 def _describe_workers(collection: CollectionConfig) -> dict[str, str]:

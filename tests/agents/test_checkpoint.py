@@ -222,6 +222,13 @@ def test_resolve_checkpoint_suggests_shipped_checkpoints(model, tmp_path, monkey
     assert_refused(lambda: resolve_checkpoint("elsewhere/walkr"), "did you mean checkpoints/walker?")
 
 
+@pytest.mark.parametrize("path", ["run/reach", "reach", "runs"])
+def test_resolve_checkpoint_suggests_the_users_own_runs(path, model, tmp_path, monkeypatch):
+    save_checkpoint(tmp_path / "runs" / "reach" / "checkpoints" / "last", model, CONFIG, INFO)
+    monkeypatch.chdir(tmp_path)
+    assert_refused(lambda: resolve_checkpoint(path), "runs/reach")
+
+
 def test_load_agent_names_a_mode_setting_or_device_that_does_not_exist(folder):
     assert_refused(lambda: load_agent(folder, "plan"), "'plan'", "planner, gated, background, actor, random")
     assert_refused(lambda: load_agent(folder, horizn=3), "'horizn'", "did you mean horizon?")

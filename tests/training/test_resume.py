@@ -2,6 +2,7 @@
 
 import itertools
 import os
+import re
 import shutil
 import signal
 import time
@@ -44,7 +45,9 @@ def test_resume_continues_an_interrupted_run(tiny, dot, tmp_path, interrupting, 
     # Steps: 45 of the prefill, 15 of the first round, 2 x 20 of the first evaluation, then into the second round.
     stopped = train(tiny(tmp_path / "run"), interrupting(dot, at_step=105).make)
     assert (stopped.exit_code, dict(stopped.summary)) == (130, {})
-    assert "make_env=..." in capsys.readouterr().out  # the command line cannot make this environment
+    printed = capsys.readouterr().out
+    assert "make_env=..." in printed  # the command line cannot make this environment
+    assert re.search(r"^renderer    the user's environment; [\d.]+ ms per frame$", printed, re.MULTILINE)
     assert [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)] == handlers
     before = read_state(stopped.run_dir)
     assert before["run"]["env_frames"] < 90
