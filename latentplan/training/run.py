@@ -41,7 +41,7 @@ from latentplan.training.checks import check_folder, check_settings
 from latentplan.training.collection.collector import Description, EnvFactory
 from latentplan.training.collection.crew import Worker, check_memory, make_worker
 from latentplan.training.collection.episodes import Stopped, to_arrays
-from latentplan.training.collection.keeping import begin_keeping, check_kept, go_on_keeping, keep_alone
+from latentplan.training.collection.keeping import begin_keeping, check_kept, keep_alone
 from latentplan.training.collection.process import WorkerEnded
 from latentplan.training.console import Progress, own_command
 from latentplan.training.demonstrations.seeding import count_rows, read_demonstrations, seed_replay
@@ -167,7 +167,6 @@ def resume(
     config, warning = read_run_config(folder)
     if warning:
         warnings.warn(warning, RuntimeWarning, stacklevel=2)
-    config = go_on_keeping(config, folder)
     if config.env.task is None:  # `train` always writes the task
         raise UserError(f"{folder / RUN_FILE} is damaged: it does not say what the task is")
     if config.env.domain == USER_DOMAIN and make_env is None:
@@ -288,8 +287,7 @@ class _Run:
         """The newest save that is whole; warns of newer ones that are not."""
         save, problems = self.saves.newest()
         warn_of_loss(save, problems)
-        has_other_ranks = count_ranks(save) != self.ranks.size
-        check_kept(self.config, self.folder, self.saves.find(RUN_FILE), has_other_ranks=has_other_ranks)
+        check_kept(self.config, self.saves.find(RUN_FILE), has_other_ranks=count_ranks(save) != self.ranks.size)
         return save
 
     def _build(self, save: Save | None) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import math
 import os
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
@@ -16,7 +15,7 @@ import numpy as np
 from latentplan.config import USER_DOMAIN, Config, EnvConfig, UserError, make_folder
 from latentplan.config.extras import require_extra
 from latentplan.config.files import read_config
-from latentplan.config.run_folder import LOCK_FILE, RUN_FILE, run_saves, try_lock
+from latentplan.config.run_folder import try_lock
 from latentplan.envs.registry import default_task
 from latentplan.envs.spaces import Actions, Interface
 from latentplan.envs.user import PixelEnv
@@ -226,77 +225,28 @@ def begin_keeping(config: Config) -> Config:
         return config
     check_folder(folder, f"--{SETTING}")
     refuse_used_folder(Path(folder))
-    return _with_whole_path(config)
+    return replace(config, collection=replace(config.collection, keep_episodes=os.path.abspath(folder)))
 
 
-def go_on_keeping(config: Config, run: Path) -> Config:
-    """The settings of a run that resumes, with the whole path of the folder of its episodes.
-
-    Runs of earlier versions, and edited settings, may name the folder as seen from where the run began. One that holds
-    episodes, but none that is as old as the last save, is seen from elsewhere.
-
-    Args:
-        config: Settings of the run.
-        run: Folder of the run.
-
-    Raises:
-        UserError: The present folder is another.
-    """
-    folder = config.collection.keep_episodes
-    if folder is None or os.path.isabs(folder):
-        return config
-    copy = run_saves(run).find(RUN_FILE)
-    if not Path(folder).is_dir() or (copy is not None and _oldest(Path(folder), -math.inf) > copy.stat().st_mtime):
-        raise UserError(_ask_where(folder, run))
-    return _with_whole_path(config)
-
-
-def check_kept(config: Config, run: Path, copy: Path | None, *, has_other_ranks: bool) -> None:
+def check_kept(config: Config, copy: Path | None, *, has_other_ranks: bool) -> None:
     """Refuses a run that resumes and would replace episodes that are kept.
 
     A run that resumes repeats the episodes after its last save, and replaces their files by equal ones. In a folder
-    that it has not used, or with another number of processes, it would replace other episodes. Where its last save does
-    not name the whole path, its own episodes are those that are not older than its lock.
+    that it has not used, or with another number of processes, it would replace other episodes.
 
     Args:
-        config: Settings of the run, with the whole path of the folder of its episodes.
-        run: Folder of the run.
+        config: Settings of the run.
         copy: File of its settings in its last save; None where there is none.
         has_other_ranks: Whether another number of processes learns than before.
 
     Raises:
-        UserError: The folder holds episodes.
+        UserError: The folder of kept episodes holds episodes of another run.
     """
     folder = config.collection.keep_episodes
     if folder is None:
         return
-    used = None if copy is None else read_config(copy).collection.keep_episodes
-    began = run / LOCK_FILE  # which nothing writes to
-    if used is None or os.path.isabs(used) or has_other_ranks:
-        if used != folder or has_other_ranks:
-            refuse_used_folder(Path(folder))
-    elif not began.exists() or _oldest(Path(folder), math.inf) < began.stat().st_mtime:
-        raise UserError(_ask_where(used, run))
-
-
-def _with_whole_path(config: Config) -> Config:
-    """The settings with the whole path of the folder of episodes, which they name."""
-    folder = os.path.abspath(str(config.collection.keep_episodes))
-    return replace(config, collection=replace(config.collection, keep_episodes=folder))
-
-
-def _oldest(folder: Path, default: float) -> float:
-    """The time at which the first of the episodes in a folder was written; `default` without any."""
-    files = list_episode_files(folder) if folder.is_dir() else []
-    return min((path.stat().st_mtime for path in files), default=default)
-
-
-def _ask_where(folder: str, run: Path) -> str:
-    """The error of a run whose settings name a folder of episodes that is not in the present folder."""
-    return (
-        f"{run / RUN_FILE} names the folder of its episodes as {folder}, which here is not that of this run: resume it "
-        f"in the folder where it was begun, or write the whole path there ({SETTING})"
-    )
+    if has_other_ranks or copy is None or read_config(copy).collection.keep_episodes != folder:
+        refuse_used_folder(Path(folder))
 
 
 def _known(info: dict[str, Any]) -> np.ndarray | None:

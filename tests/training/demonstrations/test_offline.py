@@ -1,6 +1,5 @@
 """Runs that start with recorded episodes, with and without collection of their own."""
 
-import os
 import shutil
 from dataclasses import replace
 
@@ -88,9 +87,9 @@ def test_resumed_run_refuses_a_folder_with_episodes_of_others(kept, tiny, dot, t
         resume(run, frames=120, make_env=dot)
     assert {path.name: path.read_bytes() for path in kept[1].iterdir()} == before
     copy = list_saves(run)[-1] / "config.yaml"
-    check_kept(read_config(copy), run, copy, has_other_ranks=False)
+    check_kept(read_config(copy), copy, has_other_ranks=False)
     with pytest.raises(UserError, match=f"{own} already holds recorded episodes"):
-        check_kept(read_config(copy), run, copy, has_other_ranks=True)
+        check_kept(read_config(copy), copy, has_other_ranks=True)
 
 
 def begin_in(folder, monkeypatch):
@@ -108,37 +107,6 @@ def test_run_that_resumes_elsewhere_keeps_its_episodes_where_it_began(tiny, dot,
     other.write_text("precious")
     resume(tmp_path / "run", frames=120, make_env=dot)
     assert len(list((tmp_path / "here" / "episodes").iterdir())) == 6 and other.read_text() == "precious"
-
-
-def test_run_of_an_earlier_version_keeps_its_episodes_where_it_began_alone(tiny, dot, tmp_path, monkeypatch):
-    collection, run = begin_in(tmp_path / "here", monkeypatch), tmp_path / "run"
-    with monkeypatch.context() as earlier:
-        earlier.setattr(keeping, "_with_whole_path", lambda config: config)
-        train(tiny(run, collection=collection), dot)
-    assert read_config(run / "config.yaml").collection.keep_episodes == "episodes"
-    begin_in(tmp_path / "there", monkeypatch)
-    with pytest.raises(UserError, match="names the folder of its episodes as episodes, which here is not that of"):
-        resume(run, frames=120, make_env=dot)
-    other = tmp_path / "there" / "episodes" / "episode-000-000005.hdf5"
-    other.parent.mkdir()
-    other.write_text("precious")
-    for age in (-3600.0, 3600.0):  # kept before the run began, and after it was saved
-        time = other.stat().st_mtime + age
-        os.utime(other, (time, time))
-        with pytest.raises(UserError, match="resume it in the folder where it was begun"):
-            resume(run, frames=120, make_env=dot)
-    edited = shutil.copytree(run, tmp_path / "edited") / "config.yaml"
-    text = edited.read_text()
-    edited.write_text(text.replace("keep_episodes: episodes", f"keep_episodes: {tmp_path / 'here' / 'episodes'}"))
-    with pytest.warns(RuntimeWarning, match="with a change of collection.keep_episodes"):
-        assert resume(edited.parent, frames=120, make_env=dot).exit_code == 0
-    assert other.read_text() == "precious"
-    monkeypatch.chdir(tmp_path / "here")
-    assert resume(run, frames=120, make_env=dot).exit_code == 0
-    assert len(list((tmp_path / "here" / "episodes").iterdir())) == 6
-    monkeypatch.chdir(tmp_path)
-    assert resume(run, frames=160, make_env=dot).exit_code == 0
-    assert len(list((tmp_path / "here" / "episodes").iterdir())) == 8
 
 
 def test_run_whose_episodes_cannot_be_written_is_saved(tiny, dot, tmp_path, monkeypatch):
