@@ -60,7 +60,7 @@ def plot_curves(curves: Curves, png: Path) -> None:
 
 
 def plot_profile(own: Mapping[str, Scores], published: Mapping[str, Scores], png: Path) -> None:
-    """Draws the share of runs and tasks with a return above each threshold.
+    """Draws the share of a task's runs with a return above each threshold, averaged over tasks.
 
     Args:
         own: Scores of planner and actor, (run, task).

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import math
+import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from urllib.parse import quote
 
 import numpy as np
 
@@ -16,14 +18,15 @@ from bench.suite_scores import (
     LARGEST_RETURN,
     Curves,
     aggregate,
-    balanced,
     completed,
+    counted,
     improvement,
     newest_curves,
     published_frames,
     published_scores,
     rows_at,
     score_matrix,
+    task_means,
 )
 from latentplan.config import UserError
 from latentplan.reporting.published import METHODS_AT_REPEAT_2, published_returns_of
@@ -33,8 +36,8 @@ SHOWN_FRAMES = (100_000, 200_000)  # of published returns in the table of tasks
 ABOUT_METHODS = (
     "Of a published method only the mean over its seeds is known on each task. The means and interquartile means of "
     "this table are therefore over the means of tasks, on the tasks that both have. The probability of improvement is "
-    "that of one run of the planner over the mean of the method, averaged over tasks. Its interval resamples the runs "
-    "of the planner only."
+    "that of one run of the planner over the mean of the method: the share of a task's runs that earn more, averaged "
+    "over tasks. Its interval resamples the runs of the planner only."
 )
 Results = Mapping[str, Mapping[int, Row]]
 
@@ -59,9 +62,9 @@ def write_report(rows: Sequence[Row], frames: int, path: Path) -> None:
     parts = [f"# Suite at {frames:,} frames", _describe_runs(curves, results, frames)]
     parts += [_describe_table(frames), task_table(results, frames)]
     if reached:
-        even, tasks = balanced(reached), list(reached)
-        parts += _describe_all(even, [len(rows) for rows in reached.values()], frames)
-        own = {mode: score_matrix(even, tasks, mode) for mode in MODES}
+        rows_that_count, tasks = counted(reached), list(reached)
+        parts += _describe_all(rows_that_count, [len(rows) for rows in reached.values()], frames)
+        own = {mode: score_matrix(rows_that_count, tasks, mode) for mode in MODES}
         plot_profile(own, _methods_with(tasks, published_frames(frames)), figures["profile"])
         parts += ["## Performance profile", _describe_profile(tasks, frames), _picture("profile", figures["profile"])]
     plot_curves(curves, figures["curves"])
@@ -98,14 +101,17 @@ def aggregate_table(reached: Mapping[str, Sequence[Row]]) -> str:
 def method_table(reached: Mapping[str, Sequence[Row]], frames: int) -> str:
     """The planner against each published method on the tasks that both have, as Markdown."""
     known, rows = published_frames(frames), []
+    has_intervals = min(map(len, reached.values())) > 1
     for method in METHODS_AT_REPEAT_2:
         tasks = [task for task in reached if known in published_returns_of(task).get(method, {})]
         if tasks:
             own, other = score_matrix(reached, tasks, "planner"), published_scores(method, tasks, known)
-            ours, theirs = aggregate(own.mean(axis=0, keepdims=True)), aggregate(other)
+            ours, theirs = aggregate(task_means(own)), aggregate(other)
             pairs = [(ours[name].mean, theirs[name].mean) for name in ("mean", "interquartile mean")]
             cells = [" / ".join(format_number(LARGEST_RETURN * mean, 0) for mean in pair) for pair in pairs]
-            rows.append([method, str(len(tasks)), *cells, _describe(improvement(own, other), 1.0, 2)])
+            chance = improvement(own, other)
+            chance = chance if has_intervals else chance._replace(low=None, high=None)
+            rows.append([method, str(len(tasks)), *cells, _describe(chance, 1.0, 2)])
     header = ["method", "tasks", "mean, planner / method", "interquartile mean, planner / method"]
     return _markdown([*header, "probability of improvement"], rows)
 
@@ -145,7 +151,7 @@ def _describe_table(frames: int) -> str:
 
 
 def _describe_all(reached: Mapping[str, Sequence[Row]], counts: Sequence[int], frames: int) -> list[str]:
-    """Tables over all tasks, from as many rows of each task as of every other; `counts` are the runs of the tasks."""
+    """Tables over all tasks, from the rows that count; `counts` are the runs of the tasks."""
     num_runs = min(counts)
     if num_runs == 1:
         several = f", by the mean of its runs where it has several (tasks: {sum(count > 1 for count in counts)})"
@@ -174,8 +180,8 @@ def _describe_profile(tasks: Sequence[str], frames: int) -> str:
     known = published_frames(frames)
     absent = [name for name in METHODS_AT_REPEAT_2 if name not in _methods_with(tasks, known)]
     text = (
-        "The share of runs whose return is above a threshold. Of published methods it is the share of tasks, by their "
-        f"means at {known:,} frames."
+        "The share of a task's runs whose return is above a threshold, averaged over tasks. Of published methods it is "
+        f"the share of tasks, by their means at {known:,} frames."
     )
     return text + (
         f" Methods without a result on some of these tasks are absent: {', '.join(absent)}." if absent else ""
@@ -230,4 +236,4 @@ def _markdown(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
 
 def _picture(kind: str, png: Path) -> str:
     words = {"curves": "Evaluation returns against frames", "profile": "Share of runs above each return"}
-    return f"![{words[kind]}]({png.name})"
+    return f"![{words[kind]}]({quote(os.fsencode(png.name))})"

@@ -1,6 +1,7 @@
 """Returns of a suite at one number of frames, and their statistics over tasks and seeds (Agarwal et al. 2021).
 
-Scores are returns divided by 1,000, float64 (run, task); `rliable` resamples the runs of each task.
+Scores are returns divided by 1,000, float64 (run, task), with NaN below the last run of a task that has fewer runs than
+another; `rliable` resamples the runs of each task.
 """
 
 from __future__ import annotations
@@ -8,6 +9,7 @@ from __future__ import annotations
 import contextlib
 import re
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from itertools import zip_longest
 from typing import Any
 
 import numpy as np
@@ -60,26 +62,28 @@ def completed(results: Mapping[str, Mapping[int, Row]], frames: int) -> dict[str
     return {task: rows for task, rows in reached.items() if rows}
 
 
-def balanced(reached: Mapping[str, Sequence[Row]]) -> dict[str, list[Row]]:
-    """As many rows of each task as of every other.
+def counted(reached: Mapping[str, Sequence[Row]]) -> dict[str, list[Row]]:
+    """The rows that count in statistics over all tasks.
 
     Args:
         reached: By task, a row of each of its runs, at least one.
 
     Returns:
-        Where each task has several runs, the first rows of a task, as many as the task with the fewest has. Else one
-        row per task, with the mean returns of its runs.
+        Where each task has several runs, the first rows of a task, as many as the task with the fewest has. Else all.
     """
     num_runs = min(map(len, reached.values()))
-    if num_runs > 1:
-        return {task: list(rows[:num_runs]) for task, rows in reached.items()}
-    return {task: [_averaged(rows)] for task, rows in reached.items()}
+    return {task: list(rows[: num_runs if num_runs > 1 else None]) for task, rows in reached.items()}
 
 
 def score_matrix(rows: Mapping[str, Sequence[Row]], tasks: Sequence[str], mode: str) -> Scores:
-    """Scores of planner or actor, (run, task), of as many runs of each task as of every other."""
+    """Scores of planner or actor, (run, task)."""
     returns = [[getattr(row, mode) for row in rows[task]] for task in tasks]
-    return np.array(returns, float).T / LARGEST_RETURN
+    return np.array(list(zip_longest(*returns, fillvalue=np.nan)), float) / LARGEST_RETURN
+
+
+def task_means(scores: Scores) -> Scores:
+    """The mean of the runs of each task as one run, (1, task)."""
+    return np.nanmean(scores, axis=0, keepdims=True)
 
 
 def published_scores(method: str, tasks: Sequence[str], frames: int) -> Scores:
@@ -94,7 +98,11 @@ def published_frames(frames: int) -> int:
 
 
 def aggregate(scores: Scores) -> dict[str, Estimate]:
-    """The statistics in `AGGREGATES` with stratified bootstrap intervals; without intervals for one run per task."""
+    """The statistics in `AGGREGATES` with stratified bootstrap intervals; without intervals for one run per task.
+
+    Where tasks have unequal numbers of runs, each counts by the mean of its runs, without intervals.
+    """
+    scores = task_means(scores) if np.isnan(scores).any() else scores
 
     def compute(values: Scores) -> Scores:
         return np.array([function(values) for function in AGGREGATES.values()])
@@ -111,36 +119,34 @@ def improvement(scores: Scores, others: Scores) -> Estimate:
         others: Scores of the others, (run, task); one run where only means are known.
 
     Returns:
-        The probability with its interval, for which the runs of either side are resampled; no interval for one run.
+        The probability with its interval, for which the runs of either side are resampled; no interval where a task
+        has one run.
     """
 
     def compute(ours: Scores, theirs: Scores) -> Scores:
-        difference = ours[:, None] - theirs[None]  # (run, other run, task)
-        return np.array([np.mean((difference > 0) + 0.5 * (difference == 0))])
+        wins = 0.5 + 0.5 * np.sign(ours[:, None] - theirs[None])  # (run, other run, task)
+        return np.array([np.nanmean(wins, axis=(0, 1)).mean()])
 
     return Estimate(*(ends[0] for ends in _estimate([scores, others], compute)))
 
 
 def profile(scores: Scores, thresholds: Scores) -> tuple[Scores, Scores | None, Scores | None]:
-    """Share of runs and tasks with a score above each threshold (threshold,), and the ends of its interval."""
+    """Share of a task's runs with a score above each threshold (threshold,), mean over tasks; ends of its interval."""
 
     def compute(values: Scores) -> Scores:
-        return np.array((values[:, :, None] > thresholds).mean(axis=(0, 1)))
+        values = values[:, :, None]  # (run, task, threshold)
+        above = np.where(np.isnan(values), np.nan, values > thresholds)
+        return np.array(np.nanmean(above, axis=0).mean(axis=0))
 
     share, low, high = _estimate(scores, compute)
     return (share, None, None) if low[0] is None else (share, low, high)
-
-
-def _averaged(rows: Sequence[Row]) -> Row:
-    planner, actor = (float(np.mean([getattr(row, mode) for row in rows])) for mode in ("planner", "actor"))
-    return rows[0]._replace(planner=planner, actor=actor)
 
 
 def _estimate(scores: Scores | list[Scores], compute: Callable[..., Scores]) -> tuple[Any, Any, Any]:
     """Values and the ends of their 95 % intervals; ends are None where a task has one run, which has no spread."""
     arrays = scores if isinstance(scores, list) else [scores]
     values = compute(*arrays)
-    if len(arrays[0]) == 1:
+    if len(arrays[0]) == 1 or np.isnan(arrays[0]).any():
         return values, [None] * len(values), [None] * len(values)
     library = import_extra("rliable.library", "the report")
     with _seeded():

@@ -1,6 +1,7 @@
 """`benchmark.py suite`: rows of results, their statistics, and the report."""
 
 import re
+from urllib.parse import unquote
 
 import benchmark
 import numpy as np
@@ -8,7 +9,16 @@ import pytest
 from bench.estimates import interquartile_mean
 from bench.suite_report import write_report
 from bench.suite_rows import Origin, Row, merge_rows, note_origin, read_origin, read_rows, write_rows
-from bench.suite_scores import aggregate, completed, improvement, newest_curves, profile, rows_at
+from bench.suite_scores import (
+    aggregate,
+    completed,
+    counted,
+    improvement,
+    newest_curves,
+    profile,
+    rows_at,
+    score_matrix,
+)
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -115,7 +125,7 @@ def test_aggregate_is_repeatable_and_has_intervals_from_two_runs_on():
     assert mean == pytest.approx(scores.mean()) and low < mean < high
     assert all(each.low is None for each in aggregate(scores[:1]).values())
     share, low, high = profile(scores, np.array([-0.1, 0.5, 1.0]))
-    assert share.tolist() == [1.0, np.mean(scores > 0.5), 0.0] and (low <= share).all() and (share <= high).all()
+    assert share == pytest.approx([1.0, np.mean(scores > 0.5), 0.0]) and (low <= share).all() and (share <= high).all()
 
 
 def test_report_needs_nothing_but_a_file_of_results(tmp_path, capsys):
@@ -162,3 +172,17 @@ def test_report_takes_as_many_runs_of_each_task_as_the_fewest_where_all_have_sev
     write_report(rows, 100_000, tmp_path / "report.md")
     together = (tmp_path / "report.md").read_text().partition("## All tasks together")[2]
     assert "2 runs per task count" in together and "\n| mean | 50 (" in together
+
+
+def test_a_run_counts_by_its_own_return_where_tasks_have_unequal_numbers_of_runs():
+    rows = {"a": [make_row(planner=564.0), make_row(seed=1, planner=788.0)], "b": [make_row(planner=900.0)]}
+    scores = score_matrix(counted(rows), ["a", "b"], "planner")
+    assert improvement(scores, np.array([[0.625, 0.8]])) == (0.75, None, None)
+    assert profile(scores, np.array([0.0, 0.6, 0.8]))[0].tolist() == [1.0, 0.75, 0.5]
+    assert aggregate(scores)["mean"].mean == pytest.approx((0.676 + 0.9) / 2)
+
+
+def test_report_links_its_pictures_whatever_its_name(tmp_path):
+    write_report([make_row()], 100_000, tmp_path / "ä (b c).md")
+    links = re.findall(r"!\[[^]]*\]\(([^() ]+)\)", (tmp_path / "ä (b c).md").read_text())
+    assert {unquote(link) for link in links} == {"ä (b c)-curves.png", "ä (b c)-profile.png"}
