@@ -75,6 +75,8 @@ class Request(ComposeRequest):
             raise ValueError(f"decisions must be at least 1, got {min(self.decisions)}")
         if len(set(self.workers)) < 3:
             raise UserError("--workers must name at least three numbers, from which the model is fitted")
+        if both := set(self.workers) & set(self.held_out):
+            raise UserError(f"--held-out must name other numbers than --workers, got {min(both)} in both")
         above_zero(self, "update_ms", "link_gbit")
         require_known("backend", self.backends, COLLECTION_BACKENDS)
         if self.ray_address is not None and "ray" not in self.backends:

@@ -124,7 +124,7 @@ def measure_decisions(agent: Agent, batch: int, decisions: int) -> dict[str, Any
 
 @contextmanager
 def count_model_steps(model: WorldModel) -> Iterator[dict[str, int]]:
-    """Counts the model steps of all rows, under `rows`, inside the `with` block."""
+    """Counts the model steps of all rows, those of proposals too, under `rows`, inside the `with` block."""
     counts = {"rows": 0}
 
     def counting(method: Any) -> Any:
@@ -134,14 +134,22 @@ def count_model_steps(model: WorldModel) -> Iterator[dict[str, int]]:
 
         return call
 
-    names = ("step", "fast_step", "rollout")
+    def propose(own: WorldModel, state: Any, noise: torch.Tensor) -> torch.Tensor:
+        counts["rows"] += math.prod(noise.shape[:-1])
+        proposals: torch.Tensor = imagine(own, state, noise)
+        return proposals
+
+    names, backend = ("step", "fast_step", "rollout"), model.backend
+    imagine = backend.propose
     for name in names:
         setattr(model, name, counting(getattr(model, name)))
+    backend.propose = propose  # type: ignore[method-assign,assignment]
     try:
         yield counts
     finally:
         for name in names:
             delattr(model, name)
+        del backend.propose
 
 
 class ExportedActor:

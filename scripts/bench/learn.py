@@ -63,7 +63,7 @@ def run(request: Request) -> int:
     make_folder(out)
     for each in runs:
         _train(each)
-    curves = [read_run(each.task, each.seed, each.folder, mode) for each in runs]
+    curves = [read_run(each.task, each.seed, each.folder, mode, request.frames) for each in runs]
     write_csv(out / "curves.csv", [{"task": c.task, "seed": c.seed, **p._asdict()} for c in curves for p in c.points])
     print(run_table(curves, thresholds))
     finals = final_estimates(curves)
@@ -84,15 +84,31 @@ def name_task(name: str) -> str:
     return name if suite is None else f"{name}-{check_task(suite, name)[0]}"
 
 
-def read_run(task: str, seed: int, folder: Path, mode: str) -> Curve:
+def read_run(task: str, seed: int, folder: Path, mode: str, frames: int | None = None) -> Curve:
     """The evaluations of a run, including the final evaluation and those of shorter budgets.
 
+    Args:
+        task: The task.
+        seed: The seed.
+        folder: Folder of the run.
+        mode: Agent whose returns are taken.
+        frames: Budget of env frames, after which a longer run's evaluations do not count; None takes all.
+
     Raises:
-        UserError: The run has no evaluation, or its files are damaged.
+        UserError: The run has no evaluation within its budget, one is not finite, or its files are damaged.
     """
     points = [Point(each.env_frames, each.minutes, getattr(each, mode)) for each in read_all_evaluations(folder)]
     if not points:
         raise UserError(f"{folder} holds no evaluation; lower --evaluation.every_frames or train longer")
+    if frames is not None:
+        points = [point for point in points if point.env_frames <= (1.0 + FRAMES_TOLERANCE) * frames]
+        if not points:
+            raise UserError(
+                f"{folder} holds no evaluation within {frames:,} frames; give more --frames or another --out"
+            )
+    for point in points:
+        if not all(map(math.isfinite, point)):
+            raise UserError(f"{folder} has an evaluation that is not finite, at {point.env_frames:,} frames")
     return Curve(task, seed, points)
 
 

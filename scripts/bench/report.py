@@ -39,9 +39,9 @@ def format_interval(ends: Sequence[float | None], digits: int = 1, sign: bool = 
 
 
 def write_json(path: Path | None, result: Mapping[str, Any]) -> None:
-    """Writes a result as JSON, if there is a path; the file is replaced as a whole."""
+    """Writes a result as JSON, if there is a path; numbers that are not finite become null, as JSON has none."""
     if path is not None:
-        write_text(path, json.dumps(result, indent=2) + "\n")
+        write_text(path, json.dumps(_finite(result), indent=2, allow_nan=False) + "\n")
 
 
 def write_csv(path: Path | None, rows: Sequence[Mapping[str, Any]]) -> None:
@@ -67,6 +67,15 @@ def save_figure(figure: Figure, png: Path) -> None:
     """Writes a figure as PNG in place of a file."""
     with replaced_whole(png) as part:
         figure.savefig(part, dpi=120, format="png")
+
+
+def _finite(value: Any) -> Any:
+    """A plain value with None in place of numbers that are not finite."""
+    if isinstance(value, Mapping):
+        return {key: _finite(inner) for key, inner in value.items()}
+    if isinstance(value, list | tuple):
+        return [_finite(inner) for inner in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def _aligned(line: Sequence[str], widths: Sequence[int]) -> str:

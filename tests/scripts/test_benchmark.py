@@ -3,6 +3,7 @@
 import csv
 import importlib
 import json
+import math
 import sys
 from dataclasses import replace
 
@@ -16,7 +17,8 @@ from bench.decide import ExportedActor, measure_decisions
 from bench.estimates import interquartile_estimate, interquartile_mean, paired_difference
 from bench.machine import product_limits
 from bench.render import measure_qualities
-from bench.report import format_interval, format_number, format_table
+from bench.report import format_interval, format_number, format_table, write_json
+from bench.train import shares_of_limits
 from bench.train_update import PARTS, measure_graph, measure_update
 from bench.view import summarize
 
@@ -199,12 +201,23 @@ def test_measure_update_splits_an_update_into_parts_whose_operations_add_up(conf
         assert larger[name]["flop"] == 2 * measured["parts"][name]["flop"] > 0
 
 
+def test_share_of_the_limit_is_that_of_the_threads_that_the_limit_was_measured_with():
+    measured = {"flop": 100, "flop_per_s": 200.0, "in_turn_ms": 1000.0, "update_ms": 500.0}
+    assert shares_of_limits(measured, {"float32": 100.0, "bfloat16": 400.0}) == {"float32": 1.0, "bfloat16": 0.25}
+
+
+def test_json_has_null_where_a_number_is_not_finite(tmp_path):
+    write_json(tmp_path / "result.json", {"ci95": (math.nan, 1.5), "rows": [{"cost": math.inf}]})
+    assert json.loads((tmp_path / "result.json").read_text()) == {"ci95": [None, 1.5], "rows": [{"cost": None}]}
+
+
 def test_measure_decisions_counts_the_model_steps_of_a_warm_search(config):
     torch.manual_seed(0)
     model = WorldModel(config.model, action_dim=1)
     steps = measure_decisions(PlanningAgent(model, config, 0.9), batch=1, decisions=2)["model_steps"]
-    # The horizon, times fresh candidates of two refits, the proposals, and the plan beside the policy's sequence.
-    assert steps == 3 * (2 * (8 - 2) + 2 + 2)
+    # The horizon, times fresh candidates of two refits, the proposals, which are imagined and then scored, and the plan
+    # beside the policy's sequence.
+    assert steps == 3 * (2 * (8 - 2) + 2 + 2 + 2)
     assert measure_decisions(PlanningAgent(model, config, 0.9), batch=3, decisions=1)["model_steps"] == steps
     assert measure_decisions(ActorAgent(model, config), batch=1, decisions=2)["model_steps"] == 0
 
@@ -241,7 +254,7 @@ def test_decide_applies_planner_settings_of_the_command_line(tmp_path, checkpoin
     assert benchmark.main([str(word) for word in [*command, "--planner.horizon", 1]]) == 0
     result = json.loads(path.read_text())
     assert result["planner"]["horizon"] == 1
-    assert result["arms"]["planner"]["model_steps"] == 16
+    assert result["arms"]["planner"]["model_steps"] == 16 + 2  # candidates, and the imagination of the proposals
     assert result["arms"]["planner without actor"]["model_steps"] == 16
     assert result["arms"]["exported actor"]["model_steps"] == 0
 

@@ -69,6 +69,7 @@ def test_collect_refuses_too_few_numbers_for_a_fit(capsys):
         ("--workers 0,1,2", "--workers must be in [1, 256], got 0"),
         ("--workers 1,2,257", "--workers must be in [1, 256], got 257"),
         ("--held-out 0", "--held-out must be in [1, 256], got 0"),
+        ("--workers 1,2,4 --held-out 3,4", "--held-out must name other numbers than --workers, got 4 in both"),
         ("--decisions 0", "--decisions must be at least 1, got 0"),
     ],
 )

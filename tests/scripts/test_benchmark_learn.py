@@ -53,6 +53,34 @@ def test_read_run_keeps_the_final_evaluation_of_a_shorter_budget(tmp_path):
     assert read_run("walker-walk", 0, tmp_path, "planner").points == points
 
 
+def test_read_run_ends_at_its_budget_in_the_folder_of_a_longer_run(tmp_path):
+    (tmp_path / "metrics.csv").write_text(HEADER + "80,7,4.0,1,2\n101,9,5.0,3,4\n200,12,9.0,5,6\n")
+    assert read_run("walker-walk", 0, tmp_path, "planner", 100).points[-1] == Point(101, 5.0, 3.0)
+    assert read_run("walker-walk", 0, tmp_path, "planner").points[-1] == Point(200, 9.0, 5.0)
+    with pytest.raises(UserError, match="holds no evaluation within 60 frames"):
+        read_run("walker-walk", 0, tmp_path, "planner", 60)
+
+
+def test_finals_of_one_budget_do_not_mix_with_those_of_a_longer_one(tmp_path):
+    for seed, frames in ((0, 200), (1, 100)):
+        folder = tmp_path / f"walker-walk-seed{seed}"
+        folder.mkdir()
+        (folder / "finished.json").write_text(json.dumps({"budget": ["--frames", str(frames)]}))
+        rows = "".join(f"{at},9,3,{at},1\n" for at in range(100, frames + 1, 100))
+        (folder / "metrics.csv").write_text(HEADER + rows)
+    flags = ["--tasks", "walker-walk", "--frames", "100", "--out", str(tmp_path)]
+    assert benchmark.main(["learn", *flags]) == 0
+    summary = json.loads((tmp_path / "summary.json").read_text())
+    assert [run["env_frames"] for run in summary["runs"]] == [100, 100]
+    assert summary["final"]["walker-walk"]["mean"] == 100.0
+
+
+def test_read_run_refuses_an_evaluation_that_is_not_finite(tmp_path):
+    (tmp_path / "metrics.csv").write_text(HEADER + "80,7,4.0,1,2\n100,9,5.0,nan,4\n")
+    with pytest.raises(UserError, match="is not finite, at 100 frames"):
+        read_run("walker-walk", 0, tmp_path, "planner")
+
+
 def test_read_run_refuses_damaged_final_evaluations_of_shorter_budgets(tmp_path):
     (tmp_path / "metrics.csv").write_text(HEADER + "80,7,4.0,1,2\n")
     (tmp_path / "finals.json").write_text("{")
