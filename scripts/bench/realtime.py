@@ -33,8 +33,8 @@ class Request(ComputeRequest):
         checkpoint: Folder of a trained agent, or of a run (its best checkpoint).
         episodes: Episodes of each point, from the same starts.
         seed: Seed of the starts: episode i starts from a state that depends only on the seed and i.
-        parts: Parts of the measurement.
-        rates: Decisions per second of environments that do not wait.
+        parts: Parts of the measurement, each once.
+        rates: Decisions per second of environments that do not wait, each once.
         json: Result as JSON, written anew after every point.
         plot: Result as a picture.
     """
@@ -51,6 +51,8 @@ class Request(ComputeRequest):
         super().__post_init__()
         at_least(self, episodes=1, seed=0)
         require_known("part", self.parts, PARTS)
+        object.__setattr__(self, "parts", tuple(dict.fromkeys(self.parts)))
+        object.__setattr__(self, "rates", tuple(dict.fromkeys(self.rates)))
         if min(self.rates) <= 0.0:
             raise UserError(f"--rates must be above 0, got {min(self.rates):g}")
 
@@ -84,6 +86,7 @@ def run(request: Request) -> int:
     seeds = [episode_seed(seed, index) for index in range(episodes)]
     result: dict[str, list[Row]] = {part: [] for part in request.parts}
     try:
+        check_parts(request.parts, env)
         trial = Trial(checkpoint, device, env, seeds, planner.horizon)
         for part, row in measure_parts(trial, request.parts, request.rates):
             require_unchanged(checkpoint, info)
@@ -99,6 +102,17 @@ def run(request: Request) -> int:
 
         plot_realtime(result, request.plot)
     return 0
+
+
+def check_parts(parts: Sequence[str], env: Any) -> None:
+    """Checks that an environment can be played in these parts.
+
+    Raises:
+        UserError: Its action cannot change within a decision, as it must where the environment does not wait.
+    """
+    if "rates" in parts and not hasattr(env, "step_schedule"):
+        others = ",".join(part for part in PARTS if part != "rates")
+        raise UserError(f"the action of this environment cannot change within a decision: give --parts {others}")
 
 
 def measure_parts(trial: Trial, parts: Sequence[str], rates: Sequence[float]) -> Iterator[tuple[str, Row]]:

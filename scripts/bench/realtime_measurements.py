@@ -102,13 +102,22 @@ def measure_error(trial: Trial) -> Iterator[Row]:
 
     agent: Any = load_agent(trial.checkpoint, mode="actor", device=trial.device)
     parts = [_prediction_errors(agent.model, *_record_episode(agent, trial.env, seed)) for seed in trial.seeds]
-    parts = [part for part in parts if part.shape[1]]
-    if not parts:
-        return
-    errors = np.concatenate(parts, axis=1).mean(axis=1)
     names = ("latent_distance", "reward_error", "latent_change", "reward_change")
-    for step, values in enumerate(errors.tolist(), start=1):
+    for step, values in enumerate(mean_errors(parts), start=1):
         yield {"step": step, **dict(zip(names, values, strict=True))}
+
+
+def mean_errors(parts: Sequence[np.ndarray]) -> list[list[float]]:
+    """Means over the starts of all episodes, by step; a step is that of the episodes that are long enough for it.
+
+    Args:
+        parts: Errors (step, start, 4) of each episode.
+    """
+    steps = max(map(len, parts))
+    return [
+        np.concatenate([part[step] for part in parts if step < len(part)]).mean(axis=0).tolist()
+        for step in range(steps)
+    ]
 
 
 def _record_episode(agent: Any, env: SuiteEnv, seed: int) -> tuple[list[Any], list[np.ndarray], list[float]]:
@@ -134,7 +143,7 @@ def _prediction_errors(model: Any, beliefs: list[Any], actions: list[np.ndarray]
     """Errors (step, start, 4): latent distance and reward error of the model, and of predicting no change."""
     import torch
 
-    steps = min(IMAGINED_STEPS, len(beliefs) - 2)
+    steps = max(0, min(IMAGINED_STEPS, len(beliefs) - 2))
     starts = torch.arange(1, len(beliefs) - steps, START_EVERY)
     taken = torch.as_tensor(np.stack(actions), device=model.device)
     all_rewards = torch.tensor(rewards, device=model.device)

@@ -97,7 +97,7 @@ def kill_runs(
     """Kills runs at random moments after their first save.
 
     Args:
-        folder: Where the runs are made.
+        folder: Where the runs are made; one that fails is moved to a folder of its own, which is kept.
         reference: A run that was not killed.
         tries: Number of runs.
         seconds: Time that the reference took.
@@ -109,7 +109,7 @@ def kill_runs(
     """
     expected, kills, survived = fingerprint(reference), 0, 0
     for index in range(tries):
-        own = folder / f"run{index}"
+        own = folder / f"{'worker' if is_worker else 'trainer'}{index}"
         process, killed = _train(own, overlap=is_worker), 0
         while killed < KILLS_PER_RUN:
             _await_save(own / "resume", process)
@@ -131,7 +131,8 @@ def kill_runs(
         if is_equal:
             shutil.rmtree(own)
         else:
-            print(f"run {index} ended with {code} and other results: {own}", file=sys.stderr)
+            kept = shutil.move(own, tempfile.mkdtemp(prefix="survive-failed-"))  # the folder of all runs is removed
+            print(f"run {index} ended with {code} and other results: {kept}", file=sys.stderr)
     return {"tries": tries, "survived": survived, "kills": kills}
 
 

@@ -2,12 +2,13 @@
 
 import json
 import time
+from types import SimpleNamespace
 
 import benchmark
 import numpy as np
 import pytest
 from bench.realtime import PARTS, part_table
-from bench.realtime_measurements import AGENTS, ITERATIONS, REPLAN_EVERY
+from bench.realtime_measurements import AGENTS, ITERATIONS, REPLAN_EVERY, mean_errors
 from bench.soak import IDLE, IdleAgent, Tally, play_block, soak_rows, soak_table, take_turns
 
 from latentplan.config.spaces import Spaces
@@ -83,9 +84,23 @@ def test_measure_error_compares_the_model_with_no_change(measured):
 
 def test_realtime_measures_the_chosen_parts_only(tmp_path, checkpoint):
     path = tmp_path / "r.json"
-    flags = ["--parts", "error", "--episodes", "1", "--device", "cpu", "--json", str(path)]
+    flags = ["--parts", "error,error", "--episodes", "1", "--device", "cpu", "--json", str(path)]
     assert benchmark.main(["realtime", "--checkpoint", str(checkpoint), *flags]) == 0
-    assert set(PARTS) & json.loads(path.read_text()).keys() == {"error"}
+    result = json.loads(path.read_text())
+    assert set(PARTS) & result.keys() == {"error"}
+    assert [row["step"] for row in result["error"]] == list(range(1, 9))  # a part that is named twice is measured once
+
+
+def test_errors_are_means_over_the_episodes_that_are_long_enough():
+    short, long, none = np.full((8, 1, 4), 1.0), np.full((20, 3, 4), 5.0), np.zeros((0, 0, 4))
+    assert mean_errors([short, long, none]) == [[4.0] * 4] * 8 + [[5.0] * 4] * 12
+    assert mean_errors([none]) == []
+
+
+def test_realtime_refuses_an_environment_that_cannot_run_on_before_it_plays(checkpoint, capsys, monkeypatch):
+    monkeypatch.setattr("latentplan.envs.make_env", lambda _: SimpleNamespace(close=lambda: None))
+    assert benchmark.main(["realtime", "--checkpoint", str(checkpoint), "--device", "cpu"]) == 2
+    assert capsys.readouterr().err.endswith("give --parts iterations,error,replan\n")
 
 
 def test_soak_and_realtime_show_an_agent_the_vectors_that_it_has_learned_to_see(save_agent, tmp_path, monkeypatch):

@@ -1,8 +1,10 @@
 """benchmark.py survive and faults: what they cause happens, and what they count is true."""
 
 import json
+import random
 import shutil
 import sys
+import tempfile
 from pathlib import Path
 
 import pytest
@@ -36,6 +38,26 @@ def test_fingerprint_covers_weights_replay_and_metrics(run, tmp_path):
 def test_is_noticed_is_false_for_files_that_are_whole(run):
     paths = [path for pattern in survive.FILES for path in run.glob(pattern)]
     assert len(paths) >= 15 and not any(survive.is_noticed(run, path) for path in paths)
+
+
+def test_run_that_failed_is_kept_and_no_other_run_continues_it(tmp_path, monkeypatch):
+    began = []
+
+    def start(folder, *, overlap):
+        began.append(folder.exists())
+        folder.mkdir(parents=True)
+        return 1
+
+    for name, stub in {"_train": start, "_await_save": lambda *_: None, "_has_ended": lambda *_: True}.items():
+        monkeypatch.setattr(survive, name, stub)
+    monkeypatch.setattr(survive, "_wait", lambda _: 0)
+    monkeypatch.setattr(survive, "fingerprint", lambda run: run.name)
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    for is_worker in (False, True, False):
+        row = survive.kill_runs(tmp_path / "runs", tmp_path / "reference", 1, 0.0, random.Random(0), is_worker)
+        assert row == {"tries": 1, "survived": 0, "kills": 0}
+    assert began == [False] * 3 and not list((tmp_path / "runs").iterdir())
+    assert sorted(path.name for path in tmp_path.glob("survive-failed-*/*")) == ["trainer0", "trainer0", "worker0"]
 
 
 @pytest.mark.slow
