@@ -73,7 +73,7 @@ def run(request: Request) -> int:
     }
     print(f"{about['domain']}-{about['task']}, {episodes} episodes per arm, {workers} at once", flush=True)
     outcomes: dict[str, Outcome] = {}
-    play = partial(play_arm, checkpoint=checkpoint, seeds=seeds, device=device)
+    play = partial(play_arm, checkpoint=checkpoint, seeds=seeds, device=device, threads=request.threads or 1)
     for outcome in run_in_order(play, arms, workers):
         require_unchanged(checkpoint, info)
         outcomes[outcome.arm.name] = outcome

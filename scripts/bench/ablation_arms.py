@@ -78,14 +78,15 @@ def without_actor(base: PlannerConfig) -> dict[str, Any]:
     return {"num_policy_samples": 0, **tail, **surprise}
 
 
-def play_arm(arm: Arm, checkpoint: str, seeds: Sequence[int], device: str) -> Outcome:
+def play_arm(arm: Arm, checkpoint: str, seeds: Sequence[int], device: str, threads: int = 1) -> Outcome:
     """Plays one episode per seed, with the render quality of the checkpoint.
 
     Args:
-        arm: The arm that plays, with one CPU thread.
+        arm: The arm that plays.
         checkpoint: Folder of a checkpoint or of a run.
         seeds: Seeds of the starts.
         device: `cpu` or `cuda`.
+        threads: CPU threads.
     """
     import numpy as np
     import torch
@@ -95,7 +96,7 @@ def play_arm(arm: Arm, checkpoint: str, seeds: Sequence[int], device: str) -> Ou
     from latentplan.evaluation.episodes import Step, run_episodes
     from latentplan.evaluation.statistics import latency_percentiles
 
-    torch.set_num_threads(1)
+    torch.set_num_threads(threads)
     _, config, _ = load_model(checkpoint)
     agent: Any = load_agent(checkpoint, mode=arm.mode, device=device, **arm.planner)
     differs: list[bool] = []

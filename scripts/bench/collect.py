@@ -16,7 +16,7 @@ from pathlib import Path
 from statistics import median
 from typing import TYPE_CHECKING, Any
 
-from bench.options import ComposeRequest
+from bench.options import ComposeRequest, compute_on_processor
 from bench.report import format_number, format_table, write_json
 from latentplan.config import UserError
 from latentplan.config.checks import above_zero, at_least
@@ -66,6 +66,7 @@ class Request(ComposeRequest):
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        compute_on_processor(self)
         at_least(self, rounds=1, learners=1, collectors=1)
         for name in ("workers", "held_out"):
             for number in getattr(self, name):

@@ -15,7 +15,8 @@ from pathlib import Path
 
 from bench.hostile_inputs import MARK, list_cases, write_files
 from bench.report import format_number, format_table, write_json
-from latentplan.config.checks import LONGEST_LINE, at_least
+from latentplan.config import UserError
+from latentplan.config.checks import LONGEST_LINE, at_least, shown
 from latentplan.config.parsing import option
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -65,9 +66,15 @@ class Outcome:
 
 
 def run(request: Request) -> int:
-    """Tries the inputs, prints those that were not refused as they should be, and returns 1 if there are any."""
+    """Tries the inputs, prints those that were not refused as they should be, and returns 1 if there are any.
+
+    Raises:
+        UserError: No input has such a name.
+    """
     agent, outcomes = request.checkpoint.resolve(), []
     cases = [case for case in list_cases().items() if request.only in case[0]][:: request.every]
+    if not cases:
+        raise UserError(f"--only {shown(request.only)} is part of no input's name")
     with tempfile.TemporaryDirectory() as name:
         write_files(Path(name), agent)
         for case, words in cases:

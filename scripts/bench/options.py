@@ -5,9 +5,20 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from latentplan.commands.shell import ComputeRequest
-from latentplan.config import Config
+from latentplan.config import Config, UserError
 from latentplan.config.checks import at_least
 from latentplan.config.files import Layer, Preset, compose
+
+
+def compute_on_processor(request: ComputeRequest) -> None:
+    """Sets the device of a benchmark that measures the processor alone.
+
+    Raises:
+        UserError: The command line asks for a GPU.
+    """
+    if request.device == "cuda":
+        raise UserError("this benchmark measures the processor alone: leave out --device cuda")
+    object.__setattr__(request, "device", "cpu")
 
 
 @dataclass(frozen=True, kw_only=True)

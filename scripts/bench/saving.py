@@ -14,7 +14,7 @@ from pathlib import Path
 from statistics import median
 from typing import TYPE_CHECKING, Any
 
-from bench.options import ComposeRequest
+from bench.options import ComposeRequest, compute_on_processor
 from bench.report import format_table, write_json
 from latentplan.config.checks import at_least
 from latentplan.config.parsing import option
@@ -47,6 +47,7 @@ class Request(ComposeRequest):
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        compute_on_processor(self)
         at_least(self, rows=1, new_rows=1, saves=1, blocks=1)
 
 

@@ -19,7 +19,7 @@ from pathlib import Path
 from statistics import fmean, median, stdev
 from typing import TYPE_CHECKING, Any
 
-from bench.options import ComputeRequest
+from bench.options import ComputeRequest, compute_on_processor
 from bench.peers.install import (
     FOLDER,
     PEERS,
@@ -83,6 +83,7 @@ class Request(ComputeRequest):
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        compute_on_processor(self)
         at_least(self, seeds=2, tuning_seeds=1, samples=2, iterations=1, timed=1, jobs=1)
         above_zero(self, "budget_ms")
         require_known("problem", self.problems, PROBLEM_NAMES)
@@ -142,7 +143,11 @@ class Arm:
         return answer
 
     def choose(self, request: Request) -> None:
-        """Takes the settings with the lowest cost on the tuning seeds."""
+        """Takes the settings with the lowest cost on the tuning seeds.
+
+        Raises:
+            PeerError: The planner failed, or no settings have a finite cost.
+        """
         seeds = range(FIRST_TUNING_SEED, FIRST_TUNING_SEED + request.tuning_seeds)
         costs = []
         for settings in self.choices:
@@ -150,7 +155,20 @@ class Arm:
             cost = fmean(self.ask("run", request.iterations, request, seeds=list(seeds))["costs"])
             costs.append(cost if math.isfinite(cost) else math.inf)
         self.tuning_cost = min(costs)
+        if not math.isfinite(self.tuning_cost):
+            raise PeerError("no settings have a finite cost on the starts for tuning")
         self.settings = self.choices[costs.index(self.tuning_cost)]
+
+    def play(self, iterations: int, request: Request) -> dict[str, Any]:
+        """Costs and evaluations on the starts that are reported.
+
+        Raises:
+            PeerError: The planner failed, or a cost is not finite.
+        """
+        answer = self.ask("run", iterations, request, seeds=list(range(request.seeds)))
+        if not all(map(math.isfinite, answer["costs"])):
+            raise PeerError(f"its cost is not finite on a reported start, with {iterations} iterations")
+        return answer
 
 
 def run(request: Request) -> int:
@@ -291,10 +309,10 @@ def compare(
         return results
 
     def play(counts: dict[int, int], among: Sequence[Arm]) -> dict[int, Any]:
-        seeds = list(range(request.seeds))
-        return each(lambda arm: arm.ask("run", counts[id(arm)], request, seeds=seeds), among)
+        return each(lambda arm: arm.play(counts[id(arm)], request), among)
 
     each(lambda arm: arm.choose(request), arms)
+    arms = [arm for arm in arms if arm.title not in left_out]
     base = {id(arm): request.iterations for arm in arms}
     equal = play(base, arms)
     times = take_turns([arm for arm in arms if id(arm) in equal], base, request, left_out)

@@ -16,7 +16,7 @@ def run_in_order(function: Callable[[Job], Result], jobs: Sequence[Job], workers
     Args:
         function: Computes the result of a job; picklable if there are several workers.
         jobs: The jobs.
-        workers: Jobs that run at once, each in a process with one thread; 1 runs them in this process.
+        workers: Jobs that run at once, each in a process that begins with one thread; 1 runs them in this process.
     """
     if workers == 1:
         yield from map(function, jobs)

@@ -58,6 +58,7 @@ class Conditions(NamedTuple):
         planner: Settings of the search that differ from the agent's.
         push: Standard deviation of kicks to the joints' velocities, in m/s or rad/s; 0 for none.
         trained: Folder of the agent that was trained for the objectives, or None.
+        threads: CPU threads.
     """
 
     checkpoint: str
@@ -66,6 +67,7 @@ class Conditions(NamedTuple):
     planner: dict[str, Any]
     push: float = 0.0
     trained: str | None = None
+    threads: int = 1
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -143,7 +145,7 @@ def run(request: Request) -> int:
     }
     print(f"{about['domain']}-{about['task']}, {episodes} episodes per row, {workers} at once", flush=True)
     rows: list[dict[str, Any]] = []
-    conditions = Conditions(checkpoint, seeds, device, changes, push, trained_for)
+    conditions = Conditions(checkpoint, seeds, device, changes, push, trained_for, request.threads or 1)
     for row in run_in_order(partial(play_job, conditions), jobs, workers):
         require_unchanged(checkpoint, info)
         rows.append(row)
@@ -199,7 +201,7 @@ def play_job(conditions: Conditions, job: Job) -> dict[str, Any]:
     from latentplan.evaluation.goals import goal_env, read_goals, score_env
     from latentplan.evaluation.statistics import summarize
 
-    torch.set_num_threads(1)
+    torch.set_num_threads(conditions.threads)
     checkpoint, player, search = conditions.checkpoint, job.player, conditions.planner
     if job.player in TRAINED_PLAYERS:
         assert conditions.trained is not None, "asked for by --trained"

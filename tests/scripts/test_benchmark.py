@@ -48,6 +48,10 @@ def ablated(tmp_path, checkpoint, arms, *flags):
     ("arguments", "named"),
     [
         (["trian"], "'train'"),
+        (["search", "--device", "cuda"], "--device cuda"),
+        (["saving", "--device", "cuda"], "--device cuda"),
+        (["collect", "--device", "cuda"], "--device cuda"),
+        (["hostile", "--only", "nosuchname"], "--only 'nosuchname' is part of no input's name"),
         (["train", "--update", "3"], "'--updates'"),
         (["train", "--updates", "0"], "--updates"),
         (["train", "--domain", "walkr"], "'walker'"),
@@ -185,6 +189,24 @@ def test_compare_arms_compares_with_the_first_arm():
     assert compared["full"]["minus_full"] is None
     assert compared["cold"]["minus_full"] == 1.5
     assert compared["full"]["differs_from_actor"] == 0.5
+
+
+@pytest.mark.parametrize("command", [["ablate", "--arms", "full"], ["zero-shot", "--constraints", "cart < 0.5"]])
+def test_episodes_are_played_with_the_threads_that_were_asked_for(checkpoint, monkeypatch, command):
+    used = []
+
+    def play(*_, **__):
+        used.append(torch.get_num_threads())
+        raise UserError("seen")
+
+    monkeypatch.setattr("latentplan.evaluation.episodes.run_episodes", play)
+    before = torch.get_num_threads()
+    try:
+        for threads in ([], ["--threads", "3"]):
+            assert benchmark.main([*command, "--checkpoint", str(checkpoint), "--device", "cpu", *threads]) == 2
+    finally:
+        torch.set_num_threads(before)
+    assert used == [1, 3]
 
 
 def test_measure_update_splits_an_update_into_parts_whose_operations_add_up(config):

@@ -213,6 +213,18 @@ def test_planner_that_fails_within_the_milliseconds_has_no_row_there():
     assert left_out == {"peer A on lq": "it broke"}
 
 
+@pytest.mark.parametrize(("seed", "words"), [(0, "on a reported start"), (100, "on the starts for tuning")])
+def test_planner_whose_cost_is_not_finite_is_left_out(seed, words):
+    class Diverging(FailingProcess):
+        def ask(self, request):
+            answer = super().ask(request)
+            return answer | {"costs": [*answer["costs"][1:], math.nan]} if seed in request.get("seeds", ()) else answer
+
+    rows, left_out = compare_with(Diverging())
+    assert rows == CEM_ROWS
+    assert list(left_out) == ["peer A on lq"] and words in left_out["peer A on lq"]
+
+
 @pytest.mark.parametrize(("iterations", "rows_left"), [(3, 0), (1, 1), (5, 1)])
 def test_planner_that_fails_while_it_is_timed_is_left_out(iterations, rows_left):
     rows, left_out = compare_with(FailingProcess("time", iterations))
