@@ -7,6 +7,7 @@ Every run is a `train.py` process; some run side by side. The same command goes 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -46,7 +47,7 @@ class Request(RunsRequest):
         ray_address: Address of the cluster as HOST:PORT; None starts Ray on this machine.
         report: Markdown file of tables; its plots are written beside it.
         results: File of rows, from which the report is made, and nothing is run.
-        merge: Folder of a sweep, whose rows are added to the file of results first.
+        merge: Folder of a sweep, whose rows (of the given tasks and seeds) are added to the file of results first.
     """
 
     tasks: tuple[str, ...] = option((), separator=",", metavar="dmc20|dev|A,B,...")
@@ -72,6 +73,8 @@ class Request(RunsRequest):
             raise UserError("--merge needs --results FILE, the file to which the rows are added")
         if self.results is not None and self.merge is None and self.report is None:
             raise UserError("--results needs --report FILE.md, or --merge DIR, or both")
+        if self.results is not None:
+            self._refuse_flags_of_runs()
 
     @property
     def runs(self) -> list[TrainingRun]:
@@ -84,6 +87,13 @@ class Request(RunsRequest):
             for seed in self.seeds or DEFAULT_SEEDS
             for task in self.tasks or expand_tasks(DEFAULT_TASKS)
         ]
+
+    def _refuse_flags_of_runs(self) -> None:
+        defaults = {"minutes": None, "preset": None, "device": None, "config": None, "jobs": 1, "backend": "process"}
+        given = [name for name, default in defaults.items() if getattr(self, name) != default]
+        given += [f"{section}.{name}" for section, fields in self.settings.items() for name in fields]
+        if given:
+            raise UserError(f"--{given[0]} has no effect with --results, which runs nothing: leave it out")
 
 
 def run(request: Request) -> int:
@@ -164,14 +174,22 @@ def _take_rows(request: Request, results: Path) -> list[Row]:
     """The rows of a file of results, with those of a sweep added to it, of the tasks and seeds that were asked for."""
     rows = read_rows(results)
     if request.merge is not None:
-        new = read_rows(request.merge / RESULTS)
-        if not new:
+        sweep = read_rows(request.merge / RESULTS)
+        if not sweep:
             raise UserError(f"{request.merge / RESULTS} holds no rows; give the folder of a sweep to --merge")
+        new = _select(request, sweep)
+        if not new:
+            raise UserError(f"{request.merge / RESULTS} holds no rows of these --tasks and --seeds")
         rows = merge_rows(rows, new)
         write_rows(output_file(results, "--results"), rows)
         print(f"{results} holds {len(rows)} rows, {len(new)} of them from {request.merge}")
     if not rows:
         raise UserError(f"{results} holds no rows; --merge DIR adds the rows of a sweep")
+    return _select(request, rows)
+
+
+def _select(request: Request, rows: Sequence[Row]) -> list[Row]:
+    """The rows of the tasks and seeds that were asked for, or all."""
     return [
         row for row in rows if row.task in (request.tasks or (row.task,)) and row.seed in (request.seeds or (row.seed,))
     ]

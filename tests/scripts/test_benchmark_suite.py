@@ -274,6 +274,11 @@ def test_run_waits_while_another_process_has_its_folder(tmp_path, capsys, monkey
         (["--report", "no/such/folder/report.md"], "no/such/folder"),
         (["--merge", "."], "--results"),
         (["--results", "rows.csv"], "--report"),
+        (["--results", "rows.csv", "--report", "report.md", "--jobs", "4"], "--jobs has no effect with --results"),
+        (
+            ["--results", "rows.csv", "--merge", ".", "--learning.batch_size", "8"],
+            "--learning.batch_size has no effect",
+        ),
         (["--results", "rows.csv", "--report", "report.md"], "rows.csv holds no rows"),
         (["--results", "rows.csv", "--merge", "nowhere"], "nowhere/results.csv holds no rows"),
         (["--config", "nowhere.yaml"], "nowhere.yaml"),

@@ -71,6 +71,16 @@ def test_merge_adds_a_sweep_to_a_file_that_need_not_exist(tmp_path, capsys):
     )
 
 
+def test_merge_adds_only_the_tasks_and_seeds_that_were_asked_for(tmp_path, capsys):
+    results = tmp_path / "suite.csv"
+    write_rows(tmp_path / "results.csv", [make_row(task, seed) for task in TASKS for seed in (0, 1)])
+    flags = ["--results", str(results), "--merge", str(tmp_path), "--tasks", TASKS[1], "--seeds"]
+    assert benchmark.main(["suite", *flags, "1"]) == 0
+    assert read_rows(results) == [make_row(TASKS[1], 1)]
+    assert benchmark.main(["suite", *flags, "7"]) == 2
+    assert "holds no rows of these --tasks and --seeds" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize(
     ("old", "new", "named"),
     [
