@@ -84,7 +84,7 @@ def test_measure_error_compares_the_model_with_no_change(measured):
 
 def test_realtime_measures_the_chosen_parts_only(tmp_path, checkpoint):
     path = tmp_path / "r.json"
-    flags = ["--parts", "error,error", "--episodes", "1", "--device", "cpu", "--json", str(path)]
+    flags = ["--parts", "[error, error]", "--episodes", "1", "--device", "cpu", "--json", str(path)]
     assert benchmark.main(["realtime", "--checkpoint", str(checkpoint), *flags]) == 0
     result = json.loads(path.read_text())
     assert set(PARTS) & result.keys() == {"error"}
