@@ -5,7 +5,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from latentplan.planning import CEMPlanner, conditioned
+from latentplan.planning import CEMPlanner, FunctionModel, conditioned, rate_limit
 
 HORIZON = 4
 
@@ -113,3 +113,18 @@ def test_last_plan_is_executed_without_time_when_the_policy_is_nan(planner, mode
     model.policy = lambda state, generator=None: torch.full_like(state, float("nan"))
     plan = planner.plan(model, state, last, deadline_ms=9)
     assert torch.equal(plan.actions[:, :-1], last.actions[:, 1:])
+
+
+@pytest.mark.parametrize("is_reset", [False, True])
+def test_rate_limit_holds_after_a_cold_start_that_had_no_time(make_planner, is_reset):
+    limits = [rate_limit(0.1)]
+    model = FunctionModel(lambda state, action: state + action, lambda state, action: action.sum(1))
+    planner, state = make_planner(), torch.zeros(2, 2)
+    first = planner.plan(model, state, constraints=limits, deadline_ms=0.0)
+    assert bool(first.info["is_fallback"].all()) and not bool(first.is_warm.any())
+    if is_reset:  # of the second environment, which has no action before its first
+        first = first.forget(torch.tensor([False, True]))
+    second = planner.plan(model, state, first, constraints=limits)
+    change = (second.action - first.action).abs().amax(1)
+    assert change[0] <= 0.1 + 1e-6
+    assert bool(change[1] > 0.5) == is_reset

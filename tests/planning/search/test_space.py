@@ -488,18 +488,3 @@ def test_penalties_see_actions_and_not_knots(recorder, make_planner, seeded):
     model = constant(lambda state, action: torch.zeros(len(state)))
     plan = planner.plan(model, torch.zeros(1, 1), objective=action_penalty(), generator=seeded())
     assert plan.expected_return.item() == pytest.approx(-6 * 2 * 0.25)
-
-
-@pytest.mark.parametrize("is_reset", [False, True])
-def test_rate_limit_holds_after_a_cold_start_that_had_no_time(point, make_planner, is_reset):
-    limits = [rate_limit(0.1)]
-    model = FunctionModel(lambda state, action: state + action, lambda state, action: action.sum(1))
-    planner, state = make_planner(), torch.zeros(2, 2)
-    first = planner.plan(model, state, constraints=limits, deadline_ms=0.0)
-    assert bool(first.info["is_fallback"].all()) and not bool(first.is_warm.any())
-    if is_reset:  # of the second environment, which has no action before its first
-        first = first.forget(torch.tensor([False, True]))
-    second = planner.plan(model, state, first, constraints=limits)
-    change = (second.action - first.action).abs().amax(1)
-    assert change[0] <= 0.1 + 1e-6
-    assert bool(change[1] > 0.5) == is_reset
