@@ -274,12 +274,20 @@ class ModelAgent:
             given.cpu().numpy(),
         )
 
+    def _last_action(self) -> Tensor | None:
+        """The action executed last, which the actor, noise or a replacement may have chosen, (batch, action).
+
+        It is NaN at the first decision of an episode; None before any.
+        """
+        if self._action is None or self._is_reset is None:
+            return self._action
+        return self._action.masked_fill(self._is_reset[:, None], torch.nan)
+
     def _replace_actions(self, actions: np.ndarray) -> np.ndarray:
         """The actions (batch, action), in which rows that are not finite hold the row's last action, or zeros."""
         is_broken = ~np.isfinite(actions).all(axis=1)
-        last = np.zeros_like(actions) if self._action is None else self._action.float().cpu().numpy()
-        if self._is_reset is not None:
-            last = np.where(self._is_reset.cpu().numpy()[:, None], 0.0, last)
+        known = self._last_action()
+        last = np.zeros_like(actions) if known is None else known.float().nan_to_num().cpu().numpy()
         if self.num_replaced_actions == 0:
             warnings.warn(
                 "the agent's action is not finite: its last finite action, or zeros, is executed instead; its weights "

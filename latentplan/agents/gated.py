@@ -174,13 +174,6 @@ class GatedAgent(PlanningAgent):
         self._drift = torch.where(is_planned.to(self._drift.device), 0.0, self._drift)
         return action
 
-    def _last_action(self) -> Tensor | None:
-        """The action executed last, (batch, action), NaN at the first decision of an episode; None before any."""
-        assert self._is_first is not None
-        if self._action is None:
-            return None
-        return self._action.masked_fill(self._is_first.to(self._action.device)[:, None], torch.nan)
-
     @property
     def _is_goal_untrained(self) -> bool:
         """Whether an objective or a constraint is set for which the model has no trained actor."""

@@ -136,12 +136,3 @@ class PlanningAgent(ModelAgent):
         if bool(is_surprised[0]):
             self.was_surprised, self.last_source = self.last_source == "plan", "actor"
         return torch.where(is_surprised[:, None], self._act_by_actor(state), action)
-
-    def _last_action(self) -> Tensor | None:
-        """The action executed last, which the actor, noise or a replacement may have chosen, (batch, action).
-
-        It is NaN at the first decision of an episode; None before any.
-        """
-        if self._action is None or self._is_reset is None:
-            return self._action
-        return self._action.masked_fill(self._is_reset[:, None], torch.nan)

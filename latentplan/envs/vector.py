@@ -242,9 +242,9 @@ class GuardedVectorEnv(VectorEnv[np.ndarray, np.ndarray, Any]):
 
     def _check_number(self, name: str, values: Any) -> None:
         """Raises ValueError, before any environment is asked, unless there is one value for each environment."""
-        count = len(values) if hasattr(values, "__len__") and np.ndim(values) > 0 else 0
-        if count != self.num_envs:
-            raise ValueError(f"{name} must have one entry for each of {self.num_envs} environments, got {count}")
+        shape = np.shape(values)
+        if shape[:1] != (self.num_envs,):
+            raise ValueError(f"{name} must have one entry for each of {self.num_envs} environments, got shape {shape}")
 
     def _ask_for_reset(self, index: int, seeds: Sequence[int | None] | None, attempt: int = 0) -> None:
         seed = None if seeds is None else seeds[index]

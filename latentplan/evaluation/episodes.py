@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import operator
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
@@ -88,11 +89,12 @@ def evaluate_agent(
 
     Raises:
         ValueError: `episodes` is below 1, `seed` is below 0, or the agent refuses the environment's frames.
+        TypeError: `seed` is no whole number.
         UserError: The environment gave a reward that is not a finite number, or is a vector environment.
     """
     if hasattr(env, "single_observation_space"):
         raise UserError("evaluate_agent plays one environment, not a vector environment: make it with gymnasium.make")
-    seed = int(seed)
+    seed = operator.index(seed)
     seeds = [episode_seed(seed, index) for index in range(episodes)]
     return {"seed": seed, **summarize(run_episodes(env, agent, seeds, on_step=on_step))}
 

@@ -136,6 +136,11 @@ def test_evaluate_agent_gives_plain_values_for_any_seed_and_agent():
     assert json.loads(json.dumps(result))["action_source"] == {"plan": 0, "tail": 0, "actor": 4}
 
 
+def test_evaluate_agent_refuses_a_seed_that_is_no_whole_number():
+    with pytest.raises(TypeError):
+        evaluate_agent(NoisyAgent(), ClockEnv(), seed=3.5, episodes=1)
+
+
 def test_evaluate_agent_summarizes_the_episodes_of_its_seeds():
     result = evaluate_agent(NoisyAgent(), ClockEnv(), seed=3, episodes=2)
     played = run_episodes(ClockEnv(), NoisyAgent(), [episode_seed(3, 0), episode_seed(3, 1)])

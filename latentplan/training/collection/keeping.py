@@ -20,7 +20,6 @@ from latentplan.envs.registry import default_task
 from latentplan.envs.spaces import Actions, Interface
 from latentplan.envs.user import PixelEnv
 from latentplan.envs.vector import read_own_facts
-from latentplan.training.checks import check_folder
 from latentplan.training.demonstrations.episode_file import write_episode
 from latentplan.training.demonstrations.fitting import read_interface
 from latentplan.training.demonstrations.kinds import SUFFIX, list_episode_files
@@ -218,12 +217,11 @@ def begin_keeping(config: Config) -> Config:
     """The settings of a new run with the whole path of the folder of its episodes, so that it resumes from anywhere.
 
     Raises:
-        UserError: The folder holds episodes, or cannot be made.
+        UserError: The folder holds episodes.
     """
     folder = config.collection.keep_episodes
     if folder is None:
         return config
-    check_folder(folder, f"--{SETTING}")
     refuse_used_folder(Path(folder))
     return replace(config, collection=replace(config.collection, keep_episodes=os.path.abspath(folder)))
 
